@@ -40,6 +40,10 @@ search, and far less than between poses that a symmetric magnet makes equal."""
 EQUAL_LOG_EVIDENCE = 0.1
 """Difference in log evidence up to which poses are equally probable: their odds are 1.1 : 1."""
 
+UNDECIDED_LOG_EVIDENCE = 3.0
+"""The same up to which readings do not decide between poses: odds of 20 : 1. Fits of poses that a
+symmetric magnet makes equal end up to 1 apart, since they end when chi-squared hardly falls."""
+
 
 def register(
     magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
@@ -125,14 +129,17 @@ def register(
 def least_turned_first(found: Sequence[Registration]) -> list[Registration]:
     """Return poses by their evidence, the likeliest first.
 
-    Of the likeliest ones, which a symmetric magnet makes equal, the one whose axes are turned least
-    from those of the map is first: most people lay a map as they draw it.
+    Of those between which the readings do not decide, which a symmetric magnet makes equal, the one
+    whose axes are turned least from those of the map is first: most people lay a map as they draw
+    it.
     """
     ordered = sorted(found, key=lambda each: -each.log_evidence)
     equal = [each for each in ordered
-             if each.log_evidence > ordered[0].log_evidence - EQUAL_LOG_EVIDENCE]
-    return sorted(equal, key=lambda each: float(np.linalg.norm(
-        each.instrument.rotation_rad))) + ordered[len(equal):]
+             if each.log_evidence > ordered[0].log_evidence - UNDECIDED_LOG_EVIDENCE]
+    first = min(equal, key=lambda each: (  # right angles, as small turns are for the readings
+        round(float(np.linalg.norm(each.instrument.rotation_rad)) / (np.pi / 2)),
+        -each.log_evidence))
+    return [first, *(each for each in ordered if each is not first)]
 
 
 def _on_stage(starts: Sequence[Floats], stage: StagePose) -> list[Floats]:

@@ -213,10 +213,18 @@ def _difference(key: str, old: Any, new: Any) -> str:
 def _exception(entry: dict[str, Any]) -> str:
     """Return an entry of `array.exceptions` in words: the block, and what it deviates by."""
     usual = BlockException().model_dump(mode="json")
-    own = ", ".join(f"{key} = {_short(value)}" for key, value in entry.items()
+    own = ", ".join(_key_in_words(key, value) for key, value in entry.items()
                     if value != usual[key] and key not in ("ring", "slot"))
     place = block_in_words(entry["ring"] or 0, entry["slot"] or 0) or "all blocks"
     return f"{place} ({own})"
+
+
+def _key_in_words(key: str, value: Any) -> str:
+    """Return a key and its value; a displacement in mm."""
+    if key == "shift_m":
+        x, y, z = (f"{1e3 * part:.3f}".replace("-", "\u2212") for part in value)
+        return f"moved by x {x}, y {y}, z {z} mm"
+    return f"{key} = {_short(value)}"
 
 
 def _short(value: Any) -> str:

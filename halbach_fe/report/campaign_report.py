@@ -138,10 +138,12 @@ class Campaign:
         loses = any(chapter.verb == "demagnetization" for chapter in self._concerned())
         said = " ".join([
             *self._newest(), *self._concerns(),
+            f"{'This is' if len(self.chapters) == 1 else 'These are'} "
             f"{counted(len(self.chapters), 'result')} of one magnet.",
             *([f"The map of {in_a_row(simulated)} is simulated, not measured."] if simulated
               else []), *instead,
-            f"Not to be trusted as they are: {', '.join(f'folder {each}' for each in left)}."
+            f"Not to be trusted as {'it is' if len(left) == 1 else 'they are'}: "
+            f"{', '.join(f'folder {each}' for each in left)}."
             if left else "They do not all fit together." if self.doubts else
             "The other answers hold as far as the magnet keeps its magnetization." if loses else
             f"{'All others' if instead else 'The answers'} may be used"

@@ -158,7 +158,9 @@ def write_diagnosis_report(
     write_page(
         folder / "diagnosis.html", "diagnosis.html.j2", pictures, diagnosis=diagnosis,
         study=diagnosis.before.study, answer=answer(diagnosis), assumptions=assumptions,
-        shown=dict(zip(drawn, pictures, strict=True)), view=view_of_inference(diagnosis.after),
+        shown=dict(zip(drawn, pictures, strict=True)), view=view_of_inference(
+            diagnosis.after, {place for effect in diagnosis.identified for place in (
+                (effect.place.ring, effect.place.slot), effect.place.other)}),
         view_colours=colours_in_words(diagnosis.after),
         rows=[{"finding": finding.title, "place": finding.place, "amplitude": finding.amount,
                 "Bayes factor": bayes_factor(finding.log_bayes_factor), "kind": finding.kind}

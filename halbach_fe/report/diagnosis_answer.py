@@ -46,14 +46,18 @@ REMEDIES = {
 def answer(diagnosis: Diagnosis) -> Answer:
     """Say what the study lacks, how sure that is, and what to do next."""
     found, doubts = _found(diagnosis), _doubts(diagnosis)
-    sound = not (diagnosis.unknown or diagnosis.suspected or diagnosis.solver_error or _fails(
+    # what was named stands, whatever is suspected besides
+    only_suspected = diagnosis.suspected and not diagnosis.identified
+    sound = not (diagnosis.unknown or only_suspected or diagnosis.solver_error or _fails(
         diagnosis) or diagnosis.after.held_out_conflict)
     if diagnosis.identified and doubts:
         # besides how well the model fits now, and error bars that are too wide
         doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
         wrong = (diagnosis.unknown or diagnosis.solver_error or _fails(diagnosis)
                  or diagnosis.after.held_out_conflict)
-        verdict = "No" if wrong else "Only in part" if doubtful or not sound else "Yes"
+        verdict = ("No" if wrong else "Only in part" if doubtful else
+                   "Yes, but what is suspected is not in the model" if diagnosis.suspected else
+                   "Yes")
         doubts[0] = f"{verdict}. {doubts[0]}"
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
@@ -93,8 +97,9 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         return "Refine `mesh` or move `open_boundary` outwards, and diagnose again.", again
     if diagnosis.unknown is not None:
         return unknown_advice(diagnosis.unknown), again
-    if diagnosis.suspected:
-        return " ".join(map(more_readings, diagnosis.suspected)), again
+    suspicions = " ".join(map(more_readings, diagnosis.suspected))
+    if suspicions and not diagnosis.identified:
+        return suspicions, again
     if _fails(diagnosis):
         check = "halbach-fe check MAP -o DIR"
         return ("Check the map without any magnet: it says which noise and which rows are in it.",
@@ -113,7 +118,7 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
             changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
                        f"stays as it is, update it with {STUDY_FILE}, the study with what was "
                        "found.")
-        return changed, infer
+        return f"{changed} {suspicions}".strip(), infer
     return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
 
 

@@ -33,7 +33,7 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
 )
-from halbach_fe.report.point_maps import residual_figure
+from halbach_fe.report.point_maps import residual_figure, unit_for
 from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 
 NONE = "none"
@@ -285,14 +285,19 @@ def profile(diagnosis: Diagnosis) -> Figure:
         return _residual_maps(diagnosis)
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
     label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
-    line = {"lw": 1.2} if connected else {"ls": "none", "marker": "_", "ms": 8}
+    harmonic = name == "harmonic"
+    line = {"lw": 1.2} if connected and not harmonic else {"ls": "none", "marker": "_", "ms": 10}
     figure = figure_of(5.4)
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
     held, measured = before.held_out[index], before.readings[index]
+    band = COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
+    factor, unit = unit_for(max(float(np.abs(
+        state.update.readings - state.update.prediction_posterior.mean)[index].max())
+        for state in shown))
     for state in shown:
         mean, colour = state.update.prediction_posterior.mean, state.colour
         top.plot(along, 1e3 * mean[index], color=colour, label=f"predicted, {state.when}", **line)
-        residual = 1e3 * (state.update.readings - mean)[index]
+        residual = factor * (state.update.readings - mean)[index]
         bottom.plot(along[~held], residual[~held], ".", color=colour, ms=6)
         bottom.plot(along[held], residual[held], "o", mfc="none", color=colour, ms=5)
     top.plot(along[~held], 1e3 * measured[~held], ".", color=MEASURED, ms=4,
@@ -300,8 +305,8 @@ def profile(diagnosis: Diagnosis) -> Figure:
     if held.any():
         top.plot(along[held], 1e3 * measured[held], "o", mfc="none", color=MEASURED, ms=4,
                  label="measured, held out")
-    band = 1e3 * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
-    if connected:
+    band = factor * band
+    if connected and not harmonic:
         bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
     else:
         bottom.errorbar(along, 0 * along, band, fmt="none", color=POSTERIOR, alpha=0.2, lw=4)
@@ -309,13 +314,21 @@ def profile(diagnosis: Diagnosis) -> Figure:
              else before.observation.positions)[index[0]]
     x, y, _ = 1e3 * where.round(6) + 0.0  # no -0
     of_map = f" of map {before.maps[index[0]]}" if before.is_campaign else ""
-    top.set_title(f"{label}{of_map} at all points" if not connected else
-                  f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm" if name.startswith("z")
-                  else f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
+    if harmonic:
+        wave = {"A": "cos", "B": "sin"}[label]
+        label = f"{label}$_n$"
+        top.set_title(f"{label}, coefficients of {wave} n\u03c6 in the radial B, at a radius of "
+                      f"{np.hypot(x, y):.0f} mm", fontsize="medium")
+    else:
+        top.set_title(f"{label}{of_map} at all points" if not connected else
+                      f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm"
+                      if name.startswith("z") else
+                      f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm",
+                      fontsize="medium")
     top.set_ylabel(f"{label} in mT")
     legend_above(figure, top)
-    bottom.set_ylabel("measured − predicted\nin mT")
-    bottom.set_xlabel(name)
+    bottom.set_ylabel(f"measured − predicted\nin {unit}")
+    bottom.set_xlabel("harmonic n" if harmonic else name)
     for axis in (top, bottom):
         axis.grid(alpha=0.3)
     return figure

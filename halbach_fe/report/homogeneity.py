@@ -279,7 +279,8 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
     last.legend(handles=[Line2D([], [], color="black", lw=0.8, ls="--", label="the region")],
                 loc="upper center", frameon=False)
     figure.colorbar(colours, cax=last.inset_axes((0.05, 0.5, 0.9, 0.07)), extend="both",
-                    orientation="horizontal", label="|B| over its mean, in ppm")
+                    orientation="horizontal", label="|B| over its mean, in ppm",
+                    ticks=MaxNLocator(4))
     return figure
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,9 @@ from halbach_fe.study.types import COMPONENTS
 ARC_POINTS = 5
 SIGNED = "RdBu_r"
 """Colour scale of signed numbers, readable with any colour vision."""
+
+OUTSIDE = 1.15
+"""Distance from the axis at which a block is named, relative to the magnet's outer radius."""
 
 ARROW, HEAD = 0.7, 0.35
 """Length of an arrow relative to the radial thickness of a block; length of the arrow's head
@@ -172,8 +175,13 @@ def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
         points, positions=points.positions[drawn], values=points.values[drawn]))
 
 
-def view_of_inference(result: InferenceResult) -> Markup:
-    """Return the view of an inference result: posterior magnetizations and residuals."""
+def view_of_inference(
+    result: InferenceResult, named: Collection[tuple[int, int]] = ()
+) -> Markup:
+    """Return the view of an inference result: posterior magnetizations and residuals.
+
+    ``named`` are ring and slot of blocks whose numbers are written beside them.
+    """
     nominal = result.by_block(result.response.nominal)
     length = np.linalg.norm(nominal, axis=1)
     there = length > 0  # the change of a missing block is shown as 0
@@ -191,7 +199,7 @@ def view_of_inference(result: InferenceResult) -> Markup:
     scores = result.standardized(result.prediction_posterior)
     points = (_worst_residuals(result.observation.positions, scores)
               if any(result.observation.components) else None)
-    return magnet_view(result.magnet, values, points, _residual_vectors(result))
+    return magnet_view(result.magnet, values, points, _residual_vectors(result), named)
 
 
 def colours_in_words(result: InferenceResult) -> str:
@@ -236,12 +244,13 @@ def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
 
 def magnet_view(
     magnet: Magnet, values: BlockValues, points: ViewPoints | None = None,
-    residuals: tuple[Floats, Floats] | None = None,
+    residuals: tuple[Floats, Floats] | None = None, named: Collection[tuple[int, int]] = (),
 ) -> Markup:
     """Return the view as HTML that includes all its scripts, to be placed in a page.
 
     ``residuals`` are points (n, 3) in m and what the model lacks there, B (n, 3) in T. They and the
-    plane with |B| are hidden until their names are clicked.
+    plane with |B| are hidden until their names are clicked. ``named`` are ring and slot of blocks
+    that were found.
     """
     blocks, values = _merge_rings(magnet, values)
     bodies = [prism(block, _prism_height(magnet)) for block in blocks]
@@ -249,6 +258,10 @@ def magnet_view(
                         *_arrow_traces(blocks, values, [corners for corners, _ in bodies])])
     for number, body in enumerate(magnet.iron):  # one entry of the legend for all of them
         figure.add_trace(_iron_trace(body, _prism_height(magnet)).update(showlegend=not number))
+    if found := [block for block in magnet.blocks if (block.ring, block.slot) in named]:
+        figure.add_trace(_named_trace(found, max(
+            float(np.nanmax(np.hypot(trace.x, trace.y))) for trace in figure.data
+            if trace.x is not None and len(trace.x))))
     if points is not None:
         figure.add_trace(_points_trace(points))
     if residuals is not None:
@@ -268,6 +281,20 @@ def magnet_view(
         figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY, post_script=SCRIPT,
         config={"displaylogo": False, "responsive": True, "toImageButtonOptions": {
             "filename": magnet.name, "scale": 2}}))
+
+
+def _named_trace(blocks: Sequence[MagnetBlock], outer: float) -> go.Scatter3d:
+    """Draw ring and slot of blocks beyond the outer radius in m, with a line to each block."""
+    middles = np.array([block.middle for block in blocks])
+    outside = middles.copy()
+    outside[:, :2] *= OUTSIDE * outer / np.hypot(*middles[:, :2].T)[:, None]
+    x, y, z = np.stack([middles, outside, np.full_like(middles, np.nan)], axis=1).reshape(-1, 3).T
+    texts = [text for block in blocks
+             for text in ("", f"ring {block.ring}, slot {block.slot}", "")]
+    return go.Scatter3d(
+        x=x, y=y, z=z, text=texts, mode="lines+text", name="found", hoverinfo="skip",
+        line={"color": MEASURED, "width": 5}, textposition="top center",
+        textfont={"color": MEASURED, "size": 14})
 
 
 def _to_mm(figure: go.Figure) -> None:

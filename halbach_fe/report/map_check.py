@@ -284,7 +284,8 @@ def write_map_check(
     figures = {
         "check_maps.png": (_maps(points, np.asarray(data["B_T"].values), check), (
             "The map: every column as it was measured, and its residual from the field that obeys "
-            "Maxwell's equations. Crosses are rows that were left out")),
+            "Maxwell's equations" + (
+                ". Crosses are rows that were left out" if check.excluded.any() else ""))),
         "check_readings.png": (_readings(check), (
             "Residuals in the order of the map. " + (
                 "Noise alone would be about as large everywhere; here it is not alone"

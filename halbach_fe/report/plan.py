@@ -89,42 +89,43 @@ def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
     points, same = len(plan.points), plan.same_information
     everything = points == len(plan.candidates)
-    said = (f"At the {counted(points, 'position')} of plan.csv"
-            + (", in their order: these are all the candidates"
-               f"{', the positions of the study' if _is_the_study(plan) else ''}, and the plan "
-               "only orders them. " if everything else ". "))
+    nearly = _nearly(plan)
+    enough = (f"the first {nearly} of {points} positions nearly suffice, as the uncertainty "
+              f"{'of patterns of blocks ' if plan.deviation is None else ''}that they leave is at "
+              f"most {NEARLY:g} times that of all"
+              if 1 < nearly < points else "")  # a single one only shows that none tells much
+    said = (f"At the {counted(points, 'position')} of plan.csv. " if not everything else
+            f"In the order of plan.csv{f': {enough}' if enough else ''}. These are all the "
+            f"candidates{', the positions of the study' if _is_the_study(plan) else ''}, and the "
+            "plan only orders them. ")
     if plan.deviation is None:
         left, of_study = _patterns(plan)
         beside = "" if _is_the_study(plan) else (
             f"; with as many of the study's own positions to {fraction(of_study)}"
             f"{'' if left < LITTLE * of_study else ', which is hardly more'}")
         blocks = _rms(plan.planned_sd) / _rms(plan.prior_sd)
-        said += (f"After them a block's magnetization is uncertain by {fraction(blocks)} of what "
-                 "it is before (rms over the blocks). What blocks that deviate together do to the "
-                 "field is known better: the uncertainty of such a pattern, by which the positions "
-                 f"are chosen, falls to {fraction(left)} (geometric mean){beside}. ")
+        said += (f"After {'all of ' if everything else ''}them a block's magnetization is "
+                 f"uncertain by {fraction(blocks)} of what it is before (rms over the blocks). "
+                 "What blocks that deviate together do to the field is known better: the "
+                 "uncertainty of such a pattern, by which the positions are chosen, falls to "
+                 f"{fraction(left)} (geometric mean){beside}. ")
         if left > VAGUE:
             said += ("So such a map tells little of the single blocks, at whatever positions of "
                      "these it is measured. Measure the blocks before assembly, or the field "
                      "nearer to them. ")
     else:
-        said += (f"At a point of {plan.deviation.region.text}, the deviation of |B| from its mean "
-                 f"is then known to {ppm(plan.deviation.planned[-1])} ppm rms"
-                 + ("" if _is_the_study(plan) else ", after as many of the study's positions to "
-                    f"{ppm(_of_study(plan))}") + f", and before to {ppm(plan.deviation.prior)}. ")
-    if everything:
-        nearly = _nearly(plan)
-        if 1 < nearly < points:  # a single one that suffices only shows that none tells much
-            said += (f"The first {nearly} nearly suffice: the uncertainty "
-                     f"{'of a pattern ' if plan.deviation is None else ''}that they leave is at "
-                     f"most {NEARLY:g} times that of all.")
-    else:
+        said += (f"The deviation of |B| from its mean at a point of {plan.deviation.region.text} "
+                 f"is known to {ppm(plan.deviation.prior)} ppm rms before, and to "
+                 f"{ppm(plan.deviation.planned[-1])} after {'all of ' if everything else ''}them"
+                 + ("" if _is_the_study(plan) else
+                    f" (after as many of the study's positions to {ppm(_of_study(plan))})") + ". ")
+    if not everything:
         said += (f"{counted(same, 'position')} of the plan tell as much as all "
                  f"{len(plan.baseline)} of the study." if same else
                  f"All {len(plan.baseline)} positions of the study together tell more than these "
                  f"{points}{_of_all(plan)}.")
     return Answer(
-        "Where should the magnet be measured?", said,
+        "Where should the magnet be measured?", said.strip(),
         "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
         "difference to these numbers. Positions that are chosen one after another, as these are, "
         "tell nearly as much as the best choice of all at once."

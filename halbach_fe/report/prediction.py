@@ -257,8 +257,11 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.2, lw=0)
         axis.set_ylabel(f"standardized\nresidual, {name}")
         _scale(axis, scores)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3,
-                  frameon=False, markerscale=5 if len(result.readings) > CROWD else 1)
+    legend = figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False,
+        markerscale=5 if len(result.readings) > CROWD else 1)
+    for handle in filter(None, legend.legend_handles):  # prior and posterior have their own colours
+        handle.set(color=MEASURED, alpha=1.0)
     axes[1].set_xlabel(label)
     return figure
 

@@ -56,6 +56,7 @@ SAME_M, SAME_T = 1e-7, 1e-7
 than the rounding of any study, and less than any deviation that is given."""
 
 AT_REST = "Yes, the map can be used in this pose."
+UNDECIDED = "Only if the map was measured in this pose, as the readings do not decide on it."
 NOT_AT_REST = (
     "No, do not use the map in this pose yet. The search for the best fit has not come to rest: it "
     "ended while place and turns still changed from step to step, so that the best pose may be "
@@ -98,7 +99,9 @@ def answer(
     if best.explains and not best.at_rest:
         said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
     if best.explains:
-        trust.insert(0, AT_REST if best.at_rest else NOT_AT_REST)
+        trust.insert(0, NOT_AT_REST if not best.at_rest else
+                     AT_REST if best.log_evidence > max(each.log_evidence for each in found)
+                     - EQUAL_LOG_EVIDENCE else UNDECIDED)
     else:
         said = ("This magnet does not explain the map. The least bad answer: "
                 f"{said[0].lower()}{said[1:]}")
@@ -192,8 +195,11 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
         said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
                     "how the map was measured which one is real.")
     if unlike and found[0].explains and found[0].at_rest:
-        said.append(f"{counted(len(unlike), 'other pose')} cannot be ruled out, with a probability "
-                    f"of {in_a_row(unlike)} beside {100 * probability[0]:.0f} % of this one.")
+        least = (", which is taken because its axes are turned least: decide by how the map was "
+                 "measured" if probability[0] < probability.max() else "")
+        said.append(
+            f"{counted(len(unlike), 'other pose')} cannot be ruled out, with a probability of "
+            f"{in_a_row(unlike)} beside {100 * probability[0]:.0f} % of this one{least}.")
     elif unlike:
         said.append(f"{counted(len(unlike), 'other pose')} cannot be ruled out. (In this one chi² "
                     f"is {decimals(found[0].chi2)} per reading, where about 1 is expected, so that "

@@ -52,7 +52,7 @@ def _answer(found: FilledTray) -> Answer:
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
     text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
-            f"the field deviates by {ppm(after)} ppm rms (95 %: {low} to {high}) in place of "
+            f"the field deviates by {ppm(after)} ppm rms (95 %: {low} to {high}), without them by "
             f"{ppm(before)}.")
     if all(not count for count in found.left.values()):
         text += " The whole inventory is used: more magnets may do better."

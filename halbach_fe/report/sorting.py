@@ -178,13 +178,15 @@ def answer(found: SortedBlocks) -> Answer:
         ("the mounting", prior.mounting_sd_deg > 0)) if there)]
     orders = (f"in all random orders about {text(low)}" if text(low) == text(high) else
               f"in 95 % of random orders {text(low)} to {text(high)}")
-    gain = 1 - best / min(own, float(np.median(found.random)))
-    hardly = "" if gain >= LITTLE else (
-        f"The order hardly matters: the sorted one is {100 * gain:.2g}\u00a0% better than that of "
-        "the table or a random one. ")
+    gains = sorted(1 - best / each for each in (own, float(np.median(found.random))))
+    hardly = "" if gains[0] >= LITTLE else (
+        "The order hardly matters: the sorted one is "
+        f"{' to '.join(dict.fromkeys(f'{100 * gain:.2g}' for gain in gains))}\u00a0% better than "
+        "that of the table or a random one. ")
     return Answer(
         question,
-        f"{hardly}The table of places says it, as blocks.sorted.csv does. In these slots {what} "
+        f"{hardly}The table of places below has the slot of each block, as blocks.sorted.csv has "
+        f"for machines. In these slots {what} "
         f"{text(best)} {unit}{sizes}; with the blocks {found.own_order} it would be "
         f"{text(own)}, and {orders}.{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} makes {text(spread)} {unit} of its own, "

@@ -47,8 +47,14 @@ def stray_section(stray: StrayField | None) -> StraySection | None:
             "text": stray.unknown or (
                 f"The largest distances at which |B| reaches {size}, the usual limit of access to "
                 "rooms of MRI magnets. The field is that of the magnet alone, without shields or "
-                "external fields. Without ± the standard deviation is below 0.5 mm."),
+                "external fields." + ("" if not _is_uncertain(stray) else
+                " Without ± the standard deviation is below 0.5 mm.")),
             "rows": stray_rows(stray)}
+
+
+def _is_uncertain(stray: StrayField) -> bool:
+    """Tell whether the distances are those of an updated magnet, with standard deviations."""
+    return any(reach is not None and reach.sd_m for reach in (stray.radial, stray.axial))
 
 
 def stray_rows(stray: StrayField | None) -> list[dict[str, str]]:

@@ -111,7 +111,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     ordered = float(found.known.sizes.max())
     if ordered > OF_THE_DESIGN * half:
         said += (f" That is the magnet as designed ({ordered:.3g} units with blocks as ordered), "
-                 "to which their tolerances add little.")
+                 f"to which their tolerances add little.{_made_by_tolerances(found)}")
     share, prior = found.share, found.study.prior
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
@@ -125,6 +125,18 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
         "Which multipoles do the tolerances of the blocks make?", said,
         f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
         f"{whole(len(found.sizes))} magnets were drawn.", *step)
+
+
+def _made_by_tolerances(found: Tolerance) -> str:
+    """Name the largest multipole that the design does not make; empty if it makes all of them."""
+    half, most = found.quantiles[1:3]
+    own = found.known.sizes < half / 2
+    if not own.any():
+        return ""
+    number = int(np.argmax(np.where(own, half, 0.0)))
+    return (f" The largest that only the tolerances make is c_{found.model.orders[number]}, of "
+            f"{half[number]:.3g} units in half of the magnets, and up to {most[number]:.3g} in "
+            "95 %.")
 
 
 @own_style

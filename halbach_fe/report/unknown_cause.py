@@ -122,5 +122,5 @@ def more_readings(suspicion: Suspicion) -> str:
     factor = max(suspicion.log_bayes_factor, 1.0)
     prior = np.log(suspicion.shares[0] / max(1 - suspicion.probability, 1e-9)) - factor
     times = max(2, int(np.ceil((DETECTION_LOG_ODDS - prior) / factor)))
-    return (f"Measure the same map {times} times in all: if it is there, its mean would "
-            "be enough to name it, and if it is not, the suspicion would fade.")
+    return (f"Measure the same map {times} times in all to decide on what is suspected: if it is "
+            "there, the mean of these maps is enough to name it; if not, the suspicion fades.")

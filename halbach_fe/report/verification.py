@@ -107,8 +107,8 @@ def answer(found: Verification) -> Answer:
     noisy, noise = _beside_the_noise(found)
     trust = ("No: the last refinement does not change the field less than the one before. The "
              "estimate is rough, and the mesh should be finer." if rough else
-             "Yes: the field converges. Elements of half the size divide its change from "
-             f"mesh to mesh by {2**found.order:.2g} (order {found.order:.1f}).")
+             "Yes: the field converges. In the last refinements, elements of half the size divide "
+             f"its change from mesh to mesh by {2**found.order:.2g} (order {found.order:.1f}).")
     finer = (f"Make mesh.block_size_m smaller (elements are now "
              f"{1e3 * found.element_size_m:.3g} mm), and verify again.",
              "halbach-fe verify STUDY -o DIR")
@@ -117,8 +117,8 @@ def answer(found: Verification) -> Answer:
         finer = ("Most of the error is that the computed region ends too near. Make "
                  + " and ".join(f"{key} larger (now {1e3 * size:.3g} mm)"
                                 for key, size in keys.items()) + ", and verify again.", finer[1])
-    bars = ("This estimate is from several meshes; that of halbach-fe solve is from one "
-            "comparison, and differs.")
+    bars = ("It is from several meshes: quote it, rather than that of halbach-fe solve, which is "
+            "from a single comparison and may be several times larger.")
     return Answer(question, said, " ".join(filter(None, (trust, noise, bars))),
                   *(finer if rough or noisy else measure), sound=not rough)
 
@@ -168,10 +168,9 @@ def error_basis(found: Verification) -> str:
                 "mesh of the same element sizes"
                 if found.route != "moments" else "")
     text = ("The estimated error is the total change that all further refinements would make"
-            f"{boundary}. It assumes that the changes by successive refinements go on to decrease "
-            f"by the same factor as these {STEPS - _coarsest(found)} do"
-            f"{', or as the last two if these decrease less' if not _coarsest(found) else ''} "
-            f"(order {found.order:.1f}{limit} in the element size).")
+            f"{boundary}. It assumes that these changes decrease with the power "
+            f"{found.order:.1f}{limit} of the element size: that by which all changes above "
+            "decrease, or the last two if they decrease less.")
     if len(found.differences) > STEPS + 1:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
                  "concerned. The difference between the two formulations is no part of the "

@@ -121,6 +121,12 @@ def test_verdicts(flat):
     assert answer(replace(found, unknown=unknown)).trust.startswith("No. ")
     assert answer(replace(found, after=found.before)).trust.startswith("No. ")
     assert answer(found).trust.startswith("Yes. ")
+    suspicion = Suspicion(("gain_x",), 0.9, Hypothesis(EFFECTS["gain_x"], Place()), (0.9,), 5.5)
+    besides = answer(replace(found, suspected=(suspicion,)))
+    assert besides.sound  # what was named stands, and is used
+    assert besides.trust.startswith("Yes, but what is suspected is not in the model. ")
+    assert "Measure the same map 2 times in all" in besides.step
+    assert "infer" in besides.command
     assert "Far larger" not in verdict(found)
     assert "had not converged" in verdict(replace(found, converged=False))
     assert "had not converged" not in verdict(found)

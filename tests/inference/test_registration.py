@@ -17,7 +17,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import OpenKey
 from halbach_fe.inference.pose_search import coarse_poses, right_angles
 from halbach_fe.inference.registration import (
-    EQUAL_LOG_EVIDENCE,
+    UNDECIDED_LOG_EVIDENCE,
     axes_of_map,
     least_turned_first,
     odds,
@@ -288,7 +288,10 @@ def test_of_equal_poses_the_least_turned_one_is_first():
         return SimpleNamespace(log_evidence=log_evidence, instrument=Instrument(
             rotation_rad=tuple(Rotation.from_euler("x", turn, degrees=True).as_rotvec())))
 
-    half, straight, worse = pose(-7.0, 180), pose(-7.0 - EQUAL_LOG_EVIDENCE / 2, 1), pose(-9.0, 0)
+    half, straight = pose(-7.0, 180), pose(-7.0 - UNDECIDED_LOG_EVIDENCE / 2, 1)
+    worse, near = pose(-7.0 - 1.1 * UNDECIDED_LOG_EVIDENCE, 0), pose(-9.0, 0.5)
     assert least_turned_first([worse, half, straight]) == [straight, half, worse]
-    # negative control: what the readings tell apart stays in the order of its probability
+    # negative controls: what the readings tell apart stays in the order of its probability, and of
+    # two poses in the same axes the likelier one is first
     assert least_turned_first([half, worse]) == [half, worse]
+    assert least_turned_first([near, half, straight]) == [straight, half, near]

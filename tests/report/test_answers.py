@@ -543,7 +543,7 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
 def test_a_plan_of_all_candidates_says_how_many_nearly_suffice(given):
     everything = hf.plan(given.magnet, given.session)
     said = plan.answer(everything)
-    few = int(said.said.split("The first ")[1].split(" ")[0])
+    few = int(said.said.split("the first ")[1].split(" ")[0])
     assert 0 < few < len(everything.points)
     left = np.exp(-everything.gain / len(everything.parameters))
     assert left[few - 1] <= 1.2 * left[-1] < left[few - 2]
@@ -706,12 +706,12 @@ def test_a_plan_of_the_study_itself_is_not_compared_with_it(given):
     every = plan.answer(hf.plan(given.magnet, given.session)).said
     assert "the positions of the study, and the plan only orders them" in every
     assert "as many of the study's own positions" not in every
-    assert "The first 1 " not in every
+    assert "the first 1 " not in every
     assert "tells little of the single blocks" not in every  # the control
     noisy = build_magnet(given.study.with_(noise={"regions": [{"name": "all", "sigma_T": 1.0}]}))
     vague = plan.answer(hf.plan(noisy, given.session)).said
     assert "tells little of the single blocks" in vague
-    assert "The first 1 " not in vague
+    assert "the first 1 " not in vague
 
 
 def test_an_update_without_circles_states_its_strongest_reading(given):

@@ -92,8 +92,8 @@ def test_every_answer_is_on_the_page(campaign, capsys):
         assert one["answer"] == said["answer"]
         for key in ("question", "said", "trust", "step"):
             assert said["answer"][key] in page.text
-    assert ("4 results of one magnet. The map of folder simulated is simulated, not measured. The "
-            "answers may be used, for a test.") in page.text
+    assert ("These are 4 results of one magnet. The map of folder simulated is simulated, not "
+            "measured. The answers may be used, for a test.") in page.text
     assert "1 ring of 4 sectors" in page.text
     assert [one for one in page.links if one.startswith("#")] == [
         *(f"#part-{number}" for number in (1, 2, 3, 4, 4, 3, 4))]  # contents, next steps
@@ -202,7 +202,7 @@ def test_a_study_that_was_written_is_of_the_same_magnet(tmp_path):
     page = parts_of(hf.campaign_report([first, after, found], tmp_path / "all.html"))
     assert ("better is of diagnosis/study.diagnosed.toml, which halbach-fe diagnose wrote: "
             "array.inner_radius_m is 0.12 instead of 0.104; array.exceptions has all "
-            "blocks (shift_m = 0.002, 0, 0) besides.") in page.text
+            "blocks (moved by x 2.000, y 0.000, z 0.000 mm) besides.") in page.text
     assert re.findall(r"folder (\w+),", page.text) == [
         "field", "diagnosis", "better"]
     with pytest.raises(hf.HalbachError, match="of one magnet"):
@@ -481,7 +481,7 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     unused_finding(home)
     alone = found_in(home, "field", "inferred").answer
     assert (alone.sound, alone.step) == (False, "Diagnose.")
-    assert "Not to be trusted as they are: folder inferred." in alone.said
+    assert "Not to be trusted as it is: folder inferred." in alone.said
     results(home / "better", "infer", another(instrument={"translation_m": [1e-3, 0, 0]}),
             [home / "diagnosis" / "study.diagnosed.toml", home / "map.csv"])
     campaign = found_in(home, "field", "inferred", "better", "diagnosis")

@@ -131,6 +131,15 @@ def test_names_hide_nothing(page, width):
     assert names["x"] + names["width"] <= width
 
 
+def test_blocks_that_were_found_are_named():
+    """The control has none."""
+    study = study_of("quadrupole")
+    magnet, known = build_magnet(study), known_of(study)
+    name = '"text":["","ring 1, slot 3",""]'
+    assert name in magnet_view(magnet, known, named={(1, 3), (0, 0)})
+    assert name not in magnet_view(magnet, known)
+
+
 @pytest.mark.parametrize("name", STUDIES)
 def test_studies_are_shown(page, name):
     study = study_of(name)
