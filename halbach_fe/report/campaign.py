@@ -78,14 +78,13 @@ def write_campaign_page(
         Names and digests of the campaign's files.
     """
     maps = {"map": readings} | ({} if held_out is None else {"held out": held_out})
-    points = points_of(readings)
+    magnet, points = build_magnet(study), points_of(readings)
     figures = {
         "campaign_field.png": (
             _field_figure(study, maps), "The readings of the map"),
         "campaign_geometry.png": (
-            geometry_figure(build_magnet(study), points,
-                            None if held_out is None else points_of(held_out)),
-            "The nominal blocks of the first ring, the iron ring if the study has one, and the "
+            geometry_figure(magnet, points, None if held_out is None else points_of(held_out)),
+            f"The nominal blocks of the first ring, {'the iron, ' if magnet.iron else ''}and the "
             "points of the map and the held-out points")}
     magnitude = np.linalg.norm(np.nan_to_num(readings["B_T"].values), axis=1)
     write_page(
@@ -93,7 +92,7 @@ def write_campaign_page(
         provenance={"source": "simulated", "SHA-256 of the truth": readings.attrs["truth_sha256"]},
         answer=answer(study, readings, held_out, len(blocks)),
         rows=campaign_table(study, readings, held_out), blocks=len(blocks),
-        files=files, view=view_of_nominal_magnet(build_magnet(study), ViewPoints(
+        files=files, view=view_of_nominal_magnet(magnet, ViewPoints(
             points, 1e3 * magnitude, "points of the map", "magnitude of the<br>readings in mT",
             "magnitude of the readings %{customdata:.5g} mT",
             (1e3 * float(magnitude.min()), 1e3 * float(magnitude.max())))))

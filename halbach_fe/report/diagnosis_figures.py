@@ -314,6 +314,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
              else before.observation.positions)[index[0]]
     x, y, _ = 1e3 * where.round(6) + 0.0  # no -0
     of_map = f" of map {before.maps[index[0]]}" if before.is_campaign else ""
+    line_at = f"x = {x:.0f} mm, y = {y:.0f} mm".replace("-", "\u2212")
     if harmonic:
         wave = {"A": "cos", "B": "sin"}[label]
         label = f"{label}$_n$"
@@ -321,7 +322,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
                       f"{np.hypot(x, y):.0f} mm", fontsize="medium")
     else:
         top.set_title(f"{label}{of_map} at all points" if not connected else
-                      f"{label}{of_map} at x = {x:.0f} mm, y = {y:.0f} mm"
+                      f"{label}{of_map} at {line_at}"
                       if name.startswith("z") else
                       f"{label}{of_map} at a radius of {np.hypot(x, y):.0f} mm",
                       fontsize="medium")

@@ -67,6 +67,9 @@ CERTAIN_SD = 3.0
 """Standard deviations up to which a pose or an error of a probe counts as zero: of some 25 such
 numbers that are zero, one is farther away in one of 15 maps."""
 
+NEAR_M, NEAR_RAD = 1e-3, 1e-2
+"""Shift and turn up to which `diagnose` finds a map's pose from that of the study."""
+
 NOMINAL = "nominal magnet"
 UPDATED = "magnet as the maps before have updated it"
 """What the readings are compared with before they update the blocks."""
@@ -119,9 +122,22 @@ def answer(
              "(--across-m, --turn-rad), and register again.",
              f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
             if best.explains else
+            ("Look for what the model lacks. The map lies about where the study states it, and "
+             "diagnose finds small shifts and turns by itself.",
+             f"halbach-fe diagnose STUDY{maps} -o DIR")
+            if _is_near(best, assumed or Instrument()) else
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound,
         changes_study=not _is_as_assumed(best, assumed or Instrument()))
+
+
+def _is_near(best: Registration, assumed: Instrument) -> bool:
+    """Tell whether the map lies within `NEAR_M` and `NEAR_RAD` of where the study states it."""
+    (shift, turn), (old_shift, old_turn) = (
+        (np.array(one.translation_m), np.array(one.rotation_rad))
+        for one in (best.instrument, assumed))
+    return not best.open_keys and bool(
+        np.abs(shift - old_shift).max() < NEAR_M and np.abs(turn - old_turn).max() < NEAR_RAD)
 
 
 def _is_as_assumed(best: Registration, assumed: Instrument) -> bool:

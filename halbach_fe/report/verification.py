@@ -204,8 +204,8 @@ def write_verification(
         figures["verification_along.png"] = _change_figure(found), (
             "Change of B at every position of the study, for each change of the model")
     figures["verification_geometry.png"] = geometry_figure(magnet, found.points), (
-        "The blocks of the first ring with their easy axes, the iron ring if the study has one, "
-        "and the study's positions")
+        "The blocks of the first ring with their easy axes, "
+        f"{'the iron, ' if magnet.iron else ''}and the study's positions")
     change = found.changes[STEPS - 1]
     write_page(
         folder / "verification.html", "verification.html.j2", save(figures, folder),

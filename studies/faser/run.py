@@ -41,7 +41,7 @@ def profile_to_map(source: Path, target: Path, z_step: float) -> PublishedErrors
     flux_density[:, 0] = measured
     write_map(field_map(points, flux_density, attributes={
         "source": "Fleig et al. 2023, Fig. 4", "assumed_z_step_m": str(z_step)}), target)
-    return PublishedErrors("paper", z, prior, posterior)
+    return PublishedErrors("Fleig et al. 2023", z, prior, posterior)
 
 
 def with_step(study: Study, z_step: float) -> Study:
@@ -74,8 +74,8 @@ def assumptions(update: InferenceResult, z_step: float) -> list[str]:
         f"So placed, the measured profile is {1000 * measured:.0f} mm wide at half its height, the "
         f"model's {1000 * model:.0f} mm: step or length is wrong, which explains a part of the "
         f"misfit in the fringe field; a step of {1000 * z_step * model / measured:.2f} mm would "
-        "make them equal. What remains is that the line lies beside the axis: see "
-        "make study-faser-diagnosis.",
+        "make them equal. With that step the readings still do not fit a line on the axis, but "
+        "one beside it: `make study-faser-diagnosis` finds where, and what is left then.",
         "The 1.0 m magnet has 12 rings of 83.3 mm; the ring length is inferred.",
         "The nominal moment of 330 A m² per block, as published, gives a bore field some 2 % "
         "above the measured one; the prior allows 5 % for what all blocks share.",
