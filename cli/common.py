@@ -239,13 +239,13 @@ def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
 
 
 SIMULATED = b"# source: synthetic"
-"""How a map (CSV) begins that `halbach-fe simulate-measurement` wrote."""
+"""How a map or block table (CSV) begins that `halbach-fe simulate-measurement` wrote."""
 
 
 def digest(path: Path) -> str:
     """Return the name of a file and the SHA-256 of what was read, for the provenance of a page.
 
-    It says if the file is a map that `halbach-fe simulate-measurement` wrote.
+    It says if the file is one that `halbach-fe simulate-measurement` wrote.
     """
     content = path.read_bytes()
     simulated = ", simulated" if content.startswith(SIMULATED) else ""

@@ -83,7 +83,7 @@ def answer(found: DemagnetizationMap) -> Answer:
              "no cell is past the knee of the demagnetization curve")
     limits = "; ".join(
         f"{'the first cell' if not share else f'{100 * share:g} % of the volume'} passes the knee "
-        f"at {limit:.0f} °C" if math.isfinite(limit) else
+        f"at {round(limit)} °C" if math.isfinite(limit) else
         f"{'no cell' if not share else f'{100 * share:g} % of the volume'} "
         f"{'ever' if not share else 'never'} passes the knee"
         for share, limit in ((share, found.limit_temperature(share)) for share in SHARES))
@@ -158,8 +158,8 @@ def _layers(found: DemagnetizationMap) -> dict[str, Ints]:
     middle = z[np.argmin(np.abs(z))]
     worst = z[np.argmin(found.margin)]
     if np.isclose(abs(worst), abs(middle)):
-        return {f"z = {1e3 * worst:.0f} mm" if np.ptp(z) else "": np.flatnonzero(z == worst)}
-    return {f"z = {1e3 * height:.0f} mm{words}": np.flatnonzero(z == height)
+        return {f"z = {round(1e3 * worst)} mm" if np.ptp(z) else "": np.flatnonzero(z == worst)}
+    return {f"z = {round(1e3 * height)} mm{words}": np.flatnonzero(z == height)
             for height, words in ((middle, ""), (worst, ", smallest margin"))}
 
 

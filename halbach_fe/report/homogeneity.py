@@ -140,7 +140,7 @@ def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, boo
     small = error <= rms_ppm
     return ("The field of given blocks is exact: no mesh is needed." if not error else
             f"The solver's own error, {ppm(error)} ppm rms, is {'' if small else 'not '}below "
-            "that."), small
+            f"the deviation of {ppm(rms_ppm)}."), small
 
 
 def _known_as(name: str) -> str:

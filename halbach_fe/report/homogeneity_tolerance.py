@@ -26,7 +26,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import ppm, share_in_words
+from halbach_fe.report.words import ppm, share_in_words, whole
 from halbach_fe.study.inference import Prior
 
 ENOUGH = 0.9
@@ -98,7 +98,7 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,
         f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
-        f"{len(found.rms_ppm)} magnets were drawn. {text}", *step,
+        f"{whole(len(found.rms_ppm))} magnets were drawn. {text}", *step,
         sound=small)
 
 

@@ -39,7 +39,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         "[inference.held_out] or --held-out.")
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
-    flat = result.magnet.dimension == 2
+    # the field of a quadrupole is not meant to be the same everywhere
+    of_order = result.magnet.dimension == 2 or result.magnet.array.multipole_order > 1
     faults = faults_in_words(result.study)
     mend = "" if not faults else (
         f"This is the magnet with blocks that are not as designed ({faults}): put that right and "
@@ -49,10 +50,10 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
         f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}",
-        f"{mend}See {'its multipoles' if flat else 'how homogeneous it is'}; halbach-fe "
-        f"{'' if flat else 'multipoles and '}shim {'says' if flat else 'say'} more.",
-        f"halbach-fe {'multipoles' if flat else 'homogeneity'} STUDY --posterior DIR/posterior.h5 "
-        "-o DIR")
+        f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
+        f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
+        f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
+        "DIR/posterior.h5 -o DIR")
 
 
 def _of_the_probe(result: InferenceResult) -> str:

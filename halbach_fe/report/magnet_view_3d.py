@@ -64,11 +64,13 @@ var owners = view.data[0].customdata, texts = view.data[0].meta;
 if (texts) Plotly.restyle(view, {text: [Array.from(owners, function(one) {
     return texts[one]; })]}, [0]);
 var eye = view._fullLayout.scene.camera.eye, left = view._fullLayout._size, wide = left.w / left.h;
+var far = 1.15 / wide;
 if (wide < 1) Plotly.relayout(view, {'scene.camera.eye':
-    {x: eye.x / wide, y: eye.y / wide, z: eye.z / wide}});
+    {x: far * eye.x, y: far * eye.y, z: far * eye.z}});
 """
 """Runs when the view is there: gives the vertices the text of their block, which the page holds
-once, and takes the camera back where what the colour scales leave of the view is narrow."""
+once, and takes the camera back where what the colour scales leave of the view is narrow (a little
+more than in proportion, as numbers beside the axes have the same size on any screen)."""
 
 MM = 1e3
 

@@ -124,7 +124,8 @@ def coil_table(
         ring=np.array([ring for ring, _ in there]), slot=np.array([slot for _, slot in there]),
         moment=measured.round(digits), sigma=sigma.round(digits),
         volume=np.array([shape.volume for shape in shapes]),
-        temperature=np.full(len(bodies), np.nan if reference is None else reference)), calibration
+        temperature=np.full(len(bodies), np.nan if reference is None else reference),
+        attributes={"source": "synthetic"}), calibration
 
 
 def _before_mounting(magnet: TrueMagnet, numbers: Iterable[int]) -> tuple[Body, ...]:

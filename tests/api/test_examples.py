@@ -34,7 +34,8 @@ def campaign(tmp_path_factory):
     (folder / "dipole.toml").write_text(tomlkit.dumps(study))
     (folder / "mri.toml").write_text(tomlkit.dumps(cuboids.DOCUMENT))
     hf.write_report(hf.simulate_measurement(hf.read_study(folder / "dipole.toml")), folder)
-    header, *rows = (folder / "blocks.csv").read_text().splitlines()
+    header, *rows = [line for line in (folder / "blocks.csv").read_text().splitlines()
+                     if not line.startswith("#")]
     names = header.split(",")
     place = [names.index(name) for name in ("serial", "ring", "slot")]
     for row in rows[:2]:  # two more blocks of the first types
