@@ -5,7 +5,8 @@ pose and probe are fitted together with the blocks. Numbers that a drawing leave
 too, and sets of them are compared with --alternative. Writes study.registered.toml (the study's own
 file with the instrument and these numbers), registration.json, registration.html and its figure. A
 symmetric magnet allows several poses, all of which are reported with their odds; the file has the
-most probable one. If the study lists maps, they are registered one after the other, each in the
+most probable one, or of those between which the readings do not decide the one that is turned
+least. If the study lists maps, they are registered one after the other, each in the
 magnet as those before it have updated it, and each gets a folder with its own page.
 """
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from halbach_fe.inference.pose_result import OpenKey, Registration
+    from halbach_fe.study.measurement import Instrument
     from halbach_fe.study.model import Study
 
 
@@ -123,7 +125,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(registration_summary(found))
         return 0
-    _print(arguments, found, arguments.output / "registration.html")
+    _print(arguments, found, arguments.output / "registration.html", study.instrument)
     return 0
 
 
@@ -153,15 +155,15 @@ def _run_campaign(
         common.print_json({"maps": {name: registration_summary(poses)
                                     for name, poses in found.items()}})
         return 0
-    for number, (name, poses) in enumerate(found.items()):
-        common.say(f"Map {name}:")
-        _print(arguments, poses, arguments.output / name / "registration.html",
-               UPDATED if number else NOMINAL, name)
+    for number, one in enumerate(maps):
+        common.say(f"Map {one.name}:")
+        _print(arguments, found[one.name], arguments.output / one.name / "registration.html",
+               one.study.instrument, UPDATED if number else NOMINAL, one.name)
     return 0
 
 
 def _print(arguments: argparse.Namespace, found: Sequence[Registration], page: Path,
-           *of_map: str) -> None:
+           assumed: Instrument, *of_map: str) -> None:
     """Print what was found about one map, see `halbach_fe.report.registration.answer`."""
     from halbach_fe.report.registration import answer, place_table, pose_table, sentences
 
@@ -169,4 +171,4 @@ def _print(arguments: argparse.Namespace, found: Sequence[Registration], page: P
         common.say(sentence)
     common.print_table(pose_table(found, *of_map[:1]), "Poses of the map")
     common.print_table(place_table(found), "Where the map lies in the magnet")
-    common.say_answer(arguments, answer(found, *of_map), page)
+    common.say_answer(arguments, answer(found, *of_map, assumed=assumed), page)

@@ -323,7 +323,7 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             instead=", ".join(dict.fromkeys(instead)) or EMPTY_CELL))
     for pose in diagnosis.poses:
         others = "" if not pose.others else (
-            " By symmetry it could lie elsewhere too, with a probability of "
+            " Poses that the readings hardly tell from this one have a probability of "
             f"{', '.join(f'{100 * one:.0f}' for one in pose.others)} %.")
         found.append(OtherFinding(
             "pose", "place and axes of the map", "registration",

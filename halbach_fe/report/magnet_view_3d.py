@@ -21,6 +21,7 @@ from halbach_fe.geometry.outline import Edge, outline_contains
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.field_traces_3d import UNSIGNED, cut_trace, residuals_trace
 from halbach_fe.report.page import IRON, MEASURED
+from halbach_fe.report.words import place_of
 from halbach_fe.study.types import COMPONENTS
 
 ARC_POINTS = 5
@@ -286,13 +287,13 @@ def magnet_view(
 
 
 def _named_trace(blocks: Sequence[MagnetBlock], outer: float) -> go.Scatter3d:
-    """Draw ring and slot of blocks beyond the outer radius in m, with a line to each block."""
+    """Draw the names of blocks beyond the outer radius in m, with a line to each block."""
     middles = np.array([block.middle for block in blocks])
-    outside = middles.copy()
-    outside[:, :2] *= OUTSIDE * outer / np.hypot(*middles[:, :2].T)[:, None]
+    outside, radius = middles.copy(), np.hypot(*middles[:, :2].T)
+    outside[radius < 1e-9 * outer, 0] = outer  # blocks on the axis
+    outside[:, :2] *= OUTSIDE * outer / np.hypot(*outside[:, :2].T)[:, None]
     x, y, z = np.stack([middles, outside, np.full_like(middles, np.nan)], axis=1).reshape(-1, 3).T
-    texts = [text for block in blocks
-             for text in ("", f"ring {block.ring}, slot {block.slot}", "")]
+    texts = [text for block in blocks for text in ("", place_of(block), "")]
     return go.Scatter3d(
         x=x, y=y, z=z, text=texts, mode="lines+text", name="found", hoverinfo="skip",
         line={"color": MEASURED, "width": 5}, textposition="top center",

@@ -109,12 +109,25 @@ def write_page(
             if file not in given.values()}
     provenance = {**given, **read, "programs": programs()}
     text = rendered(template, pictures=pictures, study=study, rows=rows, provenance=provenance,
+                    simulated=simulated_files(provenance),
                     answer=answer and answer.with_known_paths(), **data)
     write_text(path, text)
     title = re.search("<title>(.*?)</title>", text, re.S)
     write_record(path, html.unescape(title[1]) if title else "",
                  answer and answer.with_known_paths(folder=False), pictures, rows, provenance,
                  study)
+
+
+def simulated_files(provenance: Mapping[str, str]) -> str:
+    """Say which of the files that were read are simulated; nothing if none is."""
+    files = [(name, file) for name, text in provenance.items() for file in text.split("; ")
+             if ", simulated, SHA-256" in file]
+    of_blocks = [name in ("blocks", "stock") or file.startswith("blocks") for name, file in files]
+    if not files:
+        return ""
+    return ("The measurements of the blocks are" if all(of_blocks) else
+            "The map and the measurements of the blocks are" if any(of_blocks) else
+            "The map is") + " simulated, not measured."
 
 
 def programs() -> str:

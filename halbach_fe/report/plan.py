@@ -104,11 +104,12 @@ def answer(plan: MeasurementPlan) -> Answer:
             f"; with as many of the study's own positions to {fraction(of_study)}"
             f"{'' if left < LITTLE * of_study else ', which is hardly more'}")
         blocks = _rms(plan.planned_sd) / _rms(plan.prior_sd)
+        better = "What blocks that deviate together do to the field is known better: the"
         said += (f"After {'all of ' if everything else ''}them a block's magnetization is "
                  f"uncertain by {fraction(blocks)} of what it is before (rms over the blocks). "
-                 "What blocks that deviate together do to the field is known better: the "
-                 "uncertainty of such a pattern, by which the positions are chosen, falls to "
-                 f"{fraction(left)} (geometric mean){beside}. ")
+                 f"{better if left < blocks else 'The'} uncertainty of "
+                 f"{'such a pattern' if left < blocks else 'patterns of blocks'}, by which the "
+                 f"positions are chosen, falls to {fraction(left)} (geometric mean){beside}. ")
         if left > VAGUE:
             said += ("So such a map tells little of the single blocks, at whatever positions of "
                      "these it is measured. Measure the blocks before assembly, or the field "

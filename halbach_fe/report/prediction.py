@@ -260,8 +260,9 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
     legend = figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False,
         markerscale=5 if len(result.readings) > CROWD else 1)
-    for handle in filter(None, legend.legend_handles):  # prior and posterior have their own colours
-        handle.set(color=MEASURED, alpha=1.0)
+    if len(result.readings) <= CROWD:  # the markers tell the parts apart, in two colours
+        for handle in filter(None, legend.legend_handles):
+            handle.set(color=MEASURED, alpha=1.0)
     axes[1].set_xlabel(label)
     return figure
 

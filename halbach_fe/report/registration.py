@@ -15,7 +15,13 @@ from halbach_fe.core.files import write_text
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import Registration
-from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, axes_of_map, odds, turn_from_axes
+from halbach_fe.inference.registration import (
+    EQUAL_LOG_EVIDENCE,
+    UNDECIDED_LOG_EVIDENCE,
+    axes_of_map,
+    odds,
+    turn_from_axes,
+)
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points, turn_of
@@ -92,7 +98,7 @@ def answer(
         best.middle_m, best.translation_sd_m, strict=True))
     said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
             f"magnet. On the map's stage the middle of the magnet is at {_magnet_on_stage(best)}.")
-    alike = sum(_fit_alike(best, each) for each in found[1:])
+    alike = sum(_fit_alike(best, each) or is_symmetric_to(best, each) for each in rivals(found))
     if alike:
         said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
                  "likely.")
@@ -102,9 +108,8 @@ def answer(
     if best.explains and not best.at_rest:
         said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
     if best.explains:
-        trust.insert(0, NOT_AT_REST if not best.at_rest else
-                     AT_REST if best.log_evidence > max(each.log_evidence for each in found)
-                     - EQUAL_LOG_EVIDENCE else UNDECIDED)
+        trust.insert(0, NOT_AT_REST if not best.at_rest else AT_REST if all(
+            is_symmetric_to(best, each) for each in rivals(found)) else UNDECIDED)
     else:
         said = ("This magnet does not explain the map. The least bad answer: "
                 f"{said[0].lower()}{said[1:]}")
@@ -129,6 +134,12 @@ def answer(
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound,
         changes_study=not _is_as_assumed(best, assumed or Instrument()))
+
+
+def rivals(found: Sequence[Registration]) -> list[Registration]:
+    """Return the other poses between which and the first one the readings do not decide."""
+    least = found[0].log_evidence - UNDECIDED_LOG_EVIDENCE
+    return [each for each in found[1:] if each.log_evidence > least]
 
 
 def _is_near(best: Registration, assumed: Instrument) -> bool:
@@ -194,7 +205,7 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
     alike, unlike = [], []
     for each, value in zip(found[1:], probability[1:], strict=True):
         if value > EQUALLY_GOOD:
-            if _fit_alike(found[0], each):
+            if _fit_alike(found[0], each) or is_symmetric_to(found[0], each):
                 alike.append(each)
             else:
                 unlike.append(f"{100 * value:.0f}\u00a0%")
@@ -315,7 +326,7 @@ def by_hypothesis(found: Sequence[Registration]) -> dict[str, float]:
     total: dict[str, float] = {}
     for each, probability in zip(found, odds(found), strict=True):
         total[hypothesis(each)] = total.get(hypothesis(each), 0.0) + float(probability)
-    return total
+    return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
 def _rms_in_words(rms: np.ndarray) -> str:

@@ -180,6 +180,8 @@ def answer(found: SortedBlocks) -> Answer:
               f"in 95 % of random orders {text(low)} to {text(high)}")
     gains = sorted(1 - best / each for each in (own, float(np.median(found.random))))
     hardly = "" if gains[0] >= LITTLE else (
+        "The order of the table is nearly as good already. " if gains[1] >= LITTLE > 1 - best / own
+        else "A random order is nearly as good. " if gains[1] >= LITTLE else
         "The order hardly matters: the sorted one is "
         f"{' to '.join(dict.fromkeys(f'{100 * gain:.2g}' for gain in gains))}\u00a0% better than "
         "that of the table or a random one. ")
@@ -191,7 +193,9 @@ def answer(found: SortedBlocks) -> Answer:
         f"{text(own)}, and {orders}.{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} makes {text(spread)} {unit} of its own, "
         "added by squares, whatever the order"
-        f"{'' if spread <= best else ': more than what sorting leaves'}.{_ordered(found)}",
+        f"{'' if spread <= best else ': more than what sorting leaves'}. Blocks go only into slots "
+        f"of their own type{'' if found.turned else ', as they lie'}; halbach-fe shim also turns "
+        f"them upside down.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks." if not hardly else
         "Assemble the magnet in this order, or in another one that you write into "
         "blocks.sorted.csv, measure it, and update the blocks. To gain more, let more slots take "

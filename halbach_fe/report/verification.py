@@ -117,8 +117,9 @@ def answer(found: Verification) -> Answer:
         finer = ("Most of the error is that the computed region ends too near. Make "
                  + " and ".join(f"{key} larger (now {1e3 * size:.3g} mm)"
                                 for key, size in keys.items()) + ", and verify again.", finer[1])
-    bars = ("It is from several meshes: quote it, rather than that of halbach-fe solve, which is "
-            "from a single comparison and may be several times larger.")
+    bars = "" if rough or found.differences[-1].what == EXACT else (
+        "This estimate is from several meshes: quote it, rather than that of halbach-fe solve, "
+        "which is from a single comparison and may be several times larger.")
     return Answer(question, said, " ".join(filter(None, (trust, noise, bars))),
                   *(finer if rough or noisy else measure), sound=not rough)
 

@@ -28,6 +28,7 @@ from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.report.registration import (
     AT_REST,
     NOT_AT_REST,
+    UNDECIDED,
     answer,
     is_symmetric_to,
     magnet_on_stage,
@@ -112,10 +113,20 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     assert "fits these readings equally well" in answer([uneven, twin]).trust
     moved = replace(other, middle_m=other.middle_m + np.array([0, 0, 0.01]))
     assert not is_symmetric_to(best, moved)
+    # what ends fits of equal poses up to 1 apart tells nothing of them, but much of other poses
     nearly = replace(twin, log_evidence=best.log_evidence - 1)
-    assert "1 other pose cannot be ruled out" in answer([best, nearly]).trust
+    assert answer([best, nearly]).trust.startswith(AT_REST)
+    assert "1 other pose predicts the same readings" in answer([best, nearly]).trust
+    for evidence in (-1, 1):
+        undecided = replace(twin, log_evidence=best.log_evidence + evidence)
+        trust = answer([uneven, undecided]).trust
+        assert trust.startswith(UNDECIDED)
+        assert "1 other pose cannot be ruled out" in trust
+        assert ("turned least" in trust) == (evidence > 0)
+    worse = replace(twin, log_evidence=best.log_evidence - 1.1 * UNDECIDED_LOG_EVIDENCE)
+    assert answer([uneven, worse]).trust.startswith(AT_REST)
     # and a fit that has not come to rest is not to be used, nor has it odds
-    restless = answer([replace(best, at_rest=False), nearly])
+    restless = answer([replace(uneven, at_rest=False), nearly])
     assert "so that the odds of poses mean little" in restless.trust
     assert restless.trust.startswith(NOT_AT_REST)
     assert "register" in restless.command
@@ -137,6 +148,11 @@ def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path
         assert answer([again]).changes_study
         # a study that states that already is confirmed
         assert not answer([again], assumed=other.instrument).changes_study
+    # a map that lies where the study says but is not explained is for the study to explain
+    unexplained = replace(best, chi2=50.0)
+    assert "diagnose STUDY" in answer([unexplained]).command
+    far = own.with_(translation_m=(0.0, 0.0, 0.02))
+    assert "diagnose DIR/study.registered.toml" in answer([unexplained], assumed=far).command
 
 
 def test_sensors_that_a_map_does_not_have_are_not_in_its_table(magnet, generator, tmp_path):

@@ -742,6 +742,30 @@ def test_an_order_that_hardly_matters(given):
     assert "or in another one that you write into blocks.sorted.csv" in said.step
 
 
+def test_an_order_is_compared_with_the_table_and_with_random_ones(given):
+    """The table may be sorted already, where random orders are far worse; and the other way."""
+    magnet = build_magnet(given.study.with_(array__rings=2))
+    found = hf.sort(magnet, given.campaign.blocks, given.session)
+    own = found.numbered
+    best = replace(own, mean=0.99 * own.mean)
+    said = sorting.answer(replace(found, best=best, random=2 * found.random)).said
+    assert said.startswith("The order of the table is nearly as good already.")
+    said = sorting.answer(replace(found, best=best, numbered=replace(own, mean=2 * own.mean),
+                                  random=own.rms_of_mean * np.ones(len(found.random)))).said
+    assert said.startswith("A random order is nearly as good.")
+
+
+def test_what_only_the_tolerances_make_is_named_beside_the_design():
+    """Of order 3, as the design makes order 9; of a design that makes all there is nothing."""
+    found = SimpleNamespace(
+        model=SimpleNamespace(orders=(2, 3, 9)), known=SimpleNamespace(sizes=np.array([0, 1, 148])),
+        quantiles=np.array([[1, 2, 147], [5, 25.9, 148], [9, 54, 149], [10, 60, 150]]))
+    assert ("The largest that only the tolerances make is c_3, of 25.9 units in half of the "
+            "magnets, and up to 54 in 95 %.") in tolerance._made_by_tolerances(found)
+    found.known.sizes = np.array([5, 25, 148])
+    assert tolerance._made_by_tolerances(found) == ""
+
+
 def test_error_bars_that_take_the_probe_as_exact_say_so(given):
     """Not if the study says how well its gain is known."""
     exact = inference_answer.answer(given.updated).trust

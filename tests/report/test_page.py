@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import SMALL, own_style, save, write_page
+from halbach_fe.report.page import SMALL, own_style, save, simulated_files, write_page
 from halbach_fe.report.page_record import DPI, LEGIBLE_PX
 from tests.conftest import DIPOLE, ROOT, parse_study
 from tests.support.pages import page
@@ -141,3 +141,16 @@ def test_the_backend_of_a_notebook_is_not_needed(backend):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
                           check=False, env=os.environ | {"MPLBACKEND": backend})
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_was_simulated_is_said():
+    """Of the map, of the blocks, or of both; also if a posterior was computed with them."""
+    of_map, of_blocks = "map.csv, simulated, SHA-256 12", "coil.csv, simulated, SHA-256 34"
+    measured = {"measurements": "map.csv, SHA-256 12", "blocks": "coil.csv, SHA-256 34"}
+    assert simulated_files(measured) == ""
+    assert simulated_files(measured | {"blocks": of_blocks}).startswith("The measurements of the b")
+    assert simulated_files(measured | {"measurements": of_map}).startswith("The map is simulated")
+    both = "The map and the measurements of the blocks are simulated"
+    assert simulated_files({"measurements": of_map, "blocks": of_blocks}).startswith(both)
+    behind = f"{of_map}; blocks.csv, simulated, SHA-256 34"
+    assert simulated_files({"read for the posterior": behind}).startswith(both)
