@@ -37,14 +37,18 @@ NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 """Largest numbers of slots and rings for which the contraction figure prints its values."""
 
+ALIKE = 0.03
+"""Range of the contractions of all blocks up to which they are said instead of drawn."""
+
 
 def score_table(result: InferenceResult,
                 published: PublishedErrors | None = None) -> list[dict[str, str]]:
     """Return the rows, as text, of the table that compares predictions before and after.
 
-    Before the update, chi² is that of all training readings together, which the answer states: in
-    their own row, or in one below those of several regions. Beside published errors, which are
-    medians of relative ones, there are such medians of ours.
+    Regions have names if there are several. Before the update, chi² is that of all training
+    readings together, which the answer states: in their own row, or in one below those of several
+    regions. Beside published errors, which are medians of relative ones, there are such medians of
+    ours.
     """
     rows, largest = [], float(np.abs(result.readings).max())
     training = ~result.held_out
@@ -81,6 +85,8 @@ def score_table(result: InferenceResult,
             " ", "\u00a0"), "before, rms": off[0], "after, rms": off[1],
             "chi²/reading, before": _chi2(result.prior_conflict)}
         rows.append({name: together.get(name, NOTHING) for name in rows[0]})
+    if len({row["region"] for row in rows}) == 1:  # its name tells nothing
+        rows = [{name: text for name, text in row.items() if name != "region"} for row in rows]
     return rows
 
 
@@ -108,6 +114,7 @@ def write_inference_report(
     """
     unseen = ("of the held-out readings for prior and posterior" if result.held_out.any()
               else "of the training readings for the prior (nothing was held out)")
+    contraction = result.contraction[~np.isnan(result.contraction)]  # missing blocks have none
     profile = ("Readings with the predictions of prior and posterior, and the residuals of the "
                "posterior, along the line of the strongest reading")
     profiles = ({"profile.png": (prediction_profile_figure(result), profile)}
@@ -137,10 +144,11 @@ def write_inference_report(
                           "is right"),
         "blocks.png": (_magnetization_change_figure(result), "Posterior change of the "
                        "magnetization along the easy axis, from nominal, by ring and slot"),
+    } | ({} if not len(contraction) or np.ptp(contraction) < ALIKE else {
         "contraction.png": (_contraction_figure(result), "Contraction of each block: "
                             "the decrease of its variance from prior to posterior; 0 % means that "
                             "the readings contain no information about the block"),
-    } | dict(stray_pictures(result.stray_field))
+    }) | dict(stray_pictures(result.stray_field))
     multipoles: list[MultipoleTable] = [
         (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
         for model in ([] if result.is_campaign else circle_models(
@@ -153,7 +161,7 @@ def write_inference_report(
         provenance=provenance, result=result, multipoles=middle_table(multipoles, result.study),
         rows=score_table(result, published), published=published, assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet),
-        answer=said,
+        answer=said, contraction=_contraction_in_words(result, contraction),
         terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
         noise=[flux_density(float(end), 2)
                for end in (result.noise.sd.min(), result.noise.sd.max())],
@@ -213,6 +221,17 @@ def _magnetization_change_figure(result: InferenceResult) -> Figure:
     axis.set_yticks(range(1, rings + 1, max(1, rings // 12)))
     figure.colorbar(image, label="posterior change along\nthe easy axis in %")
     return figure
+
+
+def _contraction_in_words(result: InferenceResult, contraction: Floats) -> str:
+    """Say what part of the blocks' variances the readings take away."""
+    if not len(contraction):
+        return "none: the prior leaves nothing open"
+    low, high = (f"{100 * end:.0f}" for end in (contraction.min(), contraction.max()))
+    share = f"{low} to {high}" if low != high else low
+    together = ("" if result.measured_blocks is None or not result.study.prior.common_mode_sd else
+                "; a part of it is the calibration of the coil, which all measured blocks share")
+    return f"by {share}\u00a0% of the prior's variance{together}"
 
 
 def _contraction_figure(result: InferenceResult) -> Figure:

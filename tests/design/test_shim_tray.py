@@ -217,7 +217,7 @@ def test_command(measured, tmp_path, capsys):
     assert len(table) == summary["places"] == 24
     assert sum(bool(row["magnet"]) for row in table) == summary["magnets"]
     page = (out / "shim_tray.html").read_text()
-    assert "in place of" in page
+    assert ", without them by" in page
     assert "(None" not in page
     assert main([*arguments[:-1], str(tmp_path / "json"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == summary
