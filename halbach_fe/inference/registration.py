@@ -81,7 +81,7 @@ def register(
     Returns
     -------
     list of Registration
-        The most probable pose first.
+        The most probable pose first, see `least_turned_first`.
 
     Raises
     ------

@@ -142,6 +142,18 @@ def rivals(found: Sequence[Registration]) -> list[Registration]:
     return [each for each in found[1:] if each.log_evidence > least]
 
 
+def stated_odds(found: Sequence[Registration]) -> Floats:
+    """Return the odds (n,) of poses; the same for those that a symmetric magnet makes equal.
+
+    Their evidence differs only by where the fits ended.
+    """
+    probability, others = odds(found), rivals(found)
+    equal = [number for number, each in enumerate(found) if number == 0 or (
+        any(each is one for one in others) and is_symmetric_to(found[0], each))]
+    probability[equal] = probability[equal].mean()
+    return probability
+
+
 def _is_near(best: Registration, assumed: Instrument) -> bool:
     """Tell whether the map lies within `NEAR_M` and `NEAR_RAD` of where the study states it."""
     (shift, turn), (old_shift, old_turn) = (
@@ -201,7 +213,7 @@ def magnet_on_stage(best: Registration) -> tuple[Floats, Floats]:
 
 def _other_poses(found: Sequence[Registration]) -> list[str]:
     """Say which other poses are possible, and whether it matters which of them is used."""
-    probability, said = odds(found), []
+    probability, said = stated_odds(found), []
     alike, unlike = [], []
     for each, value in zip(found[1:], probability[1:], strict=True):
         if value > EQUALLY_GOOD:
@@ -341,7 +353,7 @@ def pose_table(
 ) -> list[dict[str, str]]:
     """Return rows of text, one per pose."""
     rows = []
-    for number, (each, probability) in enumerate(zip(found, odds(found), strict=True), 1):
+    for number, (each, probability) in enumerate(zip(found, stated_odds(found), strict=True), 1):
         rows.append({
             "pose": str(number), "odds": f"{100 * probability:.3g} %",
             **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
@@ -408,7 +420,7 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         "held_out_rms_T": numbers(each.held_out_rms_T),
         "held_out_nominal_rms_T": numbers(each.held_out_nominal_rms_T),
         "log_evidence": each.log_evidence,
-    } for each, probability in zip(found, odds(found), strict=True)]}
+    } for each, probability in zip(found, stated_odds(found), strict=True)]}
 
 
 def write_registration(

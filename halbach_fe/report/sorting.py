@@ -187,8 +187,8 @@ def answer(found: SortedBlocks) -> Answer:
         "that of the table or a random one. ")
     return Answer(
         question,
-        f"{hardly}The table of places below has the slot of each block, as blocks.sorted.csv has "
-        f"for machines. In these slots {what} "
+        f"{hardly}The slot of each block is in the table of places, which opens below, and in "
+        f"blocks.sorted.csv. In these slots {what} "
         f"{text(best)} {unit}{sizes}; with the blocks {found.own_order} it would be "
         f"{text(own)}, and {orders}.{left}{turned}",
         f"Yes. The uncertainty of {in_a_row(known)} makes {text(spread)} {unit} of its own, "

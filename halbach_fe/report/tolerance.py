@@ -110,8 +110,10 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
             f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
     ordered = float(found.known.sizes.max())
     if ordered > OF_THE_DESIGN * half:
-        said += (f" That is the magnet as designed ({ordered:.3g} units with blocks as ordered), "
-                 f"to which their tolerances add little.{_made_by_tolerances(found)}")
+        made = _made_by_tolerances(found)
+        said = (f"{made}{said[0].lower() if made else said[0]}{said[1:]} That is the magnet as "
+                f"designed ({ordered:.3g} units with blocks as ordered), to which their "
+                "tolerances add little.")
     share, prior = found.share, found.study.prior
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
@@ -134,9 +136,9 @@ def _made_by_tolerances(found: Tolerance) -> str:
     if not own.any():
         return ""
     number = int(np.argmax(np.where(own, half, 0.0)))
-    return (f" The largest that only the tolerances make is c_{found.model.orders[number]}, of "
-            f"{half[number]:.3g} units in half of the magnets, and up to {most[number]:.3g} in "
-            "95 %.")
+    return ("The largest multipole that only the tolerances make is "
+            f"c_{found.model.orders[number]}: below {half[number]:.3g} units in half of the "
+            f"magnets, below {most[number]:.3g} in 95 %. With what the design makes: ")
 
 
 @own_style

@@ -107,8 +107,9 @@ def answer(found: Verification) -> Answer:
     noisy, noise = _beside_the_noise(found)
     trust = ("No: the last refinement does not change the field less than the one before. The "
              "estimate is rough, and the mesh should be finer." if rough else
-             "Yes: the field converges. In the last refinements, elements of half the size divide "
-             f"its change from mesh to mesh by {2**found.order:.2g} (order {found.order:.1f}).")
+             "Yes: the field converges. The estimate takes it that elements of half the size "
+             f"divide the change from mesh to mesh by {2**found.order:.2g} (order "
+             f"{found.order:.1f}), no more than these meshes show.")
     finer = (f"Make mesh.block_size_m smaller (elements are now "
              f"{1e3 * found.element_size_m:.3g} mm), and verify again.",
              "halbach-fe verify STUDY -o DIR")

@@ -34,6 +34,7 @@ from halbach_fe.report.registration import (
     magnet_on_stage,
     place_table,
     probe_table,
+    stated_odds,
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.study.measurement import Instrument
@@ -117,6 +118,8 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
     nearly = replace(twin, log_evidence=best.log_evidence - 1)
     assert answer([best, nearly]).trust.startswith(AT_REST)
     assert "1 other pose predicts the same readings" in answer([best, nearly]).trust
+    assert stated_odds([best, nearly]) == pytest.approx([0.5, 0.5])
+    assert stated_odds([uneven, nearly]) == pytest.approx(odds([uneven, nearly]))
     for evidence in (-1, 1):
         undecided = replace(twin, log_evidence=best.log_evidence + evidence)
         trust = answer([uneven, undecided]).trust

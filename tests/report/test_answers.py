@@ -761,8 +761,8 @@ def test_what_only_the_tolerances_make_is_named_beside_the_design():
     found = SimpleNamespace(
         model=SimpleNamespace(orders=(2, 3, 9)), known=SimpleNamespace(sizes=np.array([0, 1, 148])),
         quantiles=np.array([[1, 2, 147], [5, 25.9, 148], [9, 54, 149], [10, 60, 150]]))
-    assert ("The largest that only the tolerances make is c_3, of 25.9 units in half of the "
-            "magnets, and up to 54 in 95 %.") in tolerance._made_by_tolerances(found)
+    assert ("The largest multipole that only the tolerances make is c_3: below 25.9 units in half "
+            "of the magnets, below 54 in 95 %.") in tolerance._made_by_tolerances(found)
     found.known.sizes = np.array([5, 25, 148])
     assert tolerance._made_by_tolerances(found) == ""
 
