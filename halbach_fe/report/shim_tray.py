@@ -41,7 +41,7 @@ def _answer(found: FilledTray) -> Answer:
     """Return the answer of an update that agrees with its map."""
     region, tray = found.model.region.text, found.magnet.study.shim_tray
     question = f"Which magnets in the tray make the field in {region} homogeneous?"
-    measured = "halbach-fe infer STUDY --measurements MAP -o DIR"
+    measured = "halbach-fe infer STUDY --measurements NEW_MAP -o DIR"
     if not found.filled:
         return Answer(
             question, "Leave the tray empty: none of its magnets makes the field more homogeneous "
