@@ -143,7 +143,7 @@ def magpylib_campaign(short_dipole, generator):
 
 
 def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, generator, session,
-                                                             tmp_path):
+                                                             tmp_path, monkeypatch):
     study, data, truth = magpylib_campaign(short_dipole, generator)
     update = infer(build_magnet(study), data, session)
     score = (update.posterior.mean - truth) / update.posterior.sd
@@ -173,8 +173,15 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     assert summary["scores"][1]["readings"] == 480
     assert len((tmp_path / "prediction.csv").read_text().splitlines()) == 1 + len(update.readings)
     text = page(tmp_path / "report.html")
-    assert text.count("<img alt=") == 6
+    assert text.count("<img alt=") == 5
     assert "disagree" not in text
+    # the map tells about as much of all blocks, which is said; the control is drawn
+    low, high = 100 * update.contraction.min(), 100 * update.contraction.max()
+    share = f"{low:.0f} to {high:.0f}" if f"{low:.0f}" != f"{high:.0f}" else f"{low:.0f}"
+    assert f"by {share}\u00a0% of the prior's variance" in text.replace("&#39;", "'")
+    monkeypatch.setattr("halbach_fe.report.inference.ALIKE", -1.0)
+    write_inference_report(update, tmp_path)
+    assert page(tmp_path / "report.html").count("<img alt=") == 6
 
 
 def test_a_held_out_map_of_another_magnet_is_told(short_dipole, generator, session):
