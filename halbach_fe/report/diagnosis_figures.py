@@ -285,12 +285,11 @@ def profile(diagnosis: Diagnosis) -> Figure:
         return _residual_maps(diagnosis)
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
     label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
-    harmonic = name == "harmonic"
+    harmonic = name == "harmonic" and connected
     line = {"lw": 1.2} if connected and not harmonic else {"ls": "none", "marker": "_", "ms": 10}
     figure = figure_of(5.4)
     top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
     held, measured = before.held_out[index], before.readings[index]
-    band = COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
     factor, unit = unit_for(max(float(np.abs(
         state.update.readings - state.update.prediction_posterior.mean)[index].max())
         for state in shown))
@@ -305,7 +304,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
     if held.any():
         top.plot(along[held], 1e3 * measured[held], "o", mfc="none", color=MEASURED, ms=4,
                  label="measured, held out")
-    band = factor * band
+    band = factor * COVERAGE_Z * np.hypot(after.prediction_posterior.sd, after.sigma)[index]
     if connected and not harmonic:
         bottom.fill_between(along, -band, band, color=POSTERIOR, alpha=0.2, lw=0)
     else:
@@ -318,8 +317,8 @@ def profile(diagnosis: Diagnosis) -> Figure:
     if harmonic:
         wave = {"A": "cos", "B": "sin"}[label]
         label = f"{label}$_n$"
-        top.set_title(f"{label}, coefficients of {wave} n\u03c6 in the radial B, at a radius of "
-                      f"{np.hypot(x, y):.0f} mm", fontsize="medium")
+        top.set_title(f"{label}{of_map}, coefficients of {wave} n\u03c6 in the radial B, at a "
+                      f"radius of {np.hypot(x, y):.0f} mm", fontsize="medium")
     else:
         top.set_title(f"{label}{of_map} at all points" if not connected else
                       f"{label}{of_map} at {line_at}"

@@ -28,7 +28,7 @@ ARC_POINTS = 5
 SIGNED = "RdBu_r"
 """Colour scale of signed numbers, readable with any colour vision."""
 
-OUTSIDE = 1.15
+OUTSIDE = 1.3
 """Distance from the axis at which a block is named, relative to the magnet's outer radius."""
 
 ARROW, HEAD = 0.7, 0.35
@@ -270,6 +270,9 @@ def magnet_view(
     if residuals is not None:
         figure.add_trace(residuals_trace(*residuals, magnet.bore_radius))
     camera = _camera(figure, magnet.dimension)
+    if found and magnet.dimension == 3:  # from their side, as the map would hide them
+        x, _, z = np.mean([block.middle for block in found], axis=0).tolist()
+        camera |= {"x": math.copysign(camera["x"], x), "z": math.copysign(camera["z"], z)}
     figure.add_trace(cut_trace(magnet))
     _to_mm(figure)
     figure.update_layout(

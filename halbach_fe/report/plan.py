@@ -105,8 +105,9 @@ def answer(plan: MeasurementPlan) -> Answer:
             f"{'' if left < LITTLE * of_study else ', which is hardly more'}")
         blocks = _rms(plan.planned_sd) / _rms(plan.prior_sd)
         better = "What blocks that deviate together do to the field is known better: the"
-        said += (f"After {'all of ' if everything else ''}them a block's magnetization is "
-                 f"uncertain by {fraction(blocks)} of what it is before (rms over the blocks). "
+        said += (f"After {'all of ' if everything else ''}them the uncertainty of a block's "
+                 f"magnetization falls to {fraction(blocks)} of what it is before (rms over the "
+                 "blocks). "
                  f"{better if left < blocks else 'The'} uncertainty of "
                  f"{'such a pattern' if left < blocks else 'patterns of blocks'}, by which the "
                  f"positions are chosen, falls to {fraction(left)} (geometric mean){beside}. ")
