@@ -95,6 +95,8 @@ class Competition:
         The readings with the blocks integrated out.
     columns : ndarray, shape (rows, k)
         Whitened signatures of all candidates.
+    absorbed : ndarray, shape (m, k + 1)
+        `Marginal.absorbed` of these and of the residual.
     residual : ndarray, shape (rows,)
     evidence : Evidence
         Of these columns for this residual.
@@ -105,8 +107,8 @@ class Competition:
     """
 
     def __init__(
-        self, marginal: Marginal, columns: Floats, residual: Floats, evidence: Evidence,
-        candidates: Sequence[Candidate], families: Sequence[Family],
+        self, marginal: Marginal, columns: Floats, absorbed: Floats, residual: Floats,
+        evidence: Evidence, candidates: Sequence[Candidate], families: Sequence[Family],
         whiten: Callable[[Floats], Floats],
     ) -> None:
         self.candidates, self.families, self.evidence = candidates, families, evidence
@@ -117,9 +119,8 @@ class Competition:
         self._parts = [np.arange(*ends[number:number + 2]) for number in range(len(families))]
         self._terms, self._columns = np.hstack(whitened), columns
         self._absorbed_terms = marginal.absorbed(self._terms)
-        self._absorbed_columns = marginal.absorbed(columns)
-        absorbed = marginal.absorbed(residual[:, None])[:, 0]
-        self._score = self._terms.T @ residual - self._absorbed_terms.T @ absorbed
+        self._absorbed_columns = absorbed[:, :-1]
+        self._score = self._terms.T @ residual - self._absorbed_terms.T @ absorbed[:, -1]
         # information between two families, of a column with all terms, of a term with all columns
         self._products: dict[tuple[int, int], Floats] = {}
         self._by_column: dict[int, Floats] = {}

@@ -132,8 +132,18 @@ def diagnose(
     MeasurementError
         If a map or the blocks do not fit the study.
     """
-    data = check_maps(study, data)
-    effects = catalogue() if effects is None else effects
+    with session.with_cache() as cached:
+        return _diagnose(study, check_maps(study, data), cached, blocks,
+                         catalogue() if effects is None else effects, validation_map, say, solver,
+                         floor_T, time_limit_s)
+
+
+def _diagnose(
+    study: Study, data: Data, session: Session, blocks: BlockTable | None,
+    effects: Sequence[Effect], validation_map: xr.Dataset | None, say: Say,
+    solver: NominalSolver | None, floor_T: Floor | None, time_limit_s: float | None,
+) -> Diagnosis:
+    """See `diagnose`; the session has a cache."""
     pace = Pace(say, session.progress, time_limit_s)
     session = replace(session, progress=pace.advance)
     pace.begin("looking for gross errors of the map")

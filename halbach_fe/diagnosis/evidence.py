@@ -207,12 +207,15 @@ class Marginal:
 
         ``absorbed`` (m, k + 1) is `absorbed` of signatures and residual, if it is known already.
         """
-        columns = np.column_stack([signatures, residual])
-        half = self.absorbed(columns) if absorbed is None else absorbed
-        total = -half.T @ half
-        for part in _rows(len(columns)):
-            total += columns[part].T @ columns[part]
-        return Evidence.of(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), len(columns))
+        half = self.absorbed(np.column_stack([signatures, residual])
+                             ) if absorbed is None else absorbed
+        taken, of_residual = half[:, :-1], half[:, -1]
+        information = -taken.T @ taken
+        for part in _rows(len(signatures)):
+            information += signatures[part].T @ signatures[part]
+        return Evidence.of(information, signatures.T @ residual - taken.T @ of_residual,
+                           float(residual @ residual - of_residual @ of_residual),
+                           len(signatures))
 
     def absorbed(self, columns: Floats) -> Floats:
         """Return what the blocks absorb of whitened columns (n, k), as (m, k).

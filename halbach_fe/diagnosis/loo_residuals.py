@@ -10,6 +10,7 @@ from scipy import special
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.stats.small_samples import false_discovery_rates
 
 DISCOVERIES = 0.01
 """False discovery rate among the groups that are reported to disagree with the model."""
@@ -97,8 +98,6 @@ def residual_groups(
     memberships : dict
         For each kind of group, the name of the group to which each reading belongs.
     """
-    from scipy.stats import false_discovery_control  # here, as this import takes most of a second
-
     found: list[tuple[str, str, int, float, float]] = []
     half = linalg.solve_triangular(marginal.factor[0], marginal.whitened.T, lower=True).T
     kept = marginal.remove(residual[:, None])[:, 0]  # S^-1 r
@@ -111,5 +110,5 @@ def residual_groups(
             chi2 = float(score @ _solve_less_product(half[rows], score))  # (S^-1 r)' P^-1 (S^-1 r)
             found.append((kind, name, len(rows), chi2 / len(rows),
                           float(special.chdtrc(len(rows), chi2))))
-    adjusted = false_discovery_control([group[-1] for group in found]) if found else []
+    adjusted = false_discovery_rates(np.array([group[-1] for group in found]))
     return [ResidualGroup(*group[:4], float(p)) for group, p in zip(found, adjusted, strict=True)]

@@ -23,6 +23,10 @@ from halbach_fe.solver.external_field import external_field
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 
+FEW_BLOCKS = 10
+"""Number of blocks whose gradients are computed one by one. If more are asked for, those of all
+blocks will be needed."""
+
 
 @dataclass(frozen=True)
 class NominalFields:
@@ -54,6 +58,7 @@ class NominalFields:
     solve: Callable[[Study], Floats]
     solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
+    _gradients: dict[int, Floats] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def magnet(self) -> Magnet:
@@ -91,6 +96,14 @@ class NominalFields:
         Element ``[b, i, c, j]`` is the derivative of component c along direction j.
         """
         return np.array(list(block_gradients(self.blocks, self.points)))
+
+    def block_gradient(self, block: int) -> Floats:
+        """Return the gradient of B of block number ``block``, (n, 3, 3) in T/m."""
+        if "block_gradients" in vars(self) or len(self._gradients) == FEW_BLOCKS:
+            return np.asarray(self.block_gradients[block])
+        if block not in self._gradients:
+            self._gradients[block] = next(block_gradients([self.blocks[block]], self.points))
+        return self._gradients[block]
 
     @cached_property
     def field(self) -> Floats:
@@ -160,7 +173,7 @@ class NominalFields:
         ``direction`` (3,) need not be a unit vector: the derivative is per unit of the factor by
         which it is multiplied.
         """
-        return np.asarray(-self.block_gradients[block] @ direction)
+        return np.asarray(-self.block_gradient(block) @ direction)
 
     def block_rotation_derivative(
         self, block: int, axis: Floats, centre: Floats
@@ -172,7 +185,7 @@ class NominalFields:
         """
         around = np.cross(axis, self.points - centre)
         return np.asarray(np.cross(axis, self.block_fields[block])
-                          - np.einsum("ncj,nj->nc", self.block_gradients[block], around))
+                          - np.einsum("ncj,nj->nc", self.block_gradient(block), around))
 
     def change_at_displaced_points(self, displacement: Floats) -> Floats:
         """Return the change of B (n, 3) in T when the points move by ``displacement``.

@@ -8,7 +8,7 @@ One by one they are cheap.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,12 +32,32 @@ NOTICEABLE_CHI2 = 9.0
 standard deviations of its amplitude."""
 
 
+@dataclass(frozen=True)
+class Compared:
+    """Candidates that are compared with each other.
+
+    Attributes
+    ----------
+    numbers : tuple of int
+        Of these candidates among all, in order.
+    columns : ndarray, shape (rows, k)
+        Their whitened signatures.
+    absorbed : ndarray, shape (m, k + 1)
+        `Marginal.absorbed` of these and of the residual.
+    evidence : Evidence
+    """
+
+    numbers: tuple[int, ...]
+    columns: Floats
+    absorbed: Floats
+    evidence: Evidence
+
+
 def most_likely(
     candidates: Sequence[Candidate], columns: Sequence[Floats], marginal: Marginal,
     residual: Floats, in_model: Collection[int]
-) -> tuple[list[int], Evidence]:
-    """Return the numbers of the candidates that are compared with each other, in order, and the
-    evidence of their signatures.
+) -> Compared:
+    """Return the candidates that are compared with each other.
 
     These are all candidates, unless they have more than `MOST_COLUMNS` signatures. Then those in
     the model and those of effects of a few places are compared with the others whose evidence is
@@ -58,22 +78,24 @@ def most_likely(
     width = np.array([part.shape[1] for part in columns], int)
     ends = np.cumsum(width)
     own = [np.arange(end - size, end) for end, size in zip(ends, width, strict=True)]
-    stacked = np.hstack([np.zeros((len(residual), 0)), *columns, residual[:, None]])
+    # by column in memory, as columns are chosen below
+    stacked = np.vstack([*(part.T for part in columns), residual]).T
     absorbed = marginal.absorbed(stacked)
 
-    def evidence(numbers: Sequence[int]) -> Evidence:
+    def compared(numbers: Sequence[int]) -> Compared:
         index = np.concatenate([np.zeros(0, int), *(own[number] for number in numbers)])
-        return marginal.evidence(stacked[:, index], residual,
-                                 absorbed[:, np.append(index, len(stacked[0]) - 1)])
+        chosen, taken = stacked[:, index], absorbed[:, np.append(index, width.sum())]
+        return Compared(tuple(numbers), chosen, taken,
+                        marginal.evidence(chosen, residual, taken))
 
     if width.sum() <= MOST_COLUMNS:
-        return list(range(len(candidates))), evidence(range(len(candidates)))
+        return compared(range(len(candidates)))
     factors = np.empty(len(candidates))
     model = sorted(in_model)
     for first in range(0, len(candidates), AT_ONCE):
         some = list(range(first, min(first + AT_ONCE, len(candidates))))
         numbered = renumbered([candidates[number] for number in (*model, *some)])
-        beside = with_candidates(evidence([*model, *some]), numbered[:len(model)])
+        beside = with_candidates(compared([*model, *some]).evidence, numbered[:len(model)])
         factors[some] = log_bayes_factors(beside, numbered[len(model):])
     names = [candidate.effect for candidate in candidates]
     places = {name: names.count(name) for name in dict.fromkeys(names)}
@@ -84,7 +106,7 @@ def most_likely(
         if number not in chosen and width[number] <= left:
             chosen.add(number)
             left -= width[number]
-    return sorted(chosen), evidence(sorted(chosen))
+    return compared(sorted(chosen))
 
 
 def renumbered(candidates: Sequence[Candidate]) -> list[Candidate]:

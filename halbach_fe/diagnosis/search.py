@@ -107,6 +107,8 @@ class Search:
         Evidence of all columns.
     columns : ndarray, shape (rows, k)
         Whitened signatures of all hypotheses, per prior standard deviation of their amplitudes.
+    absorbed : ndarray, shape (m, k + 1)
+        `Marginal.absorbed` of the columns and the residual.
     residual : ndarray, shape (rows,)
         Whitened residual of the training readings from the prior mean of the study without the
         identified effects; the columns are fitted to it.
@@ -125,6 +127,7 @@ class Search:
     candidates: tuple[Candidate, ...]
     evidence: Evidence
     columns: Floats
+    absorbed: Floats
     residual: Floats
     marginal: Marginal
     training: Floats
@@ -304,13 +307,13 @@ def score_hypotheses(
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique,
                                         len(places[effect.name]) + 1))
-    chosen, evidence = most_likely(candidates, columns, marginal, residual, {
+    compared = most_likely(candidates, columns, marginal, residual, {
         number for number, hypothesis in enumerate(scored)
         if (hypothesis.effect.name, hypothesis.place) in in_model})
-    stacked = np.hstack([np.zeros((len(residual), 0)), *(columns[number] for number in chosen)])
-    return Search(tuple(scored[number] for number in chosen),
-                  tuple(renumbered([candidates[number] for number in chosen])), evidence, stacked,
-                  residual, marginal, training, campaign, nominal_start, uncompared)
+    return Search(tuple(scored[number] for number in compared.numbers),
+                  tuple(renumbered([candidates[number] for number in compared.numbers])),
+                  compared.evidence, compared.columns, compared.absorbed, residual, marginal,
+                  training, campaign, nominal_start, uncompared)
 
 
 def _improved_place(

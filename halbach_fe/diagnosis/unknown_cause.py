@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.competition import MANY, Competition, Explanation, Term
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
@@ -130,16 +130,19 @@ def judge(
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.subset(rows), update.observation
     marginal, columns, residual = search.marginal, search.columns, search.residual
-    evidence, some = search.evidence, np.arange(len(rows))
+    absorbed, evidence = search.absorbed, search.evidence
+    some: slice | Ints = slice(None)
     if len(rows) > MAX_READINGS:
-        some = np.sort(np.random.default_rng(0).choice(some, MAX_READINGS, replace=False))
-        marginal = Marginal.of(marginal.whitened[some])
-        evidence = marginal.evidence(columns[some], residual[some])
+        some = np.sort(np.random.default_rng(0).choice(len(rows), MAX_READINGS, replace=False))
+        marginal, columns, residual = (
+            Marginal.of(marginal.whitened[some]), columns[some], residual[some])
+        absorbed = marginal.absorbed(np.column_stack([columns, residual]))
+        evidence = marginal.evidence(columns, residual, absorbed)
 
     def whiten(fields: Floats) -> Floats:
         return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
 
-    competition = Competition(marginal, columns[some], residual[some], evidence,
+    competition = Competition(marginal, columns, absorbed, residual, evidence,
                               search.candidates, flexible, lambda fields: whiten(fields)[some])
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     sources = {number: effect.hypothesis.place.at_m

@@ -13,6 +13,9 @@ m > 0; mode 0 has no condition on the axis.
 
 All blocks of a ring share the solutions by rotation. This takes seconds to minutes where 3D meshes
 take minutes to hours, and is more accurate.
+
+The runs for single blocks depend on shapes and materials only, neither on how the blocks are
+magnetized nor on the points. A cache therefore has them when only those have changed.
 """
 
 from __future__ import annotations
@@ -59,8 +62,8 @@ from halbach_fe.solver.session import RunSize, Session
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
-NOMINAL_SOURCES = 2
-"""Number of sources of the nominal array in every mode: its cosine part and its sine part."""
+NOMINAL = 0, 1
+"""First and last source of the nominal array in every mode: its cosine part and its sine part."""
 
 MODE_TOLERANCE = 1e-4
 """Modes are solved for until their decay, (r / inner radius)^m in the bore, is below this value.
@@ -81,6 +84,10 @@ MAX_MODES = 64
 AXIS_RADIUS = 1e-8
 """Points nearer to the axis than this fraction of the inner radius count as points on the axis,
 where psi/r is a limit."""
+
+NO_WAVES = [0.0, 0.0]
+"""Nominal remanence of a ring in runs for single blocks, which do not use it: as few values as
+GetDP's lists can have."""
 
 NO_REMANENCE = 1e-12
 """Tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
@@ -150,7 +157,8 @@ class _Ring:
         Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings.
     along, across, axial : list of float, in T
         Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
-        part in mode 0, then in mode 1, and so on (see `nominal_waves`).
+        part in mode 0, then in mode 1, and so on (see `nominal_waves`); `NO_WAVES` in runs for
+        single blocks.
     """
 
     recoil_permeability: float
@@ -197,13 +205,16 @@ class _Case:
 
     @cached_property
     def probes(self) -> tuple[Located, Floats]:
-        """Probes (p, 3) in m where GetDP prints gradients, to check our own evaluation."""
-        return probes_of(self.real_mesh, self.located)
+        """Probes (p, 3) in m where GetDP prints gradients, to check our own evaluation.
+
+        They do not depend on the points, so that a run serves other points too.
+        """
+        return probes_of(self.real_mesh, np.flatnonzero(self.real_mesh.in_air))
 
     @property
-    def last_source(self) -> int:
-        """Number of the last source: three per solved ring follow the nominal array's two."""
-        return NOMINAL_SOURCES - 1 + 3 * len(self.solved)
+    def single(self) -> tuple[int, int]:
+        """First and last source of single blocks: three per solved ring."""
+        return NOMINAL[1] + 1, NOMINAL[1] + 3 * len(self.solved)
 
 
 def solve_modes(
@@ -247,44 +258,57 @@ def solve_modes(
     solved = tuple(sorted({magnet.blocks[number].ring - 1 for number in blocks}))
     weights = nominal_waves(magnet, highest)
     case = _Case(magnet, mesh, weights, solved, meridian)
-    runs = runs_of(weights, bool(blocks), unknowns_of(mesh.inner, mesh.axis, 1), case.last_source)
+    runs = runs_of(weights, unknowns_of(mesh.inner, mesh.axis, 1),
+                   case.single if blocks else None)
     variants = [False] if magnet.study.solver.method == "direct" else [False, True]
-    tasks = [_task(case, run, vacuum, session)
-             for run in reversed(runs) for vacuum in variants]
-    results = run_tasks(tasks, session)
+    results = iter(run_tasks([_task(case, modes, sources, vacuum, session)
+                              for modes, sources in runs for vacuum in variants], session))
     if session.counter is not None:
         return np.zeros((1 + 3 * len(blocks), len(points), 3))
-    if len(variants) == 2:
-        results = [real - vacuum for real, vacuum in zip(results[::2], results[1::2], strict=True)]
-    modes = dict(zip([m for run in reversed(runs) for m in run],
-                     np.concatenate(results), strict=True))
-    for m, gradient in modes.items():
-        _limit_on_axis(m, gradient, meridian[:, 0] == 0)
-    return _superpose(case, modes, points, where, blocks)
+    found: dict[tuple[int, int], dict[int, Floats]] = {NOMINAL: {}, case.single: {}}
+    for modes, sources in runs:
+        gradients = next(results)
+        if len(variants) == 2:
+            gradients = gradients - next(results)
+        for m, gradient in zip(modes, gradients, strict=True):
+            _limit_on_axis(m, gradient, meridian[:, 0] == 0)
+            found[sources][m] = gradient
+    return _superpose(case, found[NOMINAL], found[case.single], points, where, blocks)
 
 
-def runs_of(weights: Floats, all_modes: bool, unknowns: int, sources: int) -> list[list[int]]:
-    """Return the modes of every run of GetDP, in order.
+def runs_of(
+    weights: Floats, unknowns: int, single: tuple[int, int] | None = None
+) -> list[tuple[list[int], tuple[int, int]]]:
+    """Return modes, and first and last source, of every run of GetDP: the longest runs first.
 
     Parameters
     ----------
     weights : ndarray, shape (modes, 2, rings, 3), in T
         Remanence of the nominal array, see `nominal_waves`.
-    all_modes : bool
-        Whether to solve for all modes, as single blocks need, or only for those that the nominal
-        array has.
-    unknowns, sources : int
+    unknowns : int
         Of one mode. They limit the modes per run, see `SOLVED_NUMBERS` and `SHARED_UNKNOWNS`.
+    single : (int, int), optional
+        First and last source of single blocks, to solve for them too. They have all modes, and the
+        nominal array has few.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
-    wanted = [m for m in range(len(weights)) if all_modes or size[m] > NO_REMANENCE * size.max()]
-    most = max(1, SOLVED_NUMBERS // (sources * unknowns))
-    if not all_modes:
-        most = max(1, min(most, SHARED_UNKNOWNS // unknowns))
-    # mode 0 has no boundary condition on the axis, unlike all others, so it is a run of its own
-    others = [m for m in wanted if m > 0]
-    return [[m] for m in wanted if m == 0] + [
-        others[first:first + most] for first in range(0, len(others), most)]
+    own = np.flatnonzero(size > NO_REMANENCE * size.max()).tolist()
+    runs = []
+    if single is not None:
+        count = single[1] - single[0] + 1
+        runs += [(modes, single) for modes in _shared_out(
+            list(range(len(weights))), SOLVED_NUMBERS // (count * unknowns))]
+    return runs + [(modes, NOMINAL) for modes in _shared_out(own, SHARED_UNKNOWNS // unknowns)]
+
+
+def _shared_out(modes: list[int], most: int) -> list[list[int]]:
+    """Return modes in parts of at most ``most``, and mode 0, if it is there, as the last part.
+
+    Mode 0 has no boundary condition on the axis, unlike all others.
+    """
+    others, most = [m for m in modes if m > 0], max(1, most)
+    return [others[first:first + most] for first in range(0, len(others), most)
+            ] + [[m] for m in modes if m == 0]
 
 
 def nominal_waves(magnet: Magnet, highest: int) -> Floats:
@@ -325,40 +349,43 @@ def _middle(magnet: Magnet, block: MagnetBlock) -> float:
     return float(np.radians(block.angle_deg))
 
 
-def _rings(case: _Case) -> list[_Ring]:
-    """Return the data of all rings for the template of the problem."""
+def _rings(case: _Case, sources: tuple[int, int]) -> list[_Ring]:
+    """Return the data of all rings for the template of the problem, for some sources."""
     magnet = case.magnet
     blocks = [magnet.blocks[magnet.number_of(ring, 1)]
               for ring in range(1, len(magnet.blocks_by_ring) + 1)]
     return [_Ring(block.recoil_permeability, np.pi / magnet.blocks_by_ring[ring],
                   case.solved.index(ring) + 1 if ring in case.solved else 0,
                   *(case.weights[:, :, ring, component].ravel().tolist()
-                    for component in range(3)))
+                    if sources == NOMINAL else NO_WAVES for component in range(3)))
             for ring, block in enumerate(blocks)]
 
 
-def _task(case: _Case, modes: list[int], vacuum: bool, session: Session) -> Task:
-    """Return the run of GetDP for all sources in some modes."""
-    first, sources = modes[0], case.last_source + 1
+def _task(
+    case: _Case, modes: list[int], sources: tuple[int, int], vacuum: bool, session: Session
+) -> Task:
+    """Return the run of GetDP for some sources in some modes."""
+    first, count = modes[0], sources[1] - sources[0] + 1
 
     # print a source whose field does not vanish, or the check of our evaluation would be empty: a
-    # single block if any is solved for, else the larger part of the nominal array
-    printed = case.last_source if case.solved else int(
+    # single block, or the larger part of the nominal array
+    printed = sources[1] if sources == case.single else int(
         np.argmax(np.abs(case.weights[first]).max(axis=(1, 2))))
 
     def stage_run(folder: Path) -> Job:
-        return fill_run_folder(case, folder, modes, (0, case.last_source), printed, vacuum,
+        return fill_run_folder(case, folder, modes, sources, printed, vacuum,
                                session.time_limit_s)
 
     def read(folder: Path) -> Floats:
-        return read_run(case, folder, len(modes), sources, printed)
+        return read_run(case, folder, len(modes), count, printed - sources[0])
 
-    return Task(name=f"getdp-{'vacuum' if vacuum else 'real'}-mode{first}", stage=stage_run,
-                read=read, shape=(len(modes), sources, len(case.meridian), 3),
-                solves=len(modes) * sources,
+    of = "-blocks" if sources == case.single else ""
+    return Task(name=f"getdp-{'vacuum' if vacuum else 'real'}{of}-mode{first}", stage=stage_run,
+                read=read, shape=(len(modes), count, len(case.meridian), 3),
+                solves=len(modes) * count,
                 size=RunSize("azimuthal_modes", case.mesh.elements,
                              unknowns_of(case.mesh.inner, case.mesh.axis, first),
-                             len(modes) * sources, matrices=len(modes)))
+                             len(modes) * count, matrices=len(modes)))
 
 
 def fill_run_folder(
@@ -385,7 +412,7 @@ def fill_run_folder(
     problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
     text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.real_mesh.regions,
-                  points=case.probes[1].tolist(), rings=_rings(case),
+                  points=case.probes[1].tolist(), rings=_rings(case, sources),
                   modes=modes, solved=max(1, len(case.solved)))
     (folder / "case.pro").write_text(text, encoding="utf-8")
     (folder / case.real_mesh.path.name).write_bytes(case.real_mesh.path.read_bytes())
@@ -429,7 +456,7 @@ def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) 
     ------
     GetDPError
         If the files are damaged, or if our evaluation differs from what GetDP printed for the
-        source ``printed``.
+        source ``printed``, counted from the first source of the run.
     """
     unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.real_mesh.cell_type)
     solutions = read_solutions(folder / SOLUTIONS_FILE, unknowns.count, modes * sources)
@@ -467,15 +494,17 @@ def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None
 
 
 def _superpose(
-    case: _Case, modes: dict[int, Floats], points: Floats, where: Ints, blocks: Sequence[int]
+    case: _Case, nominal: dict[int, Floats], single: dict[int, Floats], points: Floats,
+    where: Ints, blocks: Sequence[int]
 ) -> Floats:
     """Sum the modes into B at the points, with each block rotated into its position.
 
     Parameters
     ----------
     case : _Case
-    modes : dict of int to ndarray, shape (sources, m, 3), in T
-        d psi/dr, psi/r and d psi/dz at the points of the half-plane, by mode.
+    nominal, single : dict of int to ndarray, shape (sources, m, 3), in T
+        d psi/dr, psi/r and d psi/dz at the points of the half-plane, by mode, of the nominal
+        array and of single blocks.
     points : ndarray, shape (n, 3), in m
     where : ndarray of int, shape (n,)
         Number of each point's (r, z) among the points of the half-plane.
@@ -489,15 +518,15 @@ def _superpose(
     phi = np.arctan2(points[:, 1], points[:, 0])
     everything = case.magnet.blocks
     result = np.zeros((1 + 3 * len(blocks), len(points), 3))
-    for part in range(NOMINAL_SOURCES):
-        result[0] += _field({m: g[part, where] for m, g in modes.items()}, phi, sine=part == 1)
+    for part in NOMINAL:
+        result[0] += _field({m: g[part, where] for m, g in nominal.items()}, phi, sine=part == 1)
     rings = len(case.solved)
     for number, block in enumerate(blocks):
         middle = _middle(case.magnet, everything[block])
         rank = case.solved.index(everything[block].ring - 1)
         along, across, axial = (
-            _field({m: g[NOMINAL_SOURCES + component * rings + rank, where]
-                    for m, g in modes.items()}, phi - middle, sine=component == 1)
+            _field({m: g[component * rings + rank, where] for m, g in single.items()},
+                   phi - middle, sine=component == 1)
             for component in range(3))
         result[1 + 3 * number] = np.cos(middle) * along - np.sin(middle) * across
         result[2 + 3 * number] = np.sin(middle) * along + np.cos(middle) * across

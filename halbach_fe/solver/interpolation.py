@@ -111,12 +111,12 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
                    np.vstack([reference for _, _, reference in hits]), mean)
 
 
-def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Located, Floats]:
+def probes_of(mesh: VerifiedMesh, cells: Ints, count: int = 10) -> tuple[Located, Floats]:
     """Choose probes at which GetDP prints the field, to verify our evaluation.
 
-    There is one probe in each of up to ``count`` air elements, chosen from the elements that hold
-    ``located``, or from all of air if these are not in air: in other materials the gradient of a
-    scalar potential is not B. A probe lies inside its element, where B does not depend on a choice
+    There is one probe in each of up to ``count`` air elements, chosen from ``cells``, or from all
+    of air if these are not in air: in other materials the gradient of a scalar potential is not
+    B. A probe lies inside its element, where B does not depend on a choice
     between neighbours, and off the element's planes of symmetry, where some shape functions or
     their derivatives vanish, so that an error in them would not show.
 
@@ -126,12 +126,12 @@ def probes_of(mesh: VerifiedMesh, located: Located, count: int = 10) -> tuple[Lo
         m points.
     places : ndarray, shape (m, 3), in m
     """
-    cells = np.unique(located.cells)
+    cells = np.unique(cells)
     cells = cells[mesh.in_air[cells]]
     if not len(cells):
         cells = np.flatnonzero(mesh.in_air)
     cells = cells[np.unique(np.linspace(0, len(cells) - 1, count).astype(int))]
-    dimension = located.reference.shape[1]
+    dimension = mesh.regions.dimension
     reference = np.tile(_PROBE[mesh.cell_type], (len(cells), 1))
     located = Located(cells, reference, sparse.eye_array(len(cells), format="csr"))
     places = np.zeros((len(cells), 3))

@@ -264,7 +264,7 @@ class _Case:
     @cached_property
     def probes(self) -> tuple[Located, Floats]:
         """Probes (p, 3) in m where GetDP prints B, to check our own evaluation."""
-        return probes_of(self.real_mesh, self.located)
+        return probes_of(self.real_mesh, self.located.cells)
 
     def size(self, solves: int, newton: bool = False) -> RunSize:
         """Return the size of a run with ``solves`` linear solves."""

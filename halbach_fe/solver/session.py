@@ -5,15 +5,19 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 from halbach_fe.core.arguments import typed
+from halbach_fe.core.files import make_folder
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.pace import Progress
 from halbach_fe.core.result_folder import locked_folder
+from halbach_fe.core.temporary_files import temporary_path
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Run, find_getdp
 from halbach_fe.solver.getdp_cache import Cache, default_cache
@@ -21,6 +25,9 @@ from halbach_fe.solver.getdp_cache import Cache, default_cache
 DEFAULT_JOBS = 2
 """Number of parallel runs of GetDP, if the machine has as many cores. Most problems consist of two
 runs, with the real materials and with vacuum in their place."""
+
+TEMPORARY_CACHE_BYTES = 4 * 2**30
+"""Size limit of a cache that lasts as long as one search, see `Session.with_cache`."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -160,6 +167,22 @@ class Session:
     def within(self, name: str) -> Session:
         """Return the same session with a subfolder of this session's folder."""
         return replace(self, folder=self.folder / name)
+
+    @contextmanager
+    def with_cache(self) -> Iterator[Session]:
+        """Yield the session with its cache; if it has none, with one that is removed at the end.
+
+        A search of several rounds needs one, even if no results of earlier runs are wanted: what
+        has not changed since the last round is not solved for again.
+        """
+        if self.cache is not None or self.counter is not None:
+            yield self
+            return
+        folder = temporary_path(make_folder(self.folder) / "cache")
+        try:
+            yield replace(self, cache=Cache(folder, TEMPORARY_CACHE_BYTES))
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def alone(function: Callable[P, R]) -> Callable[P, R]:

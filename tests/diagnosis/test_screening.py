@@ -37,9 +37,9 @@ def test_the_most_likely_are_compared(generator, monkeypatch):
     marginal = Marginal.of(generator.standard_normal((rows, 5)))
 
     def chosen(of, in_model=()):
-        return most_likely(candidates, columns, marginal, of, in_model)[0]
+        return most_likely(candidates, columns, marginal, of, in_model).numbers
 
-    assert chosen(residual) == list(range(2 * count + 1))  # few enough for all
+    assert chosen(residual) == tuple(range(2 * count + 1))  # few enough for all
     monkeypatch.setattr(screening, "MOST_COLUMNS", 60)
     monkeypatch.setattr(screening, "AT_ONCE", 70)  # in several parts
     found = chosen(residual, {5})

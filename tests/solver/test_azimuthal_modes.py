@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +15,8 @@ from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, solve_nominal
+from halbach_fe.solver.getdp import run
+from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.mesh import build_meridian, verify_mesh
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.solver.session import Session
@@ -79,13 +82,51 @@ def test_runs_of_few_modes_do_the_same(modes, session, monkeypatch):
         return azimuthal_modes.solve_modes(build_magnet(study), POINTS, [0], session, highest=4)
 
     weights = azimuthal_modes.nominal_waves(build_magnet(study), 4)
-    assert azimuthal_modes.runs_of(weights, True, 1, 1) == [[0], [1, 2, 3, 4]]
+
+    def parts(sources):
+        runs = azimuthal_modes.runs_of(weights, 1, (2, 1 + sources))
+        assert runs.pop() == ([1], azimuthal_modes.NOMINAL)
+        return [part for part, _ in runs]
+
+    assert parts(3) == [[1, 2, 3, 4], [0]]
     together = columns()
-    monkeypatch.setattr(azimuthal_modes, "SOLVED_NUMBERS", 2)
-    assert azimuthal_modes.runs_of(weights, True, 1, 1) == [[0], [1, 2], [3, 4]]
-    assert azimuthal_modes.runs_of(weights, True, 1, 5) == [[m] for m in range(5)]
+    monkeypatch.setattr(azimuthal_modes, "SOLVED_NUMBERS", 6)
+    assert parts(3) == [[1, 2], [3, 4], [0]]
+    assert parts(15) == [[1], [2], [3], [4], [0]]
     # the same matrices, factorized again
     np.testing.assert_allclose(columns(), together, atol=1e-12 * np.abs(together).max())
+
+
+def test_single_blocks_are_solved_for_once(modes, session, tmp_path):
+    """Whatever the blocks' magnetizations and the points are; other materials are solved anew."""
+    names = []
+
+    def counted(getdp, job, folder, *rest):
+        names.append(folder.name)
+        return run(getdp, job, folder, *rest)
+
+    cached = replace(session, cache=Cache(tmp_path / "cache"), run=counted)
+
+    def solved_again(points, **changes):
+        """Return the fields of a block, and how many runs for blocks and for the array began."""
+        names.clear()
+        study = modes(**{"array__recoil_permeability": 1.1, "mesh__meridian_size_m": 0.03}
+                      | changes)
+        found = azimuthal_modes.solve_modes(build_magnet(study), points, [0], cached, highest=3)
+        of_blocks = sum("blocks" in name for name in names)
+        return found, (of_blocks, len(names) - of_blocks)
+
+    first, runs = solved_again(POINTS)
+    assert runs == (4, 2)  # modes from 1 and mode 0, real materials and vacuum; the array's mode 1
+    weaker = [{"ring": 1, "slot": 3, "remanence_T": 0.9}]
+    changed, runs = solved_again(POINTS, array__exceptions=weaker)
+    assert runs == (0, 4)  # a single block of another remanence has all modes
+    np.testing.assert_array_equal(changed[1:], first[1:])
+    assert np.abs(changed[0] - first[0]).max() > 0.01 * np.abs(first[0]).max()
+    away, runs = solved_again(POINTS + np.array([0.0, 0.0, 1e-3]))
+    assert runs == (0, 0)
+    assert np.abs(away - first).max() > 1e-4 * np.abs(first).max()
+    assert solved_again(POINTS, array__recoil_permeability=1.2)[1] == (4, 2)
 
 
 def test_the_modes_of_the_nominal_array_share_a_run(modes, session, monkeypatch):
@@ -93,11 +134,15 @@ def test_the_modes_of_the_nominal_array_share_a_run(modes, session, monkeypatch)
     study = modes(array__recoil_permeability=1.1, mesh__meridian_size_m=0.03)
     points = circle(0.08)
     weights = azimuthal_modes.nominal_waves(build_magnet(study), 20)
-    assert azimuthal_modes.runs_of(weights, False, 1, 1) == [[1, 15, 17]]
+
+    def parts(unknowns):
+        return [part for part, _ in azimuthal_modes.runs_of(weights, unknowns)]
+
+    assert parts(1) == [[1, 15, 17]]
     together = solve_nominal(build_magnet(study), points, session)
     monkeypatch.setattr(azimuthal_modes, "SHARED_UNKNOWNS", 2)
-    assert azimuthal_modes.runs_of(weights, False, 1, 1) == [[1, 15], [17]]
-    assert azimuthal_modes.runs_of(weights, False, 3, 1) == [[1], [15], [17]]
+    assert parts(1) == [[1, 15], [17]]
+    assert parts(3) == [[1], [15], [17]]
     apart = solve_nominal(build_magnet(study), points, session)
     np.testing.assert_allclose(apart, together, atol=1e-12 * np.abs(together).max())
 
@@ -105,9 +150,11 @@ def test_the_modes_of_the_nominal_array_share_a_run(modes, session, monkeypatch)
 @pytest.mark.parametrize("missing", [0, 1, 2])
 def test_a_missing_mode_is_seen(superposed, missing):
     """Negative control: drop one mode of the sum and the columns are wrong."""
-    found, exact, (case, modes, *others) = superposed
-    np.testing.assert_array_equal(azimuthal_modes._superpose(case, modes, *others)[1:], found)
-    wrong = azimuthal_modes._superpose(case, modes | {missing: 0 * modes[missing]}, *others)[1:]
+    found, exact, (case, nominal, modes, *others) = superposed
+    np.testing.assert_array_equal(
+        azimuthal_modes._superpose(case, nominal, modes, *others)[1:], found)
+    wrong = azimuthal_modes._superpose(
+        case, nominal, modes | {missing: 0 * modes[missing]}, *others)[1:]
     assert np.abs(wrong - exact).max() / np.abs(exact).max() > 0.05
 
 

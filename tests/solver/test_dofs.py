@@ -225,7 +225,7 @@ def test_points_are_found_where_they_are(short_dipole, dipole, tmp_path, generat
         np.testing.assert_allclose(coordinates(mesh, located),
                                    where[:, :mesh.points.shape[1]], atol=1e-9)
         assert mesh.in_air[located.cells].all()
-        probes, places = probes_of(mesh, located)
+        probes, places = probes_of(mesh, located.cells)
         np.testing.assert_allclose(coordinates(mesh, probes), places[:, :mesh.points.shape[1]])
         with pytest.raises(PointsOutsideError):
             locate(mesh, np.array([[100.0, 0, 0]]))

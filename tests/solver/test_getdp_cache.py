@@ -48,6 +48,16 @@ def shared(session, tmp_path):
     return replace(session, cache=Cache(tmp_path / "cache"), run=counted), runs
 
 
+def test_a_search_without_a_cache_has_its_own(session, tmp_path):
+    with replace(session, cache=None).with_cache() as cached:
+        assert cached.cache.folder.parent == session.folder
+        cached.cache.folder.mkdir()
+    assert not cached.cache.folder.exists()
+    given = replace(session, cache=Cache(tmp_path / "cache"))
+    with given.with_cache() as cached:
+        assert cached is given
+
+
 @pytest.fixture
 def coarse(dipole):
     return lambda **changes: dipole(mesh__block_size_m=0.04, **changes)

@@ -29,7 +29,7 @@ def dumped(study, formulation, blocks, session):
     mesh = verify_mesh(build_mesh(build_magnet(study), session.folder))
     located = locate(mesh, POINTS)
     count = 1 + study.dimension * len(blocks)
-    job = fill_run_folder(build_magnet(study), mesh, probes_of(mesh, located)[1], folder,
+    job = fill_run_folder(build_magnet(study), mesh, probes_of(mesh, located.cells)[1], folder,
                           formulation, RunRequest(blocks, (0, count - 1)))
     job = dataclasses.replace(job, options=(
         *job.options, "-ksp_view_rhs", "binary:rhs.bin::append",
