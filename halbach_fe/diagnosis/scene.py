@@ -233,6 +233,18 @@ class Scene:
             return self._by_map(place, partial(_signature_of_instrument, effect, place))
         return self.seen(hypothesis, lambda nominal: effect.signature(nominal, place))
 
+    def rough_signature(self, hypothesis: Hypothesis) -> Floats | None:
+        """Return what all maps show (k, n, 3) in T of `Effect.rough_signature`; None if that is."""
+        effect, place = hypothesis.effect, hypothesis.place
+        if effect.kind == "instrument" or effect.rough_signature(self.fields[0], place) is None:
+            return None
+
+        def of(nominal: NominalFields) -> Floats:
+            found = effect.rough_signature(nominal, place)
+            return np.zeros((1, *nominal.points.shape)) if found is None else found
+
+        return self.seen(hypothesis, of)
+
     def derivative(self, hypothesis: Hypothesis, amounts: Floats) -> Floats:
         """Return the change (k + r, n, 3) in T per unit of all amplitudes, see
         `Effect.derivative`.

@@ -26,7 +26,12 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, FieldAt, Scene
-from halbach_fe.diagnosis.screening import is_noticeable, most_likely, renumbered
+from halbach_fe.diagnosis.screening import (
+    is_noticeable,
+    most_likely,
+    near_the_likeliest,
+    renumbered,
+)
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
@@ -211,6 +216,7 @@ def score_hypotheses(
     candidates: list[Candidate] = []
     columns: list[Floats] = []
     scored: list[Hypothesis] = []
+    rough: set[int] = set()  # numbers of those whose signature is a rough one
     uncompared = done = 0
     improvable: dict[str, list[int]] = {}
     places = {effect.name: [one.place for one in shortlisted if one.effect is effect]
@@ -226,6 +232,28 @@ def score_hypotheses(
         return np.sum([response[:, size * block:size * (block + 1)] @ vector
                        for block, vector in change.items()], axis=0)[:, None]
 
+    def exact(hypothesis: Hypothesis) -> Floats:
+        """Compute the whitened signature (rows, k) of a hypothesis outside the model."""
+        key = hypothesis.effect.name, hypothesis.place
+        known[key] = signatures[key] = by_response(hypothesis, nominal_start)
+        return signatures[key]
+
+    def competitor(
+        hypothesis: Hypothesis, signature: Floats, is_rough: bool = False
+    ) -> tuple[Floats, Candidate]:
+        """Return columns (rows, k) of a hypothesis per prior standard deviation, and the candidate
+        that has them. Rough signatures may have any size.
+        """
+        effect, place = hypothesis.effect, hypothesis.place
+        own = signature * amplitude_scale(effect)[:signature.shape[1]]
+        if (effect.name, place) not in in_model and effect.is_binary and common and not is_rough:
+            own = np.hstack([own, common * own])
+        return own, Candidate(
+            effect.name, place.name, tuple(range(own.shape[1])), not is_rough and (
+                effect.is_binary or (effect.applied_in_full
+                                     and own.shape[1] > len(effect.parameters))),
+            effect.unique, len(places[effect.name]))
+
     def compare(hypothesis: Hypothesis) -> None:
         """Compute the signature of a hypothesis, unless it is known or the time is up."""
         nonlocal residual, uncompared, done
@@ -234,15 +262,20 @@ def score_hypotheses(
         effect, place = hypothesis.effect, hypothesis.place
         key = effect.name, place
         present = in_model.get(key)
+        is_rough = False
         if present is None:
-            signature = signatures.get(key)
+            signature = signatures.get(key, known.get(key))
             if signature is None and is_over():
                 uncompared += 1
                 return
-            if signature is None:
-                if key not in known:
-                    known[key] = by_response(hypothesis, nominal_start)
-                signature = signatures[key] = known[key]
+            roughly = nominal_start.rough_signature(hypothesis) if signature is None else None
+            if roughly is not None:
+                signature, is_rough = whitened(update.observation.read(roughly)), True
+                rough.add(len(scored))
+            elif signature is None:
+                signature = exact(hypothesis)
+            else:
+                signatures[key] = signature
         elif effect.applied_in_full:
             others = campaign.with_terms(apply_effects(
                 corrected, [other for other in identified if other is not present]), update.terms)
@@ -259,15 +292,9 @@ def score_hypotheses(
             signature = whitened(update.observation.read(nominal.derivative(hypothesis, amounts)))
             residual = residual + signature @ amounts
         scored.append(hypothesis)
-        own = signature * amplitude_scale(effect)[:signature.shape[1]]
-        if present is None and effect.is_binary and common:
-            own = np.hstack([own, common * own])
+        own, candidate = competitor(hypothesis, signature, is_rough)
         columns.append(own)
-        candidates.append(Candidate(
-            effect.name, place.name, tuple(range(own.shape[1])),
-            effect.is_binary or (effect.applied_in_full
-                                 and own.shape[1] > len(effect.parameters)), effect.unique,
-            len(places[effect.name])))
+        candidates.append(candidate)
         if present is None and effect.refinements and not effect.applied_in_full:
             improvable.setdefault(effect.name, []).append(len(scored) - 1)
 
@@ -307,11 +334,21 @@ def score_hypotheses(
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique,
                                         len(places[effect.name]) + 1))
-    compared = most_likely(candidates, columns, marginal, residual, {
-        number for number, hypothesis in enumerate(scored)
-        if (hypothesis.effect.name, hypothesis.place) in in_model})
-    return Search(tuple(scored[number] for number in compared.numbers),
-                  tuple(renumbered([candidates[number] for number in compared.numbers])),
+    kept_in = {number for number, hypothesis in enumerate(scored)
+               if (hypothesis.effect.name, hypothesis.place) in in_model}
+    while True:
+        compared = most_likely(candidates, columns, marginal, residual, kept_in)
+        numbered = tuple(renumbered([candidates[number] for number in compared.numbers]))
+        near = [] if is_over() else [compared.numbers[k] for k in near_the_likeliest(
+            compared.evidence, numbered, {k for k, number in enumerate(compared.numbers)
+                                          if number in rough})]
+        if not near:
+            break
+        for number in near:
+            rough.discard(number)
+            columns[number], candidates[number] = competitor(
+                scored[number], exact(scored[number]))
+    return Search(tuple(scored[number] for number in compared.numbers), numbered,
                   compared.evidence, compared.columns, compared.absorbed, residual, marginal,
                   training, campaign, nominal_start, uncompared)
 

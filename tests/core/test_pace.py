@@ -35,6 +35,11 @@ def test_progress_is_told_with_the_time_left():
     clock.now += 20.0  # the first prepares what all others use: nothing is foretold from it
     pace.advance(1, 10_000)
     assert said[-1] == "more effects: 1 of 10000"
+    clock.now += 1000.0
+    for done in range(1, 13):  # a part of the step that counts by itself
+        pace.advance(done, 20)
+        clock.now += 1.0
+    assert said[-1] == "more effects: 12 of 20, about 8 s left"
     assert not pace.is_over
 
 

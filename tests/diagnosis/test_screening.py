@@ -10,7 +10,14 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.model_selection import Candidate, prior_log_odds
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.diagnosis.screening import FEW_PLACES, NOTICEABLE_CHI2, is_noticeable, most_likely
+from halbach_fe.diagnosis.screening import (
+    FEW_PLACES,
+    NOTICEABLE_CHI2,
+    is_noticeable,
+    most_likely,
+    near_the_likeliest,
+    renumbered,
+)
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.formulation_choice import solve_nominal
@@ -49,6 +56,36 @@ def test_the_most_likely_are_compared(generator, monkeypatch):
     assert missing in chosen(residual, {displaced})
     # negative control: without its effect a candidate is among the many that are left out
     assert displaced not in chosen(columns[missing][:, 0])
+
+
+def test_what_comes_near_is_computed_exactly(generator):
+    """A rough signature suffices to tell that an effect is not what is missing."""
+    rows = 400
+    displaced, exact, other = (generator.standard_normal((rows, size)) for size in (3, 1, 1))
+    rough = exact + 0.7 * generator.standard_normal((rows, 1))  # a correlation of 0.8
+    mimic = exact + 0.3 * generator.standard_normal((rows, 1))
+    columns = [displaced, other, mimic, rough]
+    ends = np.cumsum([part.shape[1] for part in columns])
+    candidates = [Candidate(name, "", tuple(range(end - part.shape[1], end)))
+                  for name, part, end in zip(("displaced", "other", "mimic", "rough"), columns,
+                                             ends, strict=True)]
+    marginal = Marginal.of(generator.standard_normal((rows, 5)))
+    noise = generator.standard_normal(rows)
+
+    def near(missing, without=()):
+        left = [k for k in range(4) if k not in without]
+        evidence = marginal.evidence(np.hstack([columns[k] for k in left]), noise + missing)
+        chosen = renumbered([candidates[k] for k in left])
+        return near_the_likeliest(evidence, chosen, {len(left) - 1})
+
+    assert near(0.0) == []
+    assert near(displaced @ np.ones(3)) == []
+    assert near(2 * other[:, 0] + displaced @ np.ones(3)) == []
+    assert near(exact[:, 0]) == [3]  # the mimic is likelier than the rough signature
+    assert near(exact[:, 0] + displaced @ np.ones(3), without=[2]) == [2]
+    # negative control: without a rough signature nothing is computed again
+    assert near_the_likeliest(marginal.evidence(np.hstack(columns), noise + exact[:, 0]),
+                              candidates, set()) == []
 
 
 def test_what_is_left_out_still_shares_the_prior_probability():

@@ -187,6 +187,14 @@ class Effect(ABC):
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters."""
 
+    def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
+        """Return a signature (k, n, 3) in T that resembles `signature`, and takes far less time.
+
+        Its size does not matter. It serves to tell whether the effect can be what is missing: only
+        then is `signature` computed. None if that takes little time itself, as by default.
+        """
+        return None
+
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """Return the change of the readings (r, n, 3) in T per unit of each of the r refinements.
 

@@ -11,6 +11,10 @@ from halbach_fe.solver.formulation_choice import choose_route
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.model import Study
 
+SOFTER = 0.5
+"""Permeability of linear iron, relative to the study's, that stands for iron that saturates: it
+conducts less flux too."""
+
 STEEL = "aisi_1010"
 """Steel whose H(B) curve stands for that of structural steels."""
 
@@ -43,6 +47,15 @@ class IronSaturationEffect(Effect):
             # linear iron by the same route, so that both fields have the same mesh
             before = study.with_(solver__route=SOLID)
         return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
+
+    def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
+        """See `Effect.rough_signature`."""
+        ring = nominal.study.iron_ring
+        if ring is None or choose_route(nominal.magnet, nominal.points) in BOTH:
+            return None
+        softer = nominal.study.with_(iron_ring=ring.with_(
+            relative_permeability=1 + SOFTER * (ring.relative_permeability - 1)))
+        return (nominal.solve(softer) - nominal.finite_element_field)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
