@@ -51,7 +51,8 @@ class IronSaturationEffect(Effect):
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
         """See `Effect.rough_signature`."""
         ring = nominal.study.iron_ring
-        if ring is None or choose_route(nominal.magnet, nominal.points) in BOTH:
+        if ring is None or ring.relative_permeability is None or (
+                choose_route(nominal.magnet, nominal.points) in BOTH):
             return None
         softer = nominal.study.with_(iron_ring=ring.with_(
             relative_permeability=1 + SOFTER * (ring.relative_permeability - 1)))
