@@ -42,11 +42,13 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
          "campaign_kinds": campaign_kinds.run, "campaign_knee": campaign_kinds.run_knee,
          "real": real.emphatic, "real_mri": real.mri, "faser": real.faser,
-         "design": design.run, "mri": mri.run, "speed": speed.run, "speed_full": speed.full,
-         "speed_permeability": speed.permeability, "speed_solvers": speed.solvers}
+         "design": design.run, "mri": mri.run, "speed": speed.run, "speed_small": speed.small,
+         "speed_full": speed.full, "speed_permeability": speed.permeability,
+         "speed_solvers": speed.solvers}
 ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion",
          "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
-         "design", "mri", "speed", "speed_full", "speed_permeability", "speed_solvers")
+         "design", "mri", "speed", "speed_small", "speed_full", "speed_permeability",
+         "speed_solvers")
 """Parts that are measured only when they are named: they take long."""
 
 
