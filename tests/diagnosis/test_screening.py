@@ -138,15 +138,17 @@ def information_of(marginal, signatures):
 
 @pytest.mark.parametrize("name", ["iron_saturation", "recoil_permeability_across"])
 def test_rough_signatures_resemble_the_exact_ones(name, tmp_path):
-    """So closely that `NEAR` finds an effect that is what is missing: a correlation of 0.7."""
+    """So closely that `NEAR` finds an effect that is what is missing: a correlation of 0.7.
+    Measured 0.99 and 0.96; a mesh that grows too fast has no iron to speak of.
+    """
     iron = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
     nominal, marginal = dipole_fields(
-        tmp_path, iron_ring=iron, array__recoil_permeability=1.05, mesh__block_size_m=0.05)
+        tmp_path, iron_ring=iron, array__recoil_permeability=1.05, mesh__block_size_m=0.08)
     effects = {one.name: one for one in catalogue()}
     (place,) = effects[name].places(nominal.study)
     exact, rough, other = (
         effects[name].signature(nominal, place), effects[name].rough_signature(nominal, place),
-        effects["length"].signature(nominal, effects["length"].places(nominal.study)[0]))
+        effects["background"].signature(nominal, place))
     information = information_of(marginal, [exact, rough, other])
     sizes = np.sqrt(np.diag(information))
     alike = np.abs(information / sizes / sizes[:, None])
