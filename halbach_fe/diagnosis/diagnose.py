@@ -132,8 +132,9 @@ def diagnose(
     MeasurementError
         If a map or the blocks do not fit the study.
     """
+    data = check_maps(study, data)
     with session.with_cache() as cached:
-        return _diagnose(study, check_maps(study, data), cached, blocks,
+        return _diagnose(study, data, cached, blocks,
                          catalogue() if effects is None else effects, validation_map, say, solver,
                          floor_T, time_limit_s)
 

@@ -99,9 +99,9 @@ class NominalFields:
 
     def block_gradient(self, block: int) -> Floats:
         """Return the gradient of B of block number ``block``, (n, 3, 3) in T/m."""
-        if "block_gradients" in vars(self) or len(self._gradients) == FEW_BLOCKS:
-            return np.asarray(self.block_gradients[block])
         if block not in self._gradients:
+            if "block_gradients" in vars(self) or len(self._gradients) == FEW_BLOCKS:
+                return np.asarray(self.block_gradients[block])
             self._gradients[block] = next(block_gradients([self.blocks[block]], self.points))
         return self._gradients[block]
 

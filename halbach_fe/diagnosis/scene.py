@@ -234,16 +234,18 @@ class Scene:
         return self.seen(hypothesis, lambda nominal: effect.signature(nominal, place))
 
     def rough_signature(self, hypothesis: Hypothesis) -> Floats | None:
-        """Return what all maps show (k, n, 3) in T of `Effect.rough_signature`; None if that is."""
-        effect, place = hypothesis.effect, hypothesis.place
-        if effect.kind == "instrument" or effect.rough_signature(self.fields[0], place) is None:
+        """Return what all maps show (k, n, 3) in T of `Effect.rough_signature`; None if there is
+        none for one of the maps.
+        """
+        if hypothesis.effect.kind == "instrument":
             return None
-
-        def of(nominal: NominalFields) -> Floats:
-            found = effect.rough_signature(nominal, place)
-            return np.zeros((1, *nominal.points.shape)) if found is None else found
-
-        return self.seen(hypothesis, of)
+        shown: list[Floats] = []
+        for nominal in self.fields:
+            found = hypothesis.effect.rough_signature(nominal, hypothesis.place)
+            if found is None:
+                return None
+            shown.append(found @ _sensors(nominal).T)
+        return np.concatenate(shown, axis=1)
 
     def derivative(self, hypothesis: Hypothesis, amounts: Floats) -> Floats:
         """Return the change (k + r, n, 3) in T per unit of all amplitudes, see

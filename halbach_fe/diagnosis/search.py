@@ -334,12 +334,17 @@ def score_hypotheses(
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique,
                                         len(places[effect.name]) + 1))
+    if is_over():  # no time is left to solve for those that may come near
+        uncompared += len(rough)
+        for number in sorted(rough, reverse=True):
+            del scored[number], columns[number], candidates[number]
+        rough.clear()
     kept_in = {number for number, hypothesis in enumerate(scored)
                if (hypothesis.effect.name, hypothesis.place) in in_model}
     while True:
         compared = most_likely(candidates, columns, marginal, residual, kept_in)
         numbered = tuple(renumbered([candidates[number] for number in compared.numbers]))
-        near = [] if is_over() else [compared.numbers[k] for k in near_the_likeliest(
+        near = [compared.numbers[k] for k in near_the_likeliest(
             compared.evidence, numbered, {k for k, number in enumerate(compared.numbers)
                                           if number in rough})]
         if not near:

@@ -51,11 +51,12 @@ class IronSaturationEffect(Effect):
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
         """See `Effect.rough_signature`."""
         ring = nominal.study.iron_ring
-        if ring is None or ring.relative_permeability is None or (
+        if ring is None or (ring.relative_permeability or 1.0) == 1.0 or (
                 choose_route(nominal.magnet, nominal.points) in BOTH):
             return None
+        permeability = ring.relative_permeability or 1.0
         softer = nominal.study.with_(iron_ring=ring.with_(
-            relative_permeability=1 + SOFTER * (ring.relative_permeability - 1)))
+            relative_permeability=1 + SOFTER * (permeability - 1)))
         return (nominal.solve(softer) - nominal.finite_element_field)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -15,9 +15,8 @@ from halbach_fe.diagnosis.effects.base import (
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.formulation_choice import choose_route
 from halbach_fe.study.array import BlockException
-from halbach_fe.study.model import Study, iron_of
+from halbach_fe.study.model import Study
 
 STEP = 0.02
 """Step of the difference by the permeability: upwards, since none is below 1."""
@@ -39,16 +38,6 @@ class RecoilPermeabilityEffect(Effect):
         """See `Effect.signature`."""
         raised = nominal.solve(self.apply(nominal.study, place, [STEP]))
         return ((raised - nominal.finite_element_field) / STEP)[None]
-
-    def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
-        """See `Effect.rough_signature`: it leaves out the iron, if that takes most of the time."""
-        study = nominal.study
-        raised = self.apply(study, place, [STEP])
-        if iron_of(study) is None or choose_route(
-                build_magnet(raised), nominal.points) != "moments":
-            return None
-        bare = nominal.solve(study.with_(iron_ring=None, iron=None))
-        return ((nominal.solve(raised.with_(iron_ring=None, iron=None)) - bare) / STEP)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
