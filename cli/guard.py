@@ -32,10 +32,10 @@ BLAS_BUFFER_BYTES = 128 * 2**20
 and library, on two threads."""
 
 SHORT_WAIT = "4"
-"""Logarithm of the processor cycles for which threads of OpenBLAS look for more work before they
-sleep: the least that it allows. By default they look for 30 ms, on the cores on which threads of
-the other OpenBLAS, of numba and GetDP compute: a diagnosis of 192 blocks took 40 s instead of 31 s
-on two cores, and 47 s instead of 31 s of processor time."""
+"""Logarithm to base 2 of the processor cycles for which threads of OpenBLAS look for more work
+before they sleep: the least that it allows. By default they look for 30 ms, on the cores on which
+threads of the other OpenBLAS, of numba and GetDP compute. Beside another job on two cores a
+diagnosis of 192 blocks took 40 s instead of 31 s, and 47 s instead of 31 s of processor time."""
 
 AT_THE_LIMIT_BYTES = 256 * 2**20
 """An import that fails so near to the limit of memory fails for want of it: the largest library,

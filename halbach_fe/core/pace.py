@@ -45,6 +45,7 @@ class Pace:
     _said: float = field(init=False)
     _total: int = field(init=False, default=0)
     _first: int = field(init=False, default=0)
+    _done: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         self._begun = self._step_begun = self._said = self.clock()
@@ -57,21 +58,22 @@ class Pace:
     def begin(self, step: str) -> None:
         """Begin a step, whose name the lines about its progress start with."""
         self._step, self._step_begun = step, self.clock()
-        self._said, self._total, self._first = self._step_begun, 0, 0
+        self._said, self._total, self._first, self._done = self._step_begun, 0, 0, 0
 
     def advance(self, done: int, total: int) -> None:
         """Report that parts of the step are done, with the time left at the pace so far."""
         if self.show is not None:
             self.show(done, total)
         now = self.clock()
-        if not done or self._total not in (0, total):  # a step may count anew
+        # a step may count anew, from 0 or from 1
+        if not done or done < self._done or self._total not in (0, total):
             self._step_begun, self._first = now, done
         elif done < total and now - self._said >= QUIET_S:
             left = (now - self._step_begun) * (total - done) / max(done - self._first, 1)
             foretold = f", about {duration(left)} left" if done >= FORETOLD * total else ""
             self.say(f"{self._step}: {done} of {total}{foretold}")
             self._said = now
-        self._total = total
+        self._total, self._done = total, done
 
 
 def duration(seconds: float) -> str:

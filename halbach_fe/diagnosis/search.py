@@ -111,7 +111,8 @@ class Search:
     evidence : Evidence
         Evidence of all columns.
     columns : ndarray, shape (rows, k)
-        Whitened signatures of all hypotheses, per prior standard deviation of their amplitudes.
+        Whitened signatures of all hypotheses, per prior standard deviation of their amplitudes;
+        rough ones, see `Effect.rough_signature`, may have any size.
     absorbed : ndarray, shape (m, k + 1)
         `Marginal.absorbed` of the columns and the residual.
     residual : ndarray, shape (rows,)

@@ -15,7 +15,8 @@ All blocks of a ring share the solutions by rotation. This takes seconds to minu
 take minutes to hours, and is more accurate.
 
 The runs for single blocks depend on shapes and materials only, neither on how the blocks are
-magnetized nor on the points. A cache therefore has them when only those have changed.
+magnetized nor, as long as they need as many modes, on the points. A cache therefore has them when
+only those have changed.
 """
 
 from __future__ import annotations
@@ -279,7 +280,8 @@ def solve_modes(
 def runs_of(
     weights: Floats, unknowns: int, single: tuple[int, int] | None = None
 ) -> list[tuple[list[int], tuple[int, int]]]:
-    """Return modes, and first and last source, of every run of GetDP: the longest runs first.
+    """Return modes, and first and last source, of every run of GetDP: those for single blocks,
+    which take longest, first.
 
     Parameters
     ----------

@@ -115,10 +115,10 @@ def probes_of(mesh: VerifiedMesh, cells: Ints, count: int = 10) -> tuple[Located
     """Choose probes at which GetDP prints the field, to verify our evaluation.
 
     There is one probe in each of up to ``count`` air elements, chosen from ``cells``, or from all
-    of air if these are not in air: in other materials the gradient of a scalar potential is not
-    B. A probe lies inside its element, where B does not depend on a choice
-    between neighbours, and off the element's planes of symmetry, where some shape functions or
-    their derivatives vanish, so that an error in them would not show.
+    of air if these are not in air: in other materials the gradient of a scalar potential is not B.
+    A probe lies inside its element, where B does not depend on a choice between neighbours, and off
+    the element's planes of symmetry, where some shape functions or their derivatives vanish, so
+    that an error in them would not show.
 
     Returns
     -------

@@ -40,6 +40,12 @@ def test_progress_is_told_with_the_time_left():
         pace.advance(done, 20)
         clock.now += 1.0
     assert said[-1] == "more effects: 12 of 20, about 8 s left"
+    clock.now += 1000.0
+    for done in range(1, 13):  # another part with as many
+        pace.advance(done, 20)
+        clock.now += 1.0
+    assert said[-1] == "more effects: 12 of 20, about 8 s left"
+    assert said[-2] == "more effects: 2 of 20, about 18 s left"  # without the 1000 s before
     assert not pace.is_over
 
 

@@ -51,10 +51,11 @@ class IronSaturationEffect(Effect):
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
         """See `Effect.rough_signature`."""
         ring = nominal.study.iron_ring
-        if ring is None or (ring.relative_permeability or 1.0) == 1.0 or (
-                choose_route(nominal.magnet, nominal.points) in BOTH):
+        if ring is None or ring.relative_permeability is None:
             return None
-        permeability = ring.relative_permeability or 1.0
+        permeability = ring.relative_permeability
+        if permeability == 1.0 or choose_route(nominal.magnet, nominal.points) in BOTH:
+            return None  # nothing is softer than what conducts no flux
         softer = nominal.study.with_(iron_ring=ring.with_(
             relative_permeability=1 + SOFTER * (permeability - 1)))
         return (nominal.solve(softer) - nominal.finite_element_field)[None]
