@@ -71,7 +71,7 @@ from halbach_fe.diagnosis.unknown_cause import (
     named_effects,
     suspicions,
 )
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
@@ -165,13 +165,17 @@ def _diagnose(
     outliers: tuple[Outlier, ...] = ()
     solver_error: SolverErrorExplanation | None = None
     flexible: list[Family] = []
+    solved: Magnet | None = None  # the last whose single blocks were solved for
 
     def changed(identified: Sequence[IdentifiedEffect]) -> Study:
         return with_position_noise(apply_effects(corrected, identified), position_noise)
 
     def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
-        return infer(build_magnet(changed(identified)), data, _subsession(session, name), blocks,
-                     validation_map=validation_map)
+        nonlocal solved
+        update = infer(build_magnet(changed(identified)), data, _subsession(session, name), blocks,
+                       validation_map=validation_map, similar=solved)
+        solved = solved if update.response.of_similar else update.magnet
+        return update
 
     if len(starts) > 1:
         say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")

@@ -69,7 +69,7 @@ def infer(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
     blocks: BlockTable | None = None, prior: Gaussian | None = None,
     linearized_only: bool = False, validation_map: xr.Dataset | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    say: Callable[[str], None] = lambda text: None, similar: Magnet | None = None,
 ) -> InferenceResult:
     """Update the block magnetizations of a study with a measured map.
 
@@ -93,6 +93,9 @@ def infer(
         `halbach_fe.measurement.observation.study_for_validation_map`.
     say : callable, optional
         Takes a line of text about each update, if terms of instruments are estimated.
+    similar : Magnet, optional
+        A slightly different magnet that was solved for before, see
+        `halbach_fe.response.matrix.response_matrix`. It saves most of the time.
 
     Returns
     -------
@@ -148,7 +151,7 @@ def infer(
         if solved is None or (at is not None
                               and solved.neglected(at, maps, readings) > NEGLECTED):
             solved = _Solved(
-                _response(magnet, readings.observation, session), maps,
+                _response(magnet, readings.observation, session, similar), maps,
                 np.zeros(0) if at is None else readings_of_field(at.nominal, maps, readings))
             model = solved.response
         elif at is not None:
@@ -365,10 +368,12 @@ def _poses(open_terms: OpenTerms, maps: Sequence[Map], posterior: Gaussian) -> t
     return tuple(found)
 
 
-def _response(magnet: Magnet, observation: Observation, session: Session) -> Response:
+def _response(
+    magnet: Magnet, observation: Observation, session: Session, similar: Magnet | None
+) -> Response:
     """Return the response of all readings to the magnetizations."""
     try:
-        return response_matrix(magnet, observation, session)
+        return response_matrix(magnet, observation, session, similar)
     except PointsOutsideError as error:
         raise MeasurementError(error.sentence(f"map of study {error.study}")) from None
 

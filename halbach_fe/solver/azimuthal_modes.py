@@ -155,7 +155,8 @@ class _Ring:
     half_angle : float, in rad
         Half the angle of a block.
     rank : int
-        Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings.
+        Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings,
+        and in runs for the nominal array.
     along, across, axial : list of float, in T
         Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
         part in mode 0, then in mode 1, and so on (see `nominal_waves`); `NO_WAVES` in runs for
@@ -356,8 +357,9 @@ def _rings(case: _Case, sources: tuple[int, int]) -> list[_Ring]:
     magnet = case.magnet
     blocks = [magnet.blocks[magnet.number_of(ring, 1)]
               for ring in range(1, len(magnet.blocks_by_ring) + 1)]
+    numbered = case.solved if sources == case.single else ()
     return [_Ring(block.recoil_permeability, np.pi / magnet.blocks_by_ring[ring],
-                  case.solved.index(ring) + 1 if ring in case.solved else 0,
+                  numbered.index(ring) + 1 if ring in numbered else 0,
                   *(case.weights[:, :, ring, component].ravel().tolist()
                     if sources == NOMINAL else NO_WAVES for component in range(3)))
             for ring, block in enumerate(blocks)]
@@ -415,7 +417,7 @@ def fill_run_folder(
     (folder / PROBLEM).write_bytes(problem)
     text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.real_mesh.regions,
                   points=case.probes[1].tolist(), rings=_rings(case, sources),
-                  modes=modes, solved=max(1, len(case.solved)))
+                  modes=modes, solved=len(case.solved) if sources == case.single else 1)
     (folder / "case.pro").write_text(text, encoding="utf-8")
     (folder / case.real_mesh.path.name).write_bytes(case.real_mesh.path.read_bytes())
     return Job(

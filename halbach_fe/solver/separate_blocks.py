@@ -29,7 +29,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     highest_mode_at,
     solve_iron,
 )
-from halbach_fe.solver.exact_block_field import field_of, unit_fields
+from halbach_fe.solver.exact_block_field import field_on_circles, unit_fields
 from halbach_fe.solver.iron_grid import IronRectangle, Resolution
 from halbach_fe.solver.session import Session
 
@@ -239,7 +239,7 @@ def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     if len(blocks) < MANY_BLOCKS or any(
             edge.arc for block in blocks for edge in block.outline) or any(
             block.gradient or block.corner_loss for block in blocks):
-        return partial(field_of, blocks)
+        return partial(field_on_circles, blocks)
     from halbach_fe.solver.moments.interaction import Interaction  # import numba
     from halbach_fe.solver.moments.solve import System
 

@@ -9,7 +9,7 @@ import pytest
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import exact_block_field, prism_kernel
-from halbach_fe.solver.exact_block_field import field_of, gradient_of, unit_field
+from halbach_fe.solver.exact_block_field import field_of, field_on_circles, gradient_of, unit_field
 from halbach_fe.solver.prism_kernel import arc_table
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from tests.conftest import circle
@@ -183,6 +183,43 @@ def test_finite_and_continuous_above_an_edge(short_dipole):
     nearby = unit_field(block, np.array([[x + 1e-9, y - 1e-9, 0.3]]))
     assert np.isfinite(there).all()
     np.testing.assert_allclose(there, nearby, atol=1e-8)
+
+
+@pytest.mark.parametrize(("angles", "evaluated"), [(64, 3), (40, 5), (37, 32)])
+@pytest.mark.parametrize("shape", ["sector", "trapezoid"])
+def test_blocks_of_a_ring_are_evaluated_once_on_circles(
+    short_dipole, generator, monkeypatch, shape, angles, evaluated
+):
+    """Two rings of 16 blocks: one block each, and one that is displaced by a micrometre, where the
+    angles are a multiple of 16; two blocks each and the displaced one for 40 angles, as every
+    second block is five steps further; all for 37. Rounding.
+    """
+    study = short_dipole(array__block={"shape": shape}, array__exceptions=[
+        {"ring": 2, "slot": 7, "displacement_m": [1e-6, 0.0, 0.0]},
+        {"ring": 1, "slot": 3, "magnetization_factor": -0.7}])
+    blocks = build_magnet(study).blocks
+    start = 0.1
+    middle, z = generator.uniform(0.19, 0.2, 5), generator.uniform(-0.1, 0.1, 5)
+    points = np.vstack([
+        np.column_stack([middle * np.cos(angle), middle * np.sin(angle), z])
+        for angle in start + 2 * np.pi * np.arange(angles) / angles])
+    exact = field_of(blocks, points)
+    calls = []
+    local = exact_block_field._local_field
+
+    def counted(block, where):
+        calls.extend([block] * (len(where) == len(points)))
+        return local(block, where)
+
+    monkeypatch.setattr(exact_block_field, "_local_field", counted)
+    found = field_on_circles(blocks, points)
+    assert len(calls) == evaluated
+    assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
+    elsewhere = points + generator.uniform(-1e-3, 1e-3, points.shape)
+    np.testing.assert_allclose(field_on_circles(blocks, elsewhere), field_of(blocks, elsewhere),
+                               rtol=1e-12, atol=1e-14)
+    in_place = build_magnet(short_dipole(array__block={"shape": shape})).blocks  # control
+    assert np.abs(field_of(in_place, points) - exact).max() > 1e-7 * np.abs(exact).max()
 
 
 def test_scaling(short_dipole, generator):

@@ -8,7 +8,7 @@ import pytest
 from halbach_fe.core.errors import GetDPError, HalbachWarning, MeshError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
-from halbach_fe.response.matrix import response_matrix, verify_superposition
+from halbach_fe.response.matrix import check_superposition, response_matrix, superposition_error
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.formulations import edge_elements
@@ -172,12 +172,12 @@ def test_superposition_check_can_fail(generator):
     matrix, nominal = generator.standard_normal((9, 4)), generator.standard_normal(4)
     direct = matrix @ nominal
     magnitude = np.abs(matrix) @ np.abs(nominal)
-    assert verify_superposition(matrix @ nominal, magnitude, direct) < 1e-12
+    assert superposition_error(matrix @ nominal, magnitude, direct) < 1e-12
     swapped = matrix[:, [1, 0, 2, 3]]
     with pytest.raises(GetDPError, match="do not add up"):
-        verify_superposition(swapped @ nominal, magnitude, direct)
+        check_superposition(superposition_error(swapped @ nominal, magnitude, direct))
     with pytest.raises(GetDPError, match="do not add up"):  # no column at all
-        verify_superposition(0 * direct, 0 * magnitude, direct)
+        check_superposition(superposition_error(0 * direct, 0 * magnitude, direct))
 
 
 def test_stored_response_is_used_only_for_the_same_inputs(dipole, session):
