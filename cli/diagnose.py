@@ -162,7 +162,7 @@ def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
 
     common.print_estimate(estimate.update, as_json=False)
     rounds = estimate.as_dict()["rounds"]
-    times = " to ".join(duration(estimate.seconds(count)) for count in rounds)
+    times = " to ".join(map(duration, (estimate.shortest_s, estimate.longest_s)))
     common.say(f"That is one round; a diagnosis that finds something takes {rounds[0]} to "
                f"{rounds[1]}. The first one compares {estimate.signatures} hypotheses, which need "
                f"{estimate.fields} more fields of whole magnets. In all {times}, within a factor "

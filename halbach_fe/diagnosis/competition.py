@@ -104,14 +104,17 @@ class Competition:
     families : sequence of Family
     whiten : callable
         Function of the changes (k, n, 3) in T of a map that returns whitened readings (rows, k).
+    excluded : collection of int
+        Numbers of candidates that are not added to an explanation.
     """
 
     def __init__(
         self, marginal: Marginal, columns: Floats, absorbed: Floats, residual: Floats,
         evidence: Evidence, candidates: Sequence[Candidate], families: Sequence[Family],
-        whiten: Callable[[Floats], Floats],
+        whiten: Callable[[Floats], Floats], excluded: Collection[int] = (),
     ) -> None:
         self.candidates, self.families, self.evidence = candidates, families, evidence
+        self.excluded = frozenset(excluded)
         self.prior = prior_log_odds(candidates)
         self.prior_of_family = float(np.log(EFFECT_PRIOR_ODDS / max(len(families), 1)))
         whitened = [whiten(family.fields()) for family in families]
@@ -311,7 +314,8 @@ class Competition:
                                      self.candidates) + self.prior
             taken = {self.candidates[k].effect for k in kept if self.candidates[k].unique}
             odds[[number for number, candidate in enumerate(self.candidates)
-                  if number in kept or candidate.effect in taken]] = -np.inf
+                  if number in kept or number in self.excluded
+                  or candidate.effect in taken]] = -np.inf
             if not len(odds):  # there was no time for any hypothesis
                 break
             best = int(np.argmax(odds))

@@ -25,6 +25,7 @@ from halbach_fe.inference.infer import observation_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Data, check_maps
 from halbach_fe.response.resource_estimate import Estimate, estimate_infer, estimate_solve
+from halbach_fe.solver.mesh import with_rough_mesh
 from halbach_fe.study.model import Study
 
 FEWEST_ROUNDS = 2
@@ -53,15 +54,25 @@ class DiagnosisEstimate:
     fields: int
     fields_s: float
 
-    def seconds(self, rounds: int) -> float:
-        """Return the time in s of so many rounds."""
-        return rounds * self.update.seconds + self.fields_s
+    @property
+    def shortest_s(self) -> float:
+        """Time in s of `FEWEST_ROUNDS`.
+
+        By azimuthal modes, a second round of nearly the same shapes and materials takes the
+        solutions of the first one, see `halbach_fe.response.matrix.response_matrix`.
+        """
+        solved = 1 if self.update.route == "azimuthal_modes" else FEWEST_ROUNDS
+        return solved * self.update.seconds + self.fields_s
+
+    @property
+    def longest_s(self) -> float:
+        """Time in s of `MAX_ROUNDS`, each of which solves the model anew."""
+        return MAX_ROUNDS * self.update.seconds + self.fields_s
 
     def as_dict(self) -> dict[str, Any]:
         """Return the estimate as plain data for JSON."""
         return {"rounds": [FEWEST_ROUNDS, MAX_ROUNDS], "signatures": self.signatures,
-                "fields": self.fields, "seconds": [
-                    self.seconds(FEWEST_ROUNDS), self.seconds(MAX_ROUNDS)],
+                "fields": self.fields, "seconds": [self.shortest_s, self.longest_s],
                 "each_round": self.update.as_dict()}
 
 
@@ -112,14 +123,19 @@ def estimate_diagnosis(
 
 
 def _asked(effect: Effect, study: Study, points: Floats, place: Place) -> list[Study]:
-    """Return the magnets whose field the signature at a place needs."""
+    """Return the magnets whose field the signature at a place needs, the rough one if there is one.
+
+    Their meshes are those that suffice for signatures.
+    """
     asked: list[Study] = []
 
     def solve(changed: Study) -> Floats:
         if changed != study:  # the field of the study itself is shared by all
-            asked.append(changed)
+            asked.append(with_rough_mesh(changed))
         return np.zeros((len(points), 3))
 
     nominal = NominalFields(study, points, np.zeros(len(points)), solve)
-    effect.signature(nominal, place)
+    if effect.kind == "instrument" or effect.rough_signature(nominal, place) is None:
+        asked.clear()
+        effect.signature(nominal, place)
     return asked

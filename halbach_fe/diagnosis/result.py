@@ -244,7 +244,9 @@ class Diagnosis(ShownInNotebook):
         What is likelier than not to be missing, but not certain enough to be named.
     probabilities : dict
         Posterior probability of each effect by name, and of ``none``, on the assumption that at
-        most one effect is missing from the corrected study.
+        most one effect is missing from the corrected study. Effects that explain too little to be
+        solved for have that of their rough signature, see
+        `halbach_fe.diagnosis.effects.base.Effect.rough_signature`.
     evidence : Evidence
         Evidence of all signatures for the corrected study.
     candidates : tuple of Candidate

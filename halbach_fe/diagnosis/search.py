@@ -127,6 +127,9 @@ class Search:
         Of the study from which the search started.
     uncompared : int
         Number of hypotheses for which there was no time.
+    rough : frozenset of int
+        Numbers of the hypotheses with rough signatures. They explain too little to be solved for,
+        and cannot be selected.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -140,6 +143,7 @@ class Search:
     campaign: Campaign
     nominal: Scene
     uncompared: int = 0
+    rough: frozenset[int] = frozenset()
 
 
 def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
@@ -239,6 +243,17 @@ def score_hypotheses(
         known[key] = signatures[key] = by_response(hypothesis, nominal_start)
         return signatures[key]
 
+    def roughly(hypothesis: Hypothesis, over: bool) -> Floats | None:
+        """Return the whitened rough signature (rows, k); None if there is none, or if it is not
+        known and the time is over.
+        """
+        key = f"{hypothesis.effect.name}, roughly", hypothesis.place
+        if key not in signatures and not over:
+            fields = nominal_start.rough_signature(hypothesis)
+            if fields is not None:
+                signatures[key] = whitened(update.observation.read(fields))
+        return signatures.get(key)
+
     def competitor(
         hypothesis: Hypothesis, signature: Floats, is_rough: bool = False
     ) -> tuple[Floats, Candidate]:
@@ -266,17 +281,19 @@ def score_hypotheses(
         is_rough = False
         if present is None:
             signature = signatures.get(key, known.get(key))
-            if signature is None and is_over():
-                uncompared += 1
-                return
-            roughly = nominal_start.rough_signature(hypothesis) if signature is None else None
-            if roughly is not None:
-                signature, is_rough = whitened(update.observation.read(roughly)), True
-                rough.add(len(scored))
-            elif signature is None:
-                signature = exact(hypothesis)
-            else:
+            if signature is not None:
                 signatures[key] = signature
+            else:
+                over = is_over()
+                signature = roughly(hypothesis, over)
+                if signature is not None:
+                    is_rough = True
+                    rough.add(len(scored))
+                elif over:
+                    uncompared += 1
+                    return
+                else:
+                    signature = exact(hypothesis)
         elif effect.applied_in_full:
             others = campaign.with_terms(apply_effects(
                 corrected, [other for other in identified if other is not present]), update.terms)
@@ -335,14 +352,9 @@ def score_hypotheses(
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique,
                                         len(places[effect.name]) + 1))
-    if is_over():  # no time is left to solve for those that may come near
-        uncompared += len(rough)
-        for number in sorted(rough, reverse=True):
-            del scored[number], columns[number], candidates[number]
-        rough.clear()
-    kept_in = {number for number, hypothesis in enumerate(scored)
-               if (hypothesis.effect.name, hypothesis.place) in in_model}
     while True:
+        kept_in = {number for number, hypothesis in enumerate(scored)
+                   if (hypothesis.effect.name, hypothesis.place) in in_model}
         compared = most_likely(candidates, columns, marginal, residual, kept_in)
         numbered = tuple(renumbered([candidates[number] for number in compared.numbers]))
         near = [compared.numbers[k] for k in near_the_likeliest(
@@ -350,13 +362,22 @@ def score_hypotheses(
                                           if number in rough})]
         if not near:
             break
-        for number in near:
+        if is_over():  # no time is left to solve for them
+            uncompared += len(near)
+            for number in reversed(near):
+                del scored[number], columns[number], candidates[number]
+            rough = {number - sum(gone < number for gone in near) for number in rough - {*near}}
+            continue
+        for done, number in enumerate(near):
+            progress(done, len(near))
             rough.discard(number)
             columns[number], candidates[number] = competitor(
                 scored[number], exact(scored[number]))
+        progress(len(near), len(near))
     return Search(tuple(scored[number] for number in compared.numbers), numbered,
                   compared.evidence, compared.columns, compared.absorbed, residual, marginal,
-                  training, campaign, nominal_start, uncompared)
+                  training, campaign, nominal_start, uncompared, frozenset(
+                      k for k, number in enumerate(compared.numbers) if number in rough))
 
 
 def _improved_place(
@@ -495,7 +516,8 @@ def identify_effects(
 
     An effect is impossible if an amplitude is below its parameter's minimum (a negative gap, for
     example), if no valid study has it, or if it puts points of the map inside material. Such a
-    candidate is excluded and the selection repeated.
+    candidate is excluded and the selection repeated. Those with rough signatures are excluded: they
+    explain too little, also in place of one that is impossible.
 
     Parameters
     ----------
@@ -503,7 +525,7 @@ def identify_effects(
         The study corrected for gross errors and outliers.
     search : Search
     """
-    excluded: set[int] = set()
+    excluded = set(search.rough)
     while True:
         found = amplitudes(
             search, select_effects(search.evidence, search.candidates, excluded=excluded))

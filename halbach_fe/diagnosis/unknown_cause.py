@@ -143,7 +143,8 @@ def judge(
         return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
 
     competition = Competition(marginal, columns, absorbed, residual, evidence,
-                              search.candidates, flexible, lambda fields: whiten(fields)[some])
+                              search.candidates, flexible, lambda fields: whiten(fields)[some],
+                              search.rough)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     sources = {number: effect.hypothesis.place.at_m
                for number, effect in zip(numbers, identified, strict=True)

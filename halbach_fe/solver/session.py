@@ -17,7 +17,7 @@ from halbach_fe.core.files import make_folder
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.pace import Progress
 from halbach_fe.core.result_folder import locked_folder
-from halbach_fe.core.temporary_files import temporary_path
+from halbach_fe.core.temporary_files import remove_orphans, temporary_path
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Run, find_getdp
 from halbach_fe.solver.getdp_cache import Cache, default_cache
@@ -178,7 +178,8 @@ class Session:
         if self.cache is not None or self.counter is not None:
             yield self
             return
-        folder = temporary_path(make_folder(self.folder) / "cache")
+        remove_orphans(make_folder(self.folder))  # of processes that were killed
+        folder = temporary_path(self.folder / "cache")
         try:
             yield replace(self, cache=Cache(folder, TEMPORARY_CACHE_BYTES))
         finally:
