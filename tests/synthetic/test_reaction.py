@@ -166,6 +166,28 @@ def test_iron_of_every_kind_in_three_dimensions():
         np.testing.assert_allclose(middle, expected, atol=1e-9 * body.shape.volume)
 
 
+def test_elements_are_small_at_the_ends_of_tubes():
+    """Vertices on the rims of a tube are hardly farther apart than it is thick, unless a size is
+    asked for, which is the control.
+    """
+    thickness, outer, half = 0.01, 0.1, 0.02
+    iron = {"relative_permeability": 100.0, "bodies": [
+        {"kind": "tube", "inner_radius_m": outer - thickness, "outer_radius_m": outer,
+         "length_m": 2 * half, "z_m": 0.0}]}
+    magnet = magnet_of(study_of({"free_blocks": table_of(PLAIN)}, iron=iron))
+
+    def farthest(elements):
+        mesh = ngsolve_reaction.mesh_of(magnet, POINTS, elements)
+        places = np.array([vertex.point for vertex in mesh.vertices])
+        rim = (np.abs(np.hypot(*places[:, :2].T) - outer) < 1e-6) & (
+            np.abs(places[:, 2] - half) < 1e-6)
+        angles = np.sort(np.arctan2(places[rim, 1], places[rim, 0]))
+        return outer * np.diff(angles, append=angles[0] + 2 * np.pi).max()
+
+    assert farthest(Elements()) < 1.3 * thickness
+    assert farthest(Elements(0.03)) > 1.7 * thickness
+
+
 def test_block_table_of_a_magnet_of_all_kinds():
     """Places, types and moments: of blocks before they were mounted; missing ones are left out."""
     array = CUBES | {"recoil_permeability": 1.0, "recoil_permeability_across": 1.0,
