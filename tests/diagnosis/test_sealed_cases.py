@@ -36,11 +36,11 @@ def test_a_few_cases(study, tmp_path):
     text = SCRIPT.with_name("study.toml").read_text()
     # of blocks in vacuum the mesh matters to few signatures only; the magnet keeps its length but
     # has half of the blocks, of a shape that magpylib has a quick field of; and the comparison of
-    # effects is linear algebra of the readings, of which 60 % suffice
+    # effects is linear algebra of the readings, of which a fifth suffices
     for old, new in (("block_size_m = 0.027", "block_size_m = 0.06\nmeridian_size_m = 0.03"),
                      ("rings = 4", "rings = 2"), ('"sector"', '"trapezoid"'),
                      ("ring_length_m = 0.0833333", "ring_length_m = 0.1666666"),
-                     ("count = 41", "count = 25")):
+                     ("count = 41", "count = 17"), ("angles = 24", "angles = 12")):
         assert text.count(old) == 1
         text = text.replace(old, new)
     (tmp_path / "study.toml").write_text(text)
@@ -51,8 +51,8 @@ def test_a_few_cases(study, tmp_path):
              for key, seed in FEW.items()}
     for key in ("offset_z", "arm_sag"):
         assert cases[key]["named"][0][0] == key
-        # some 900 held-out readings: four standard deviations of chi-squared
-        assert 0.81 < cases[key]["chi2_after"] < 1.19 < cases[key]["chi2_before"]
+        # 306 held-out readings: four standard deviations of chi-squared
+        assert 0.68 < cases[key]["chi2_after"] < 1.32 < cases[key]["chi2_before"]
     assert not cases["none"]["named"]
     assert not cases["none"]["unknown"]
     assert cases["coil"]["unknown"] == "field"
