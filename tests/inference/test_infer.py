@@ -478,7 +478,7 @@ CURVE = {"inner_radius_m": 0.19, "outer_radius_m": 0.192,
          "curve": {"kind": "steel", "name": "aisi_1010"}}
 
 
-def saturated_campaign(dipole, generator, session, spread, sizes=(0.007, 0.005)):
+def saturated_campaign(dipole, generator, session, spread, sizes=(0.01, 0.007)):
     """A 2D map of a dipole in a saturated ring, by Newton's method on a mesh of its own."""
     changes = {"iron_ring": CURVE, "noise": NOISE, "observation__components": ["x", "y"],
                "prior": {"magnitude_sd": spread, "direction_sd_deg": np.degrees(spread)}}
