@@ -145,11 +145,11 @@ STUDIES: dict[str, dict[str, Any]] = {
             "block_size_m": 0.02}),
     "free-permeable": free(recoil_permeability=[1.05] * 6),
     "iron-ring": changed(
-        CLOSED, mesh__meridian_size_m=0.015, mesh__growth=2.0, array__recoil_permeability=1.0,
+        CLOSED, mesh__meridian_size_m=0.025, mesh__growth=2.0, array__recoil_permeability=1.0,
         iron_ring={"inner_radius_m": 0.09, "outer_radius_m": 0.1, "relative_permeability": 100.0}),
     "iron-tube": changed(BASE, iron={
         "bodies": [TUBE], "relative_permeability": 100.0}),
-    "iron-prisms": changed(BASE, array__rings=1, mesh__growth=2.0, iron={
+    "iron-prisms": changed(BASE, array__rings=1, mesh__growth=4.0, mesh__block_size_m=0.03, iron={
         "bodies": [PRISM], "relative_permeability": 100.0}),
     "iron-curve": changed(BASE, array__rings=1, iron={
         "bodies": [TUBE], "curve": {

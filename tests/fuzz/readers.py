@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 from unittest import mock
 
+import h5py
 import meshio
 import numpy as np
 import xarray as xr
@@ -205,16 +206,23 @@ def a_matrix() -> bytes:
     return written(".npy", lambda path: StoredMatrix.of([np.ones((3, 2))], (3, 2), path))
 
 
+@cache
+def without_matrix() -> bytes:
+    """A response that names a matrix in a file of its own, by a checksum of zeros."""
+    return written(".h5", lambda path: write_response(path, "the key", Response(
+        StoredMatrix(_beside(path, "the key"), (3, 2), "0" * 64),
+        ("r01s01.Mx", "r01s01.My"), np.ones(2), np.zeros(3), np.zeros(3), 1e-9)))
+
+
 def with_matrix(path: Path) -> np.ndarray | None:
-    """A response whose matrix is in a file of its own."""
+    """A response whose matrix is in a file of its own, of which it has the checksum."""
     with tempfile.TemporaryDirectory() as folder:
         main = Path(folder, "response.h5")
         beside = _beside(main, "the key")
         beside.write_bytes(path.read_bytes())
-        write_response(main, "the key", Response(
-            StoredMatrix(beside, (3, 2), hashlib.sha256(beside.read_bytes()).hexdigest()),
-            ("r01s01.Mx", "r01s01.My"), np.ones(2), np.zeros(3),
-            np.zeros(3), 1e-9))
+        main.write_bytes(without_matrix())
+        with h5py.File(main, "r+") as file:
+            file.attrs["matrix_sha256"] = hashlib.sha256(beside.read_bytes()).hexdigest()
         found = read_response(main, "the key")
         return None if found is None else found.whole
 

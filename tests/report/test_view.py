@@ -69,8 +69,8 @@ def coloured(page):
 def words(page):
     """What is shown as the pointer goes over the picture."""
     box, found = page.locator("#magnet-view").bounding_box(), set()
-    for along in np.linspace(0.3, 0.6, 5):
-        for down in np.linspace(0.35, 0.7, 5):
+    for along in np.linspace(0.3, 0.6, 3):
+        for down in np.linspace(0.35, 0.7, 3):
             page.mouse.move(box["x"] + along * box["width"], box["y"] + down * box["height"])
             page.wait_for_timeout(60)
             found.update(page.evaluate(
@@ -87,7 +87,7 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     assert coloured(shown) > 20_000
     found = words(shown)
     own = [one for one in found if "ring 1, slot" in one]
-    assert own
+    assert len(own) > 1  # 3 of 9 points were over blocks
     for text in own:
         slot = int(text.split("slot ")[1].split("M")[0])
         assert known.colours.words[slot - 1] in text
