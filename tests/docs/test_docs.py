@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from halbach_fe.cli.verbs import VERBS
+from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.model import Study
 from tests.conftest import ROOT
 from tests.support.warm_process import run_warm
@@ -47,10 +48,15 @@ def blocks_of(text):
 
 
 def run_page(text, folder):
-    """Run a page's blocks; AssertionError with what was said if one does not do as it should."""
+    """Run a page's blocks; AssertionError with what was said if one does not do as it should.
+
+    What a block of the page has solved the next finds in a cache, as on the machine of a reader.
+    """
     environment = os.environ | {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "OMP_NUM_THREADS": "1"}
+    if "--mpi" not in text:  # there several processes are to solve what one has solved
+        environment |= {FOLDER_VARIABLE: str(folder / ".cache"), LIMIT_VARIABLE: "1"}
     for block in blocks_of(text):
         if block.file:
             (folder / block.file).write_text(block.text, encoding="utf-8")

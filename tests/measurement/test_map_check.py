@@ -234,11 +234,13 @@ def test_edges_of_magnets_are_no_errors_of_the_probe(generator, monkeypatch, wei
 
 @pytest.mark.parametrize("spoiled", ["shuffled lines", "curl"])
 def test_what_no_magnet_makes_is_not_fitted(generator, spoiled):
-    points, field = GRID[:189], read_by(generator)[:189]  # three planes suffice
+    # three planes suffice for a curl, two for lines, which leave 4.3 mT (40 uT, were they sound)
+    count = 189 if spoiled == "curl" else 126
+    points, field = GRID[:count], read_by(generator)[:count]
     if spoiled == "curl":
         field += 0.02 * np.column_stack([-points[:, 1], points[:, 0], 0 * points[:, 0]]) / STEP_M
     else:
-        field = field.reshape(21, 9, 3)[generator.permutation(21)].reshape(-1, 3)
+        field = field.reshape(14, 9, 3)[generator.permutation(14)].reshape(-1, 3)
     check = check_map(field_map(points, field))
     assert "does not obey" in verdict(check)
 
