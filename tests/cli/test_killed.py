@@ -51,15 +51,15 @@ def test_killed_and_run_again(verb, tmp_path):
 
 ORPHANING = """
 import subprocess, time
-subprocess.Popen(["sleep", "10"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-time.sleep(3)
+subprocess.Popen(["sleep", "15"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+time.sleep(6)
 """
 
 
 def test_a_process_that_survives_is_seen(tmp_path):
     """The control: a child that nothing ties to its parent."""
     end = kill_and_run_again([sys.executable, "-c", ORPHANING], dict(os.environ), tmp_path,
-                             tmp_path, moment_s=2.0, patience_s=1.0)
+                             tmp_path, moment_s=4.0, patience_s=2.0)
     assert end.broken == ["sleep survives"]
 
 
