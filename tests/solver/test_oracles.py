@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import ngsolve
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
+from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.oracles import dipole_of
@@ -17,22 +20,41 @@ from tests.oracles import ngsolve_model as oracle
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
 
 
+@dataclass(frozen=True)
+class InVacuum:
+    """The FASER dipole with iron, places, NGSolve's mesh, and B there of the sources in vacuum."""
+
+    study: Study
+    points: np.ndarray
+    mesh: ngsolve.Mesh
+    field: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def in_vacuum():
+    study = read_study(ROOT / "studies" / "faser" / "campaign.toml")
+    points = points_from(study.observation.positions)[::29]
+    mesh = oracle.eighth(dipole_of(study), 0.04)
+    with ngsolve.TaskManager():
+        return InVacuum(study, points, mesh, oracle.vector_potential_field(
+            dipole_of(study), mesh, 3, points, real=False, residual=1e-7))
+
+
 @pytest.mark.parametrize("with_iron", [True, False], ids=["iron", "air"])
-def test_full_array_against_the_vector_potential_in_3d(session, with_iron):
+def test_full_array_against_the_vector_potential_in_3d(session, in_vacuum, with_iron):
     """The whole FASER dipole, fringe included, with mu_r = 1.05 and an iron tube, in units of its
-    main field of 0.57 T. Coarse here: 2.7e-4 with iron, 2.4e-4 without, rms 4e-5 and 3e-5;
+    main field of 0.57 T. Coarse here: 2.6e-4 with iron, 2.3e-4 without, rms 4e-5 and 3e-5;
     NGSolve's finer meshes and orders bring it down to 3.3e-5 (`make benchmark`).
     """
-    study = read_study(ROOT / "studies" / "faser" / "campaign.toml")
+    study, points = in_vacuum.study, in_vacuum.points
     if not with_iron:
         study = study.with_(iron_ring=None)
-    points = points_from(study.observation.positions)[::29]
     shifted = points + np.array([0, 0, 0.01])
     ours, moved = np.split(finite_element_part(
         build_magnet(study), np.vstack([points, shifted]), session, columns=False).nominal, 2)
     with ngsolve.TaskManager():
-        dipole = dipole_of(study)
-        theirs = oracle.vector_potential(dipole, oracle.eighth(dipole, 0.04), 3, points)
+        theirs = oracle.vector_potential_field(
+            dipole_of(study), in_vacuum.mesh, 3, points, residual=1e-7) - in_vacuum.field
     main_field = 0.57
     assert np.linalg.norm(ours - theirs, axis=1).max() < 7e-4 * main_field
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < 1e-4 * main_field
@@ -57,9 +79,9 @@ def column():
     block, dipole = build_magnet(study).blocks[NUMBER], dipole_of(study)
     mesh = oracle.whole(dipole, block.slot - 1, block.z_min, block.z_max, 0.04)
     with ngsolve.TaskManager():
-        # a residual of 1e-6 leaves 1e-6 of the reaction
+        # a residual of 1e-4 leaves 6e-5 of the reaction
         return oracle.scalar_potential_column(dipole, mesh, 3, (1.0, 0.0, 0.0), POINTS,
-                                              residual=1e-6).reaction
+                                              residual=1e-4).reaction
 
 
 @pytest.mark.parametrize(("route", "cap"), [
