@@ -16,6 +16,7 @@ from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read
 from halbach_fe.solver.formulation_choice import finite_element_part
 from halbach_fe.solver.interpolation import coordinates, locate, probes_of, shape_functions
 from halbach_fe.solver.mesh import build_meridian, build_mesh, verify_mesh
+from halbach_fe.solver.session import Session
 from tests.conftest import circle
 
 
@@ -168,18 +169,29 @@ def test_damaged_lists_of_unknowns_are_refused(tmp_path, content):
         read_unknowns(path, "tetra10")
 
 
-@pytest.mark.parametrize(("route", "order", "part", "corners_only"), [
-    *(("azimuthal_modes", 1, part, False) for part in range(3)),
-    ("scalar_potential", 1, 0, False), ("scalar_potential", 1, 0, True),
-    ("edge_elements", 1, 0, False), *(("edge_elements", 2, part, False) for part in range(3))])
-def test_other_numbering_is_noticed(
-    short_dipole, session, monkeypatch, route, order, part, corners_only
-):
-    """Negative control of the comparison with GetDP's own print: unknowns in another order."""
+@pytest.fixture(scope="module")
+def accepted(request, short_dipole, getdp, tmp_path_factory):
+    """The study of a route and an order, and points: unknowns in GetDP's own order are accepted."""
+    route, order = request.param
     study = short_dipole(solver={"route": route, "edge_order": order},
                          mesh__block_size_m=0.06, mesh__meridian_size_m=0.03, mesh__growth=3.0)
     points = circle(0.05, 5, 0.013)
+    session = Session(getdp, tmp_path_factory.mktemp("accepted"), jobs=2)
     finite_element_part(build_magnet(study), points, session, columns=False)
+    return study, points
+
+
+@pytest.mark.parametrize(("accepted", "part", "corners_only"), [
+    *((("azimuthal_modes", 1), part, False) for part in range(3)),
+    (("scalar_potential", 1), 0, False), (("scalar_potential", 1), 0, True),
+    (("edge_elements", 1), 0, False),
+    *((("edge_elements", 2), part, False) for part in range(3))],
+    indirect=["accepted"], ids=lambda value: "-".join(map(str, value))
+    if isinstance(value, tuple) else None)
+def test_other_numbering_is_noticed(accepted, session, monkeypatch, part, corners_only):
+    """Negative control of the comparison with GetDP's own print: unknowns in another order."""
+    study, points = accepted
+    route = study.solver.route
     mesh = None if route == "azimuthal_modes" else verify_mesh(
         build_mesh(build_magnet(study), session.folder / "again"))
 

@@ -101,18 +101,20 @@ def test_3d_ring_against_magpylib_and_exact_field(short_dipole, session):
 def test_3d_error_falls_with_refinement(short_dipole, session):
     """First order in B: halving every size must take at least a third off, down to a cap.
 
-    Measured 0.043 and 0.020, rms.
+    A single ring in a box that is small. Measured 0.063 and 0.029, rms.
     """
     points = in_bore()
     errors = []
-    for size, layers in ((0.03, 2), (0.015, 4)):
+    for size, layers in ((0.04, 2), (0.02, 4)):
         study = short_dipole(array__recoil_permeability=1.0, solver={"method": "direct"},
+                             array__rings=1,
+                             open_boundary={"radius_m": 0.5, "half_length_m": 0.4},
                              mesh={"block_size_m": size, "layers_per_ring": layers, "growth": 1.8})
         exact = field_of(build_magnet(study).blocks, points)
         found = solve_nominal(build_magnet(study), points, session)
         errors.append(np.sqrt(np.mean((found - exact) ** 2)) / np.abs(exact).max())
     assert errors[1] < 0.67 * errors[0]
-    assert errors[1] < 0.03
+    assert errors[1] < 0.043
 
 
 def test_3d_one_block_all_components(short_dipole, session):
@@ -202,7 +204,8 @@ def test_stored_response_is_used_only_for_the_same_inputs(dipole, session):
 @pytest.mark.parametrize("route", ["edge_elements", "scalar_potential", "azimuthal_modes"])
 def test_one_point_alone(short_dipole, session, route):
     """GetDP's interpolation of a table of one line gives nothing; a study of one point works."""
-    study = short_dipole(solver__route=route, mesh__meridian_size_m=0.03)
+    study = short_dipole(solver__route=route, mesh__meridian_size_m=0.03,
+                         mesh__block_size_m=0.06, mesh__growth=3.0)
     points = in_bore(5)
     alone = solve_nominal(build_magnet(study), points[:1], session)
     np.testing.assert_allclose(alone[0], solve_nominal(build_magnet(study), points, session)[0],
