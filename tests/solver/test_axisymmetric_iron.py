@@ -157,8 +157,9 @@ def test_saturating_iron_against_ngsolve(bodies, session):
     found = solve_iron(bodies, dipole(moment, place), session, estimate=False)
     assert worst(found.field(points), truth) < 8e-3
     other = [replace(body, law=froehlich_kennelly(IRON["initial"], 0.9)) for body in bodies]
-    wrong = solve_iron(other, dipole(moment, place), session, estimate=False)
-    assert worst(wrong.field(points), truth) > 0.03  # negative control: another saturation
+    # negative control: another saturation, 9e-2 off; with the right one this mesh is 4e-3 off
+    wrong = solve_iron(other, dipole(moment, place), session, resolution=FEW, estimate=False)
+    assert worst(wrong.field(points), truth) > 0.03
 
 
 def test_a_weak_source_sees_the_initial_permeability(session):
