@@ -78,11 +78,11 @@ SHAPES = [PrismBody(0.02, 0.03, 0.03, 0.04), PrismBody(0.02, 0.02, 0.04, 0.03, 0
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
 def test_lone_moment_of_every_shape(shape):
-    """Gauss points against NGSolve with coarse elements of order 2, which leave 2e-4; with fine
-    ones of order 3 measured 3e-5. Self-demagnetization is 3 %.
+    """Gauss points against NGSolve with coarse elements of order 2: measured 2e-4 to 3e-4, and up
+    to 6e-4 of polygons; with fine ones of order 3 measured 3e-5. Self-demagnetization is 3 %.
     """
     mu = np.diag([1.05, 1.1, 1.1])
-    theirs = moment_matrix(shape, mu, block_mesh(shape, shape.thickness / 2), 2)
+    theirs = moment_matrix(shape, mu, block_mesh(shape, shape.thickness / 1.7, 1), 2)
     ours = separate_reaction.lone_moment_matrix(shape, mu)
     size = theirs[0, 0]
     np.testing.assert_allclose(ours, theirs, atol=1e-3 * size)
