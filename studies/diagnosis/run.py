@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -201,10 +202,11 @@ def own_factors(found: Diagnosis, hidden: Sequence[str]) -> dict[str, float]:
     return factors
 
 
-def known_as(name: str) -> list[str]:
+@cache
+def known_as(name: str) -> tuple[str, ...]:
     """Names in the catalogue of what the campaign hides: that, or one of each sensor."""
-    return [effect.name for effect in catalogue()
-            if effect.name == name or effect.name[:-2] == name] or [name]
+    return tuple(effect.name for effect in catalogue()
+                 if effect.name == name or effect.name[:-2] == name) or (name,)
 
 
 def detectable(result: dict[str, Any], name: str) -> bool:
