@@ -353,7 +353,7 @@ def check_superposition(error: float, tolerance: float = SUPERPOSITION_TOLERANCE
 
 
 def _key(
-    magnet: Magnet, observation: Observation, session: Session, similar: Magnet | None
+    magnet: Magnet, observation: Observation, session: Session, similar: Magnet | None = None
 ) -> str:
     """Return a digest of everything that the matrix depends on."""
     relevant = magnet.study.model_dump(mode="json", include=FIELD_KEYS)

@@ -134,10 +134,10 @@ def test_columns_of_a_similar_magnet(modes, session, tmp_path):
     """They save all runs for single blocks, and readings of deviations are as good.
 
     Blocks that deviate by 1 %, in an iron tube, after a change of the inner radius by 30 um: the
-    largest difference was measured to be 1.3e-7 of the largest reading. Controls: without what iron
-    and permeability answer it is 7e-4, and a radius that differs by 2 mm is solved for.
+    largest difference was measured to be 1.1e-7 of the largest reading. Controls: without what iron
+    and permeability answer it is 6e-4, and a radius that differs by 2 mm is solved for.
     """
-    names = []
+    names, points = [], POINTS * [0.4, 0.4, 1.0]  # near the axis few modes suffice
 
     def counted(getdp, job, folder, *rest):
         names.append(folder.name)
@@ -147,9 +147,9 @@ def test_columns_of_a_similar_magnet(modes, session, tmp_path):
 
     def response_of(radius, name, similar=None):
         names.clear()
-        study = modes(array__inner_radius_m=radius, iron_ring=IRON, mesh__meridian_size_m=0.03)
+        study = modes(array__inner_radius_m=radius, iron_ring=IRON, mesh__meridian_size_m=0.05)
         magnet = build_magnet(study)
-        found = response_matrix(magnet, observe(study, POINTS, np.ones((len(POINTS), 3), bool)),
+        found = response_matrix(magnet, observe(study, points, np.ones((len(points), 3), bool)),
                                 cached.within(name), similar)
         return magnet, found, sum("blocks" in name for name in names)
 
@@ -169,7 +169,7 @@ def test_columns_of_a_similar_magnet(modes, session, tmp_path):
 
     scale = np.abs(readings(exact)).max()
     assert np.abs(readings(found) - readings(exact)).max() < 5e-7 * scale
-    vacuum = np.concatenate([unit_field(block, POINTS) for block in magnet.blocks], axis=2)
+    vacuum = np.concatenate([unit_field(block, points) for block in magnet.blocks], axis=2)
     bare = replace(exact, matrix=vacuum.reshape(exact.matrix.shape) * MU_0 * 1.05)
     bare = replace(bare, offset=exact.offset + (exact.matrix - bare.matrix) @ exact.nominal)
     assert np.abs(readings(bare) - readings(exact)).max() > 3e-4 * scale
