@@ -171,17 +171,17 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
     for number, body in enumerate(magnet.all_bodies):
         parts.append(_solid(body, flat))
         _name(parts[-1], f"block{number}", flat)
-    for solid in magnet.all_iron.bodies if magnet.all_iron else ():
+    iron = magnet.all_iron.bodies if magnet.all_iron else ()
+    for solid in iron:
         parts.append(_iron(solid, flat))
         sizes.append(min(sizes))
         _name(parts[-1], "iron", flat)
     for part, size in zip(parts, sizes, strict=True):
         (part.faces if flat else part).maxh = size
-    if not flat and elements.size is None and magnet.all_iron:
-        for solid, part, size in zip(magnet.all_iron.bodies, parts[-len(magnet.all_iron.bodies):],
-                                     sizes[-len(magnet.all_iron.bodies):], strict=True):
+    if not flat and elements.size is None:
+        for solid, part in zip(iron, parts[len(magnet.all_bodies):], strict=True):
             if isinstance(solid, Tube):
-                _refine_ends(solid, part, size)
+                _refine_ends(solid, part, min(sizes))
     extent = max(abs(value) for part in parts for corner in part.bounding_box
                  for value in (corner.x, corner.y, corner.z))
     reach = max(extent, float(np.abs(points[:, :magnet.dimension]).max()))

@@ -1,4 +1,8 @@
-"""Effects that are judged by a rough signature before they are solved for."""
+"""Effects that are judged by a rough signature before they are solved for.
+
+The maps are of the model that fits them, as only the steps of the search are tested. Rough
+signatures are compared with exact ones in test_screening.
+"""
 
 from __future__ import annotations
 
