@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", metavar="PART",
                         help=f"of {', '.join(PARTS)} (default: all but {', '.join(ALONE)})")
     chosen = parser.parse_args().parts or [part for part in PARTS if part not in ALONE]
-    results = {}
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
 
     def note(name: str, value: float, unit: str, against: str) -> None:
         results[name] = {
@@ -69,9 +69,8 @@ def main() -> None:
 
     for part in chosen:
         PARTS[part](note)
-    before = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    results = before | results
-    write_text(RESULTS, json.dumps(results, indent=1) + "\n")
+        # a run of hours that is interrupted keeps the parts that it has finished
+        write_text(RESULTS, json.dumps(results, indent=1) + "\n")
     common.print_table([{"name": name} | {key: str(value) for key, value in entry.items()}
                         for name, entry in results.items()])
 
