@@ -40,8 +40,8 @@ from halbach_fe.solver.formulation_choice import (
     SUPERPOSITION_TOLERANCE,
     ElementFields,
     check_points,
-    choose_route,
     finite_element_part,
+    runs_serve_other_points,
     vacuum_part,
 )
 from halbach_fe.solver.session import Session
@@ -221,13 +221,13 @@ def response_matrix(
 def _serves(similar: Magnet, magnet: Magnet, points: Floats, session: Session) -> bool:
     """Tell whether the cache has what a similar magnet's blocks add to the field at any points.
 
-    That is so by azimuthal modes. On other routes the runs depend on the points, too.
+    See `halbach_fe.solver.formulation_choice.runs_serve_other_points`.
     """
     alike = [[(block.ring, block.slot, block.angle_deg) for block in each.blocks]
              for each in (similar, magnet)]
     return (session.cache is not None and session.counter is None and not magnet.is_vacuum
             and alike[0] == alike[1]
-            and all(choose_route(each, points) == "azimuthal_modes" for each in (similar, magnet)))
+            and all(runs_serve_other_points(each, points) for each in (similar, magnet)))
 
 
 def _of_similar(

@@ -172,7 +172,7 @@ class _Ring:
 
 
 @dataclass(frozen=True)
-class _Case:
+class ModesCase:
     """The data that all runs for a magnet share.
 
     Attributes
@@ -219,9 +219,21 @@ class _Case:
         return NOMINAL[1] + 1, NOMINAL[1] + 3 * len(self.solved)
 
 
+SingleBlocks = Callable[[ModesCase, Session], dict[int, Floats]]
+"""A function that returns, by mode, d psi/dr, psi/r and d psi/dz (3 solved rings, points, 3) in T
+of single blocks: what they add to those in vacuum or, for the method ``direct``, all of it."""
+
+
+def meridian_points(magnet: Magnet, points: Floats) -> Floats:
+    """Return (r, z, 0) of points (n, 3) in m; those beside the axis are moved onto it."""
+    r = np.hypot(points[:, 0], points[:, 1])
+    r[r < AXIS_RADIUS * magnet.bore_radius] = 0.0
+    return np.column_stack([r, points[:, 2], 0 * r])
+
+
 def solve_modes(
     magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
-    highest: int | None = None,
+    highest: int | None = None, single_blocks: SingleBlocks | None = None,
 ) -> Floats:
     """Return the finite-element part of B of the nominal array and of single blocks, mode by mode.
 
@@ -241,15 +253,15 @@ def solve_modes(
     session : Session
     highest : int, optional
         The highest mode, by default `modes_needed`.
+    single_blocks : callable, optional
+        Computes the gradients of single blocks in another way than by a solve for each.
 
     Returns
     -------
     ndarray, shape (1 + 3 len(blocks), n, 3), in T
         The nominal array, then block by block, axis by axis.
     """
-    r = np.hypot(points[:, 0], points[:, 1])
-    r[r < AXIS_RADIUS * magnet.bore_radius] = 0.0
-    meridian, where = unique_points(np.column_stack([r, points[:, 2], 0 * r]))
+    meridian, where = unique_points(meridian_points(magnet, points))
     highest = modes_needed(magnet, points) if highest is None else highest
     mesh: VerifiedMesh | CountedMesh
     if session.counter is None:
@@ -259,15 +271,18 @@ def solve_modes(
     check_inside(magnet.name, mesh.radius, mesh.half_length, points)
     solved = tuple(sorted({magnet.blocks[number].ring - 1 for number in blocks}))
     weights = nominal_waves(magnet, highest)
-    case = _Case(magnet, mesh, weights, solved, meridian)
+    case = ModesCase(magnet, mesh, weights, solved, meridian)
     runs = runs_of(weights, unknowns_of(mesh.inner, mesh.axis, 1),
-                   case.single if blocks else None)
+                   case.single if blocks and single_blocks is None else None)
     variants = [False] if magnet.study.solver.method == "direct" else [False, True]
     results = iter(run_tasks([_task(case, modes, sources, vacuum, session)
                               for modes, sources in runs for vacuum in variants], session))
+    known = single_blocks(case, session) if blocks and single_blocks is not None else {}
     if session.counter is not None:
         return np.zeros((1 + 3 * len(blocks), len(points), 3))
-    found: dict[tuple[int, int], dict[int, Floats]] = {NOMINAL: {}, case.single: {}}
+    for m, gradient in known.items():
+        _limit_on_axis(m, gradient, meridian[:, 0] == 0)
+    found: dict[tuple[int, int], dict[int, Floats]] = {NOMINAL: {}, case.single: known}
     for modes, sources in runs:
         gradients = next(results)
         if len(variants) == 2:
@@ -352,12 +367,12 @@ def _middle(magnet: Magnet, block: MagnetBlock) -> float:
     return float(np.radians(block.angle_deg))
 
 
-def _rings(case: _Case, sources: tuple[int, int]) -> list[_Ring]:
+def _rings(case: ModesCase, sources: tuple[int, int]) -> list[_Ring]:
     """Return the data of all rings for the template of the problem, for some sources."""
     magnet = case.magnet
     blocks = [magnet.blocks[magnet.number_of(ring, 1)]
               for ring in range(1, len(magnet.blocks_by_ring) + 1)]
-    numbered = case.solved if sources == case.single else ()
+    numbered = () if sources == NOMINAL else case.solved
     return [_Ring(block.recoil_permeability, np.pi / magnet.blocks_by_ring[ring],
                   numbered.index(ring) + 1 if ring in numbered else 0,
                   *(case.weights[:, :, ring, component].ravel().tolist()
@@ -366,7 +381,7 @@ def _rings(case: _Case, sources: tuple[int, int]) -> list[_Ring]:
 
 
 def _task(
-    case: _Case, modes: list[int], sources: tuple[int, int], vacuum: bool, session: Session
+    case: ModesCase, modes: list[int], sources: tuple[int, int], vacuum: bool, session: Session
 ) -> Task:
     """Return the run of GetDP for some sources in some modes."""
     first, count = modes[0], sources[1] - sources[0] + 1
@@ -393,14 +408,14 @@ def _task(
 
 
 def fill_run_folder(
-    case: _Case, folder: Path, modes: list[int], sources: tuple[int, int], printed: int,
+    case: ModesCase, folder: Path, modes: list[int], sources: tuple[int, int], printed: int,
     vacuum: bool, time_limit_s: float,
 ) -> Job:
     """Fill a run folder with everything that GetDP needs, and return the job to run there.
 
     Parameters
     ----------
-    case : _Case
+    case : ModesCase
     folder : Path
         An existing folder.
     modes : list of int
@@ -417,7 +432,7 @@ def fill_run_folder(
     (folder / PROBLEM).write_bytes(problem)
     text = render("case_modes.pro.j2", magnet=case.magnet, regions=case.real_mesh.regions,
                   points=case.probes[1].tolist(), rings=_rings(case, sources),
-                  modes=modes, solved=len(case.solved) if sources == case.single else 1)
+                  modes=modes, solved=1 if sources == NOMINAL else len(case.solved))
     (folder / "case.pro").write_text(text, encoding="utf-8")
     (folder / case.real_mesh.path.name).write_bytes(case.real_mesh.path.read_bytes())
     return Job(
@@ -448,7 +463,7 @@ def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:
     return everywhere - (fixed if mode > 0 else 0)
 
 
-def read_run(case: _Case, folder: Path, modes: int, sources: int, printed: int) -> Floats:
+def read_run(case: ModesCase, folder: Path, modes: int, sources: int, printed: int) -> Floats:
     """Return d psi/dr, psi/r and d psi/dz of all solutions of a run at the points.
 
     Returns
@@ -498,14 +513,14 @@ def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None
 
 
 def _superpose(
-    case: _Case, nominal: dict[int, Floats], single: dict[int, Floats], points: Floats,
+    case: ModesCase, nominal: dict[int, Floats], single: dict[int, Floats], points: Floats,
     where: Ints, blocks: Sequence[int]
 ) -> Floats:
     """Sum the modes into B at the points, with each block rotated into its position.
 
     Parameters
     ----------
-    case : _Case
+    case : ModesCase
     nominal, single : dict of int to ndarray, shape (sources, m, 3), in T
         d psi/dr, psi/r and d psi/dz at the points of the half-plane, by mode, of the nominal
         array and of single blocks.

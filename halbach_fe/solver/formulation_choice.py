@@ -36,6 +36,7 @@ from halbach_fe.solver.magnetostatics import (
     solve_sources,
     solve_tangent,
 )
+from halbach_fe.solver.reciprocal_columns import reciprocal_gradients, saves_solves
 from halbach_fe.solver.separate_blocks import (
     applies,
     field_in_vacuum,
@@ -291,6 +292,17 @@ def _joined(
                          any(fields.for_deviations for _, fields in parts))
 
 
+def runs_serve_other_points(magnet: Magnet, points: Floats) -> bool:
+    """Tell whether the runs for single blocks, which the cache keeps, do not depend on the points.
+
+    That is so by azimuthal modes, unless reciprocity solves for these points (n, 3) in m instead.
+    """
+    if choose_route(magnet, points) != "azimuthal_modes":
+        return False
+    symmetry = symmetry_of(magnet) if uses_symmetry(magnet) else no_symmetry(magnet)
+    return not saves_solves(magnet, symmetry.source_points(points)[0], symmetry.sources)
+
+
 def uses_symmetry(magnet: Magnet) -> bool:
     """Tell whether only some blocks are solved for, and the others obtained by symmetry.
 
@@ -319,7 +331,9 @@ def _solve(
 ) -> Floats:
     """Solve a linear problem by a route; the result is that of `solve_sources`."""
     if route == "azimuthal_modes":
-        return solve_modes(magnet, points, blocks, session)
+        return solve_modes(
+            magnet, points, blocks, session,
+            single_blocks=reciprocal_gradients if saves_solves(magnet, points, blocks) else None)
     return solve_sources(magnet, points, blocks, session, formulation_of(magnet, route))
 
 

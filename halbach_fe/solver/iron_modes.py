@@ -87,6 +87,14 @@ class GaussPoints:
         """
         return sparse.csr_array(sparse.vstack([self.along_r, mode * self.over_r, self.along_z]))
 
+    def stiffness(self, mode: int, permeability: Floats | float = 1.0) -> sparse.csr_array:
+        """Return the stiffness (unknowns, unknowns) of a mode, the integral over r dr dz of
+        mu_r (grad psi_m . grad v + m^2/r^2 psi_m v); ``permeability`` is mu_r (k,).
+        """
+        gradient = self.gradient(mode)
+        weights = np.tile(self.weights * permeability, 3)
+        return sparse.csr_array(gradient.T @ (sparse.diags_array(weights) @ gradient))
+
 
 @dataclass(frozen=True)
 class IronModes:
@@ -275,15 +283,15 @@ def assemble_modes(
 
     run_tasks([task(0), task(1)], session)
     unknowns, plain = found[0]
-    everywhere = _gauss_points(mesh, np.arange(mesh.elements), unknowns)
+    everywhere = gauss_points(mesh, np.arange(mesh.elements), unknowns)
     for mode in (0, 1):
-        _check(everywhere, mode, found[mode][1])
+        check_matrix(everywhere, mode, found[mode][1])
     in_iron = np.flatnonzero(mesh.in_iron)
-    points = _gauss_points(mesh, in_iron, unknowns)
+    points = gauss_points(mesh, in_iron, unknowns)
     iron = np.unique(points.along_r.indices)
     number = body[np.searchsorted(r, points.r) - 1, np.searchsorted(z, points.z) - 1]
     return IronModes(mesh, unknowns, plain, sparse.csr_array(found[1][1] - plain),
-                     _axis_unknowns(mesh, unknowns), iron, points.restricted(iron), number)
+                     axis_unknowns(mesh, unknowns), iron, points.restricted(iron), number)
 
 
 def points_at(mesh: VerifiedMesh, located: Located, unknowns: Unknowns) -> GaussPoints:
@@ -301,7 +309,7 @@ def _operators(
     return GaussPoints(place[:, 0], place[:, 1], np.ones(len(place)), value, along_r, along_z)
 
 
-def _gauss_points(mesh: VerifiedMesh, cells: Ints, unknowns: Unknowns) -> GaussPoints:
+def gauss_points(mesh: VerifiedMesh, cells: Ints, unknowns: Unknowns) -> GaussPoints:
     """Return the nine Gauss points of rectangles, those of GetDP's rule GaussLegendre."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     reference = np.array([(u, v) for u in nodes for v in nodes])
@@ -315,24 +323,24 @@ def _gauss_points(mesh: VerifiedMesh, cells: Ints, unknowns: Unknowns) -> GaussP
         area, np.outer(weights, weights).ravel() / 4).ravel())
 
 
-def _check(points: GaussPoints, mode: int, theirs: sparse.csr_array) -> None:
-    """Check that GetDP's matrix equals that of our Gauss points.
+def check_matrix(
+    points: GaussPoints, mode: int, theirs: sparse.csr_array, permeability: Floats | float = 1.0
+) -> None:
+    """Check that GetDP's matrix equals that of our Gauss points, `GaussPoints.stiffness`.
 
     Raises
     ------
     GetDPError
         If the two matrices differ.
     """
-    gradient = points.gradient(mode)
-    ours = gradient.T @ (sparse.diags_array(np.tile(points.weights, 3)) @ gradient)
-    difference = abs(ours - theirs).max() / abs(theirs).max()
+    difference = abs(points.stiffness(mode, permeability) - theirs).max() / abs(theirs).max()
     if not difference <= MATRIX_TOLERANCE:
         raise GetDPError(
             f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
             "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
 
 
-def _axis_unknowns(mesh: VerifiedMesh, unknowns: Unknowns) -> Ints:
+def axis_unknowns(mesh: VerifiedMesh, unknowns: Unknowns) -> Ints:
     """Return the unknowns of the functions that do not vanish on the axis."""
     inner = np.flatnonzero(mesh.points[mesh.cells, 0].min(axis=1) == 0)
     along = np.array([-1.0, 0.3, 1.0])  # the side of the axis has three functions
