@@ -28,12 +28,13 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.response.mesh_convergence import variants_to_compare
-from halbach_fe.solver.azimuthal_modes import mode_decay
+from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.formulation_choice import (
     MESHES,
     check_points,
@@ -330,12 +331,16 @@ def decisive_points(magnet: Magnet, points: Floats) -> Observation:
     """Return an observation of the few points that determine the runs of GetDP.
 
     These are the point that needs the most azimuthal modes, and the points farthest from the axis
-    and from the plane z = 0.
+    and from the plane z = 0. By azimuthal modes, points at different places of the half-plane are
+    solves if there are fewer of them than rings, see `halbach_fe.solver.reciprocal_columns`.
     """
-    decisive = np.unique([
+    decisive = [
         np.argmax(mode_decay(magnet, points)) if magnet.dimension == 3 else 0,
-        np.argmax(np.hypot(points[:, 0], points[:, 1])), np.argmax(np.abs(points[:, 2]))])
-    few = points[decisive]
+        np.argmax(np.hypot(points[:, 0], points[:, 1])), np.argmax(np.abs(points[:, 2]))]
+    if is_axisymmetric(magnet):
+        places = unique_points(meridian_points(magnet, points))[1]
+        decisive += np.unique(places, return_index=True)[1][:len(magnet.blocks_by_ring)].tolist()
+    few = points[np.unique(decisive)]
     readings = sparse.csr_array(sparse.eye_array(3 * len(few)))
     labels = tuple(f"B{name}" for name in COMPONENTS) * len(few)
     return Observation(few, readings, readings, few, labels, np.repeat(few, 3, axis=0))

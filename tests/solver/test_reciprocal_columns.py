@@ -9,10 +9,12 @@ import pytest
 
 from halbach_fe.core.errors import GetDPError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.resource_estimate import decisive_points
 from halbach_fe.solver import formulation_choice, reciprocal_columns
-from halbach_fe.solver.azimuthal_modes import solve_modes
+from halbach_fe.solver.azimuthal_modes import meridian_points, solve_modes
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.reciprocal_columns import angle_integrals, reciprocal_gradients, saves_solves
 from halbach_fe.solver.session import Session
@@ -92,6 +94,16 @@ def test_when_they_save_solves(magnet_of):
     assert not saves_solves(long, scattered, blocks)
     assert not saves_solves(long, POINTS, blocks[:8])
     assert not saves_solves(magnet_of(), POINTS, range(32))
+
+
+def test_an_estimate_takes_the_same_way(magnet_of):
+    """Its few points decide as the map does: all places of a few, and enough of many."""
+    long, blocks = magnet_of(array__rings=200), range(0, 3200, 16)
+    scattered = np.random.default_rng(3).uniform(-0.05, 0.05, (300, 3))
+    few = decisive_points(long, POINTS).points
+    assert len(unique_points(meridian_points(long, few))[0]) == 5
+    assert saves_solves(long, few, blocks)
+    assert not saves_solves(long, decisive_points(long, scattered).points, blocks)
 
 
 def test_a_matrix_of_other_materials_is_refused(magnet_of, session, monkeypatch):
