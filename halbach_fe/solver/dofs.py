@@ -9,6 +9,7 @@ text.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -68,33 +69,41 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
     GetDPError
         If the file cannot be read or is damaged.
     """
-    edges, faces = _PARTS[cell_type]
     try:
-        text = path.read_text(encoding="ascii")
-        rows = _section(text, "DofData", skip=5)
-        if not rows:
-            raise ValueError("no unknowns")
-        table = np.loadtxt(rows, usecols=range(5), comments=None, ndmin=2)
-        if not (np.abs(table) <= MOST_ENTITIES * max(1, len(table))).all():
-            raise ValueError("an entity or unknown has an impossibly large number")
-        table = table.astype(int)
-        count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
-        if count < 1:
-            raise ValueError("no unknowns")
-        functions = []
-        for kind in np.unique(table[:, 0]):
-            of_kind = table[table[:, 0] == kind]
-            index = np.full(np.abs(of_kind[:, 1]).max() + 1, -1)
-            solved = of_kind[of_kind[:, 3] == _UNKNOWN]
-            if not ((solved[:, 4] >= 1) & (solved[:, 4] <= count)).all():
-                raise ValueError(f"the number of an unknown is not within 1 to {count}")
-            index[np.abs(solved[:, 1])] = solved[:, 4] - 1
-            functions.append(index)
-        return Unknowns(count, tuple(functions), _entities(text, "ElementsXEdges", edges),
-                        _entities(text, "ElementsXFacets", faces))
+        return _unknowns(path.read_text(encoding="ascii"), cell_type)
     except (OSError, ValueError, IndexError, OverflowError) as error:
         raise GetDPError(
             f"GetDP's list of unknowns {path.name} cannot be read ({error}).") from None
+
+
+@lru_cache(maxsize=2)  # the runs of a mesh, one after the other, have the same list
+def _unknowns(text: str, cell_type: str) -> Unknowns:
+    """Return the unknowns in the text of a ``.pre`` file, see `read_unknowns`."""
+    edges, faces = _PARTS[cell_type]
+    rows = _section(text, "DofData", skip=5)
+    if not rows:
+        raise ValueError("no unknowns")
+    table = np.loadtxt(rows, usecols=range(5), comments=None, ndmin=2)
+    if not (np.abs(table) <= MOST_ENTITIES * max(1, len(table))).all():
+        raise ValueError("an entity or unknown has an impossibly large number")
+    table = table.astype(int)
+    count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
+    if count < 1:
+        raise ValueError("no unknowns")
+    functions = []
+    for kind in np.unique(table[:, 0]):
+        of_kind = table[table[:, 0] == kind]
+        index = np.full(np.abs(of_kind[:, 1]).max() + 1, -1)
+        solved = of_kind[of_kind[:, 3] == _UNKNOWN]
+        if not ((solved[:, 4] >= 1) & (solved[:, 4] <= count)).all():
+            raise ValueError(f"the number of an unknown is not within 1 to {count}")
+        index[np.abs(solved[:, 1])] = solved[:, 4] - 1
+        functions.append(index)
+    found = Unknowns(count, tuple(functions), _entities(text, "ElementsXEdges", edges),
+                     _entities(text, "ElementsXFacets", faces))
+    for shared in (*found.functions, found.edges, found.faces):
+        shared.flags.writeable = False
+    return found
 
 
 def _section(text: str, name: str, skip: int) -> list[str]:
