@@ -340,7 +340,7 @@ def decisive_points(magnet: Magnet, points: Floats) -> Observation:
     if is_axisymmetric(magnet):
         places = unique_points(meridian_points(magnet, points))[1]
         decisive += np.unique(places, return_index=True)[1][:len(magnet.blocks_by_ring)].tolist()
-    few = points[np.unique(decisive)]
+    few = points[np.unique(np.array(decisive, int))]
     readings = sparse.csr_array(sparse.eye_array(3 * len(few)))
     labels = tuple(f"B{name}" for name in COMPONENTS) * len(few)
     return Observation(few, readings, readings, few, labels, np.repeat(few, 3, axis=0))
