@@ -331,8 +331,9 @@ def decisive_points(magnet: Magnet, points: Floats) -> Observation:
     """Return an observation of the few points that determine the runs of GetDP.
 
     These are the point that needs the most azimuthal modes, and the points farthest from the axis
-    and from the plane z = 0. By azimuthal modes, points at different places of the half-plane are
-    solves if there are fewer of them than rings, see `halbach_fe.solver.reciprocal_columns`.
+    and from the plane z = 0. If azimuthal modes apply, there is also a point at every place (r, z)
+    of the half-plane, up to the number of rings: whether there are fewer places than rings decides
+    what is solved for, see `halbach_fe.solver.reciprocal_columns`.
     """
     decisive = [
         np.argmax(mode_decay(magnet, points)) if magnet.dimension == 3 else 0,

@@ -343,9 +343,13 @@ class _Reference:
     slope: Floats
 
 
-def factorize(matrix: sparse.sparray) -> sparse_linalg.SuperLU:
-    """Factorize a symmetric positive definite matrix, in an order that keeps the factors sparse."""
-    return sparse_linalg.splu(sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A",
+def factorize(matrix: sparse.sparray, ordered: bool = False) -> sparse_linalg.SuperLU:
+    """Factorize a symmetric positive definite matrix, in an order that keeps the factors sparse.
+
+    ``ordered`` tells that the unknowns are in such an order already.
+    """
+    return sparse_linalg.splu(sparse.csc_array(matrix),
+                              permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
                               diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 

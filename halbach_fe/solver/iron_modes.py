@@ -216,8 +216,7 @@ def _condensed(modes: IronModes, mode: int) -> Exterior:
     matrix, iron, rest = modes.matrix(mode), modes.iron, modes.rest
     surface = np.flatnonzero(np.diff(matrix[rest][:, iron].tocsc().indptr))
     order = np.concatenate([rest, iron[surface]])
-    factor = sparse_linalg.splu(sparse.csc_array(matrix[order][:, order]), permc_spec="NATURAL",
-                                diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factor = factorize(matrix[order][:, order], ordered=True)
     kept = np.arange(len(order))
     if not ((factor.perm_c == kept).all() and (factor.perm_r == kept).all()):
         raise AssertionError("SuperLU changed the order of a positive definite matrix")

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sparse
-import scipy.sparse.linalg as sparse_linalg
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.magnet import Magnet
@@ -101,9 +100,8 @@ class _Discrete:
         The numbering of the first axis is that of pro/azimuthal_modes.pro: component by component.
         """
         free = self.free[mode > 0]
-        matrix = sparse.csc_array((self.stiffness[0] + mode**2 * self.stiffness[1])[free][:, free])
-        factor = sparse_linalg.splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0,
-                                    options={"SymmetricMode": True})
+        matrix = sparse.csr_array(self.stiffness[0] + mode**2 * self.stiffness[1])
+        factor = factorize(matrix[free][:, free], ordered=True)
         in_r, over_r, in_z = (source[free].T for source in self.sources)
         right = sparse.csr_array(self.readings[:, free])
         found = np.empty((COMPONENTS, len(self.half_angle), right.shape[0]))
