@@ -7,7 +7,7 @@ from math import inf, sqrt
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.solver.prism_kernel import compiled
+from halbach_fe.core.compiled import compiled
 
 
 @compiled

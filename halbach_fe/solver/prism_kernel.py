@@ -18,27 +18,17 @@ infinite, it is large and finite.
 
 The six independent components of the symmetric field matrix are in the order xx, yy, zz, xy, xz,
 yz: mu_0 H in T for a polarization of 1 T.
-
-This module imports numba, which takes a second; functions that need it import it themselves.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 from math import atan2, cos, inf, log, pi, sin, sqrt
-from typing import Any
 
-import numba
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-
-compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-"""Decorator of all compiled functions. Threads run them side by side, since they release the GIL;
-numba's own threads must not be entered from several Python threads."""
-
-reordered: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-"""The same for sums whose terms may be added in any order, several at a time."""
+from halbach_fe.core.compiled import compiled
 
 _TINY = 1e-26
 """Added to squared distances relative to the square of a prism's size, where a logarithm would be

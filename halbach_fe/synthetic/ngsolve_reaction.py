@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
+from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.iron import FroehlichLaw, IronLaw, Pole, TableLaw, Tube
 from halbach_fe.synthetic.optional_packages import import_extra
@@ -51,9 +52,6 @@ TABLE_POINTS = 4000
 
 ON_END = 1e-6
 """Distance from an end of a tube, relative to its radius, within which an edge lies there."""
-
-CHUNK = 4_000_000
-"""Largest number of entries of a temporary array, 32 MB."""
 
 
 END_SIZE = 1 / 8
@@ -130,23 +128,16 @@ def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:
     """Return B (n, d) in T of dipoles at points (n, d) in m.
 
     ``places`` (m, d) in m are the positions of the dipoles, ``moments`` (m, d) mu_0 times their
-    moments in T m^d. In two dimensions they are lines of dipoles. Source: J. D. Jackson, Classical
-    Electrodynamics, 3rd ed., equation 5.56, for two dimensions integrated along z.
+    moments in T m^d. In two dimensions they are lines of dipoles.
     """
+    from halbach_fe.synthetic import dipole_kernel  # imports numba
+
     size = points.shape[1]
-    centre = places.mean(axis=0)
-    places, points = places - centre, points - centre
-    own, square = np.einsum("ij,ij->i", places, moments), np.einsum("ij,ij->i", places, places)
+    kernel = {2: dipole_kernel.field_2d, 3: dipole_kernel.field_3d}[size]
+    points, *rows = (np.ascontiguousarray(each, float) for each in (points, places.T, moments.T))
     field = np.empty_like(points)
-    step = max(1, CHUNK // len(places))
-    for first in range(0, len(points), step):
-        chunk = points[first:first + step]
-        inverse = 1 / (np.einsum("ij,ij->i", chunk, chunk)[:, None] + square
-                       - 2 * chunk @ places.T)  # 1 / r^2
-        near = inverse if size == 2 else inverse * np.sqrt(inverse)  # 1 / r^d
-        along = (chunk @ moments.T - own) * near * inverse
-        field[first:first + step] = size * (
-            chunk * along.sum(axis=1)[:, None] - along @ places) - near @ moments
+    in_threads(lambda first, last: kernel(points, *rows, first, last, field),
+               share_out(len(points)))
     return field / (2 * np.pi * (size - 1))
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.solver.prism_kernel import Six, compiled, prism_field
+from halbach_fe.core.compiled import compiled
+from halbach_fe.solver.prism_kernel import Six, prism_field
 
 Flags = NDArray[np.bool_]
 Singles = NDArray[np.float32]
