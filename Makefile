@@ -109,7 +109,7 @@ results/mri4all/measured.html: results/mri4all/diagnosed/diagnosis.html
 study-mri4all: results/mri4all/homogeneity/homogeneity.html
 results/mri4all/homogeneity/homogeneity.html: results/mri4all/measured/report.html
 	.venv/bin/halbach-fe homogeneity results/mri4all/registered/study.registered.toml -o $(@D) \
-	    --posterior results/mri4all/measured/posterior.h5 --sphere-m 0.05 \
+	    --posterior results/mri4all/measured/posterior.h5 --sphere-m 0.045 \
 	    --measurements results/mri4all/check/corrected_map.csv
 
 # Everything between the wish and the shimmed magnet, on one page.

@@ -103,6 +103,9 @@ an instrument."""
 DETERMINED = 0.5
 """A parameter is determined if its standard deviation is below this part of its prior one."""
 
+ALL_OF_IT = 0.99
+"""Share of a component in the mean square of the field from which its gain is that of |B|."""
+
 SIGNIFICANT = 4.0
 """Standard deviations from which a parameter is reported as found."""
 
@@ -454,7 +457,7 @@ def check_map(
         orientation=_named(matrix), alike=alike,
         rms_as_given_T=_rms(given), rms_T=_rms(residual[chosen] @ np.abs(matrix)),
         floor_T=_rms(floor @ np.abs(matrix)),
-        terms=_terms(whole, max(float(beyond.max()), 1.0)), broken=broken,
+        terms=_terms(whole, max(float(beyond.max()), 1.0), model.shares(whole)), broken=broken,
         windows=_windows(points[chosen], residual[chosen] @ np.abs(matrix)),
         noise_T=noise, position_noise_m=displaced,
         structure=_structure(points[chosen], residual[chosen]),
@@ -629,11 +632,13 @@ CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
 """Differences of the Legendre polynomials 1 to 4 between times of the scan."""
 
 
-def _terms(fitted: ProbeFit, beyond: float) -> tuple[InstrumentTerm, ...]:
+def _terms(fitted: ProbeFit, beyond: float, shares: Floats) -> tuple[InstrumentTerm, ...]:
     """Return the parameters of the instrument in the units of people.
 
     ``beyond`` is how many times farther off held-out lines are than fitted ones. What the charges
-    cannot follow is no white noise: it moves the parameters by as much more.
+    cannot follow is no white noise: it moves the parameters by as much more. ``shares`` (3,) are
+    those of the components in the mean square of the field: gains are relative to their mean with
+    these weights, so that the component that is most of the field keeps its size.
     """
     value, found = fitted.instrument * fitted.prior_sd, []
     scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
@@ -656,9 +661,9 @@ def _terms(fitted: ProbeFit, beyond: float) -> tuple[InstrumentTerm, ...]:
     for (first, second), (one, other) in zip(pairs, mixed, strict=True):
         add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
             {one: 1.0, other: 1.0})
-    for own in range(3):
-        add(f"gain of B{COMPONENTS[own]} over the mean of all", "%", 100.0,
-            {9 + 4 * other: (own == other) - 1 / 3 for other in range(3)})
+    for own in np.flatnonzero(shares < ALL_OF_IT).tolist():
+        add(f"gain of B{COMPONENTS[own]} relative to that of |B|", "%", 100.0,
+            {9 + 4 * other: float((own == other) - shares[other]) for other in range(3)})
     for (when, weights), own in product(CHANGES.items(), range(3)):
         add(f"turn about {COMPONENTS[own]} {when}", "mrad", 1e3,
             {TURNS.start + 3 * wave + own: weight for wave, weight in weights.items()})

@@ -93,7 +93,8 @@ class ProbeFit:
     def mixing(self) -> Floats:
         """Matrix (3, 3) that is added to 1: reading c is row c times B.
 
-        Its trace is 0, because a common gain is no error that a map can show.
+        Its trace is 0, because a common gain is no error that a map can show. (Where one component
+        is most of the field, that changes the field's size: `ProbeModel.ideal` takes it back.)
         """
         matrix = (self.instrument * self.prior_sd)[MIXING].reshape(3, 3)
         return np.asarray(matrix - np.eye(3) * np.trace(matrix) / 3)
@@ -257,13 +258,20 @@ class ProbeModel:
     def ideal(self, at: ProbeFit) -> Floats:
         """Return what a probe without errors would have read (n, 3) in T.
 
-        What the fit leaves stays in it, along the axes that the sensors read.
+        What the fit leaves stays in it, along the axes that the sensors read. The gain of |B| is
+        that of the readings, because no map can show a common gain.
         """
         every = np.ones(len(self.points), bool)
         reads = np.stack([self._sensor(at, every, sensor)[1] for sensor in range(3)], axis=1)
-        left = self.field - self.readings(at)
-        return self.charges.field(self.points, at.amplitudes) + np.linalg.solve(
-            reads, left[..., None])[..., 0]
+        read, field = self.readings(at), self.charges.field(self.points, at.amplitudes)
+        gain = 1 + float(self.shares(at) @ np.diag(at.mixing))
+        return np.asarray(gain * (field + np.linalg.solve(
+            reads, (self.field - read)[..., None])[..., 0]))
+
+    def shares(self, at: ProbeFit) -> Floats:
+        """Return the share (3,) of each component in the mean square of the field."""
+        squares = np.mean(self.charges.field(self.points, at.amplitudes)**2, axis=0)
+        return np.asarray(squares / squares.sum())
 
 
 def fit_probe(

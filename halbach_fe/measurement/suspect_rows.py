@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.special import gammainc
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.measurement.scan_lines import point_spacing
+
+CHANCE = 1e-3
+"""Probability below which so many repetitions are no chance."""
 
 SPIKE = 12.0
 """A reading is a spike if its residual is larger than this multiple of the standard deviation of
@@ -30,11 +34,22 @@ ROUGH_ROUNDS = 10
 
 
 def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
-    """Return the rows that are zero, or repeat the row before them at another position."""
+    """Return the rows that are zero, or repeat the row before them at another position.
+
+    Where the field is uniform, rounded readings repeat by chance. Rows that repeat one or two of
+    the components tell how often: if a component that may repeat does so with the probability p,
+    they are as 3 p (1 - p)^2 and 3 p^2 (1 - p), and p^3 is that of rows that repeat all three.
+    Those count only if they are more.
+    """
     zero = (field == 0).all(axis=1)
+    alike = field[1:] == field[:-1]
+    moved = (points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
     repeated = np.zeros(len(field), bool)
-    repeated[1:] = (field[1:] == field[:-1]).all(axis=1) & (
-        points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
+    repeated[1:] = alike.all(axis=1) & moved
+    _, one, two, _ = np.bincount(alike[moved].sum(axis=1), minlength=4)
+    by_chance = two / 3 * two / max(one, 1)
+    if repeated.any() and gammainc(repeated.sum(), by_chance) > CHANCE:  # of Poisson's distribution
+        repeated[:] = False
     return {name: (1 + np.flatnonzero(rows)).tolist()
             for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
 

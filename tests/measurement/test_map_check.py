@@ -19,9 +19,10 @@ from halbach_fe.measurement.field_map import (
     readings_sha256,
     write_map,
 )
-from halbach_fe.measurement.harmonic_field import Charges, fit_fields
+from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel
+from halbach_fe.measurement.suspect_rows import broken_rows
 from halbach_fe.report.map_check import (
     answer,
     oriented,
@@ -188,7 +189,8 @@ def test_an_imperfect_instrument(generator):
 def trust_white_noise(monkeypatch):
     """Let the check believe that whatever the charges do not follow is white noise."""
     terms = map_check._terms
-    monkeypatch.setattr(map_check, "_terms", lambda fitted, _: terms(fitted, 1.0))
+    monkeypatch.setattr(map_check, "_terms",
+                        lambda fitted, _, shares: terms(fitted, 1.0, shares))
     monkeypatch.setattr(map_check, "_confirmed",
                         lambda model, rows, left_out, fit, start, pace: (model, start))
 
@@ -349,6 +351,41 @@ def test_extrapolated_lines_are_no_spikes(generator):
     assert check_map(field_map(points, field)).broken == {}
     field[len(field) // 2, 1] += 3e-3
     assert check_map(field_map(points, field)).broken == {"spike": [len(field) // 2 + 1]}
+
+
+def test_the_corrected_map_keeps_the_size_of_the_field(generator):
+    """Gains of 3, -2 and 1 % of a nearly uniform field along z: what a probe of 1 % in all would
+    read is 1 % more than the field. With the mean of all three gains as 0, as the fit has them, Bz
+    would be 0.3 % smaller than it was read.
+    """
+    gain = np.array([0.03, -0.02, 0.01])
+    field = np.random.default_rng(2).standard_normal(21 + 3)  # degrees 1 to 4
+    field = 1e-3 * solid_harmonic_fields(GRID / 0.02, 4) @ field + [0.0, 0.0, 0.05]
+    noise = 1e-6 * generator.standard_normal(field.shape)
+    check = check_map(field_map(GRID, field * (1 + gain) + noise))
+    np.testing.assert_allclose(check.corrected_T.mean(axis=0)[2], 1.01 * field[:, 2].mean(),
+                               rtol=1e-4)  # 1e-3 of the field is not along z
+    terms = {term.name: term for term in check.terms}
+    assert "gain of Bz relative to that of |B|" not in terms
+    for name, value in (("x", 2.0), ("y", -3.0)):
+        found = terms[f"gain of B{name} relative to that of |B|"]
+        assert found.determined
+        assert abs(found.value - value) < 4 * found.sd
+
+
+def test_rounded_readings_repeat_by_chance(generator):
+    """In a uniform field, rounded to its noise, rows are alike by chance; a reading that stays
+    where others move, in a map of all digits, is a repetition.
+    """
+    points = 0.01 * np.stack(np.meshgrid(*[np.arange(8)] * 3), axis=-1).reshape(-1, 3)
+    field = [0.05, 0.0, 0.0] + 1e-5 * generator.standard_normal(points.shape)
+    rounded = field.round(5)
+    assert (rounded[1:] == rounded[:-1]).all(axis=1).sum() > 3
+    assert broken_rows(points, rounded) == {}
+    field[100] = field[99]
+    assert broken_rows(points, field) == {"repeated": [101]}
+    rounded[200:240] = rounded[200]  # a reading that hangs for long is no chance
+    assert set(range(202, 241)) <= set(broken_rows(points, rounded)["repeated"])
 
 
 def test_a_change_during_the_scan_must_predict_lines(generator):
