@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import place_of
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.summary import (
@@ -20,6 +21,9 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
+from halbach_fe.geometry.equal_blocks import turned_onto
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.pose_space import right_angles
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.unknown_cause import (
@@ -116,9 +120,9 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
             return ("Measure what tells apart the causes that explain the map equally well: the "
                     f"page says what. Until then {STUDY_FILE} has the first of them.", infer)
         if remedies := _remedies(diagnosis):
-            changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
-                       f"stays as it is, update it with {STUDY_FILE}, the study with what was "
-                       "found.")
+            changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. "
+                       f"{_also_possible(diagnosis)}If it stays as it is, update it with "
+                       f"{STUDY_FILE}, the study with what was found.")
         return f"{changed} {suspicions}".strip(), infer
     return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
 
@@ -127,6 +131,38 @@ def _remedies(diagnosis: Diagnosis) -> list[str]:
     """Say what can be put right at the magnet itself, by hand."""
     return [REMEDIES[effect.hypothesis.effect.name].format(place_in_words(effect.place))
             for effect in diagnosis.identified if effect.hypothesis.effect.name in REMEDIES]
+
+
+def _also_possible(diagnosis: Diagnosis) -> str:
+    """Say which other blocks it can be if the pose of the map was found from the map itself.
+
+    A turn that brings the nominal magnet onto itself then changes nothing but names of blocks.
+    Where the study leaves the map as it is, or blocks were measured, they are known.
+    """
+    study = diagnosis.before.study
+    instruments = [study.of_map(number).instrument for number in range(len(study.maps))] or [
+        study.instrument]
+    if diagnosis.before.measured_blocks is not None or not any(
+            any(one.rotation_rad) or any(one.translation_m) for one in instruments):
+        return ""
+    magnet = build_magnet(study)
+    images = [found for turn in right_angles()[1:] if (found := turned_onto(magnet, turn))]
+    numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
+    said = []
+    for effect in diagnosis.identified:
+        if effect.hypothesis.effect.name in REMEDIES:
+            place = effect.place
+            own = [numbers[ring, slot] for ring, slot in (
+                (place.ring, place.slot), place.other) if ring and slot]
+            others = dict.fromkeys(tuple(image[each] for each in own) for image in images)
+            others.pop(tuple(own), None)
+            if others:
+                blocks = " or ".join(place_in_words(place_of(*(
+                    magnet.blocks[each] for each in other))) for other in others)
+                said.append(f"{place_in_words(place)} may be {blocks} as well")
+    return (f"If where the map lies was found from the map itself (register), {in_a_row(said)}, "
+            "as the nominal magnet is the same after a turn: only a mark on the magnet tells which "
+            "it is. ") if said else ""
 
 
 def _fails(diagnosis: Diagnosis) -> bool:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.equal_blocks import turned_onto
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
@@ -56,10 +56,6 @@ readings. The fits of a symmetric magnet's two poses ended within 1e-5 of each o
 
 SAME_PLACE = 4.0
 """Distance in standard deviations up to which two poses are the same place but for a symmetry."""
-
-SAME_M, SAME_T = 1e-7, 1e-7
-"""Distance of corners in m, and difference of remanences in T, up to which blocks are equal: more
-than the rounding of any study, and less than any deviation that is given."""
 
 AT_REST = "Yes, the map can be used in this pose."
 UNDECIDED = "Only if the map was measured in this pose, as the readings do not decide on it."
@@ -259,28 +255,13 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
     Such poses predict the same readings, before and after an update. Magnets with permeable bodies
     or with blocks of uneven magnetization are never said to be symmetric.
     """
-    magnet = build_magnet(one.study)
-    blocks = magnet.blocks
-    if magnet.iron or magnet.dimension == 2 or any(
-            block.gradient or block.corner_loss for block in blocks):
-        return False
     first, second = (_axes(each) for each in (one, other))
     turn = second @ first.T
     off = np.abs(other.middle_m - turn @ one.middle_m)
     if (off > SAME_PLACE * np.hypot(np.abs(turn) @ one.translation_sd_m,
                                     other.translation_sd_m)).any():
         return False
-    corners = [_corners(block) for block in blocks]
-    moments = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
-    middles = np.array([each.mean(axis=0) for each in corners])
-    for number, block in enumerate(blocks):
-        there = int(np.linalg.norm(middles - turn @ middles[number], axis=1).argmin())
-        apart = np.linalg.norm((corners[number] @ turn.T)[:, None] - corners[there], axis=2)
-        if (max(apart.min(axis=0).max(), apart.min(axis=1).max()) > SAME_M
-                or np.abs(turn @ moments[number] - moments[there]).max() > SAME_T
-                or _permeabilities(block) != _permeabilities(blocks[there])):
-            return False
-    return True
+    return turned_onto(build_magnet(one.study), turn) is not None
 
 
 def _axes(one: Registration) -> np.ndarray:
@@ -289,17 +270,6 @@ def _axes(one: Registration) -> np.ndarray:
     for number, axis in enumerate(axes_of_map(one.instrument).values()):
         matrix[COMPONENTS.index(axis[-1]), number] = -1.0 if axis.startswith("-") else 1.0
     return matrix
-
-
-def _corners(block: MagnetBlock) -> np.ndarray:
-    """Return the corners (n, 3) of a block in m."""
-    return block.from_frame(np.array([
-        (*edge.start, z) for edge in block.outline for z in (block.z_min, block.z_max)]))
-
-
-def _permeabilities(block: MagnetBlock) -> tuple[float, float]:
-    """Return the relative permeabilities of a block."""
-    return block.recoil_permeability, block.recoil_permeability_across
 
 
 def _fit(best: Registration, before: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,9 @@ from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import change_table, found_table, write_diagnosis_report
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
+from tests.support.short_dipole import TEXT
 
 EFFECTS = {effect.name: effect for effect in catalogue()}
 NOISE = {"regions": [{"name": "all", "sigma_T": 2e-5}]}
@@ -248,6 +251,37 @@ def test_both_of_two_swapped_blocks_are_named(flat):
     assert "r01s03, r01s12" in note(both.identified[0])
     own = Place(1, 3, other=(1, 4), labels=("A7", "r01s04"))  # a free block has its own label
     assert place_in_words(own) == "block A7 and ring 1, slot 4"
+
+
+def test_a_turn_of_the_magnet_exchanges_names(flat):
+    """Half a turn about the field of an ideal dipole exchanges its rings. A map whose place in the
+    magnet was found from the map itself does not tell a block from its image.
+    """
+    found, _ = flat
+    one = found.identified[0]
+    placed = parse_study(tomllib.loads(TEXT + "\n[instrument]\nrotation_rad = [0.01, 0.0, 0.0]\n"))
+
+    block, two = Place(1, 3), Place(1, 3, other=(1, 4))
+
+    def said(study, place=block, name="block_flipped", **changes):
+        hypothesis = Hypothesis(EFFECTS[name], place)
+        candidate = Candidate(name, place.name, (0,), is_binary=True)
+        return answer(replace(
+            found, before=replace(found.before, magnet=build_magnet(study), **changes),
+            identified=(replace(one, hypothesis=hypothesis, values=np.ones(1), sd=np.zeros(1),
+                                selection=replace(one.selection, candidate=candidate,
+                                                  alternatives=())),))).step
+
+    assert "ring 1, slot 3 may be ring 2, slot 7 as well" in said(placed)
+    pair = "ring 1, slot 3 and ring 1, slot 4 may be ring 2, slot 7 and ring 2, slot 6 as well"
+    assert pair in said(placed, two, "blocks_swapped")
+    # controls: the study leaves the map where it is, one block differs, blocks were measured
+    assert "as well" not in said(parse_study(tomllib.loads(TEXT)))
+    uneven = parse_study(tomllib.loads(
+        TEXT + "\n[[array.exceptions]]\nring = 1\nslot = 2\nremanence_T = 1.25\n"
+        "\n[instrument]\nrotation_rad = [0.01, 0.0, 0.0]\n"))
+    assert "as well" not in said(uneven)
+    assert "as well" not in said(placed, measured_blocks=("r01s01",))
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
