@@ -146,12 +146,16 @@ class Campaign:
             one.study_of(study).instrument).T for one in self.maps], axis=1)
 
     def places(self, effect: Effect, study: Study) -> list[Place]:
-        """Return the places of an effect: of one of an instrument, in every map, probe or stage."""
+        """Return the places of an effect: of one of an instrument, in every map, probe or stage.
+
+        Maps that cannot show it have none.
+        """
         if effect.kind == "field" or not self.is_listed:
-            return list(effect.places(study))
+            return list(effect.places(study)) if any(
+                effect.can_show(one.points) for one in self.maps) else []
         found: dict[Place, list[str]] = {}
         for one in self.maps:
-            if one.number is None:
+            if one.number is None or not effect.can_show(one.points):
                 continue
             own = one.study_of(study)
             for place in effect.places(own):

@@ -24,6 +24,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.field_map import POSITION_COLUMNS, check_magnitudes, points_of
+from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, Axes
 
@@ -120,6 +121,8 @@ def sensor_positions(instrument: Instrument, points: Floats) -> Floats:
     z = points[:, 2]
     if instrument.arm_sag_m and np.ptp(z) > 0:
         stretched[:, 1] -= instrument.arm_sag_m * ((z - z.min()) / np.ptp(z)) ** 2
+    if instrument.lag_m:
+        stretched -= instrument.lag_m * motion(points)
     sensors = stretched[:, None] + np.array(instrument.sensor_position_m)
     return np.asarray(sensors @ rotation_matrix(instrument.rotation_rad).T
                       + instrument.translation_m)

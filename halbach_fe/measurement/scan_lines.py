@@ -11,6 +11,19 @@ from halbach_fe.core.arrays import Floats, Ints
 HELD_OUT_EVERY = 5
 """Every so many scan lines one is held out by default."""
 
+JUMP = 1.5
+"""Length of a step, relative to the median one, beyond which it is a jump to another line."""
+
+STRAIGHT = 0.5
+"""Cosine of the angle between two steps from which they are of one line, or of one circle."""
+
+NEAR, AGAINST, MANY = 8, -0.7, 0.2
+"""Number of neighbours that are near, cosine of the angle to the way to a neighbour below which it
+is in the opposite direction, and share of points with such a neighbour that are many."""
+
+ENOUGH = 20_000
+"""Number of points that show how a stage moves."""
+
 
 def point_spacing(points: Floats) -> float:
     """Return the median distance in m of points (n, 3) from their nearest neighbours."""
@@ -34,6 +47,36 @@ def scan_lines(points: Floats) -> Ints:
             best = number
     few, short = best.max() + 1 < HELD_OUT_EVERY, len(points) < 3 * (best.max() + 1)
     return np.arange(len(points)) if few or short else best
+
+
+def motion(points: Floats) -> Floats:
+    """Return the unit vectors (n, 3) along which a stage came to each of its points (n, 3).
+
+    They are 0 for the first point of a line: the stage has stopped there.
+    """
+    step = np.diff(points, axis=0, prepend=points[:1])
+    size = np.linalg.norm(step, axis=1)
+    usual = np.median(size[size > 0]) if size.any() else 0.0
+    moved = (size > 0) & (size <= JUMP * usual)
+    way = np.where(moved[:, None], step / np.where(moved, size, 1.0)[:, None], 0.0)
+    goes_on = np.sum(way[1:] * way[:-1], axis=1) > STRAIGHT
+    on_a_line = np.zeros(len(points), bool)
+    on_a_line[1:] |= goes_on
+    on_a_line[:-1] |= goes_on
+    return np.asarray(way * on_a_line[:, None])
+
+
+def goes_both_ways(points: Floats) -> bool:
+    """Tell whether many of a map's points (n, 3) were come to against the way to others nearby."""
+    points = points[:ENOUGH]
+    way = motion(points)
+    moved = way.any(axis=1)
+    if moved.sum() < 2:
+        return False
+    count = min(NEAR + 1, int(moved.sum()))
+    near = KDTree(points[moved]).query(points[moved], np.arange(2, count + 1))[1]
+    along = np.einsum("nc,nkc->nk", way[moved], way[moved][near])
+    return bool(np.mean((along < AGAINST).any(axis=1)) > MANY)
 
 
 def held_out_lines(lines: Ints, every: int) -> NDArray[np.bool_]:

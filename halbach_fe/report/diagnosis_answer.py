@@ -120,9 +120,9 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
             return ("Measure what tells apart the causes that explain the map equally well: the "
                     f"page says what. Until then {STUDY_FILE} has the first of them.", infer)
         if remedies := _remedies(diagnosis):
-            changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. "
-                       f"{_also_possible(diagnosis)}If it stays as it is, update it with "
-                       f"{STUDY_FILE}, the study with what was found.")
+            changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
+                       f"stays as it is, update it with {STUDY_FILE}, the study with what was "
+                       "found.")
         return f"{changed} {suspicions}".strip(), infer
     return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
 
@@ -150,10 +150,10 @@ def _also_possible(diagnosis: Diagnosis) -> str:
     numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
     said = []
     for effect in diagnosis.identified:
-        if effect.hypothesis.effect.name in REMEDIES:
-            place = effect.place
-            own = [numbers[ring, slot] for ring, slot in (
-                (place.ring, place.slot), place.other) if ring and slot]
+        place = effect.place
+        own = [numbers[ring, slot] for ring, slot in (
+            (place.ring, place.slot), place.other) if ring and slot]
+        if own:
             others = dict.fromkeys(tuple(image[each] for each in own) for image in images)
             others.pop(tuple(own), None)
             if others:
@@ -162,7 +162,7 @@ def _also_possible(diagnosis: Diagnosis) -> str:
                 said.append(f"{place_in_words(place)} may be {blocks} as well")
     return (f"If where the map lies was found from the map itself (register), {in_a_row(said)}, "
             "as the nominal magnet is the same after a turn: only a mark on the magnet tells which "
-            "it is. ") if said else ""
+            "it is.") if said else ""
 
 
 def _fails(diagnosis: Diagnosis) -> bool:
@@ -246,6 +246,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "The magnet is the same from several sides, so that the readings may be displaced by "
             f"{joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
             "first is used here.")
+    if exchanged := _also_possible(diagnosis):
+        sentences.append(exchanged)
     unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                for effect in diagnosis.identified
                if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]

@@ -47,8 +47,9 @@ class Instrument(StudyModel):
     points off the axis at the angle phi it also adds
     ``eccentricity_m[0] cos phi + eccentricity_m[1] sin phi`` to the distance. It multiplies z by
     ``1 + z_scale`` and lowers y by the sag of the arm, which grows with the square of the distance
-    from the map's smallest z and is ``arm_sag_m`` at its largest z. T rotates by the rotation
-    vector ``rotation_rad`` about the origin, then translates by ``translation_m``.
+    from the map's smallest z and is ``arm_sag_m`` at its largest z. It displaces every point by
+    ``lag_m`` against the step from the row before, but for the first of a line or circle. T rotates
+    by the rotation vector ``rotation_rad`` about the origin, then translates by ``translation_m``.
 
     Readings. With B' the components of B along the rotated axes, the reading of component i is
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
@@ -68,6 +69,7 @@ class Instrument(StudyModel):
     radius_offset_m: Offset = 0.0
     eccentricity_m: tuple[Offset, Offset] = (0.0, 0.0)
     arm_sag_m: Offset = 0.0
+    lag_m: Offset = 0.0
     sensor_position_m: tuple[Displacement, Displacement, Displacement] = (
         (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     gain: Fractions = (0.0, 0.0, 0.0)

@@ -270,7 +270,7 @@ def test_a_turn_of_the_magnet_exchanges_names(flat):
             found, before=replace(found.before, magnet=build_magnet(study), **changes),
             identified=(replace(one, hypothesis=hypothesis, values=np.ones(1), sd=np.zeros(1),
                                 selection=replace(one.selection, candidate=candidate,
-                                                  alternatives=())),))).step
+                                                  alternatives=())),))).trust
 
     assert "ring 1, slot 3 may be ring 2, slot 7 as well" in said(placed)
     pair = "ring 1, slot 3 and ring 1, slot 4 may be ring 2, slot 7 and ring 2, slot 6 as well"

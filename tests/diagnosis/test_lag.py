@@ -1,0 +1,81 @@
+"""Readings that lag behind a stage that scans to and fro."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.instrument import sensor_positions
+from halbach_fe.measurement.scan_lines import goes_both_ways, motion
+from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.reader import parse_study
+from tests.support.short_dipole import BODY, NOISE_T, TEXT, truth
+
+LAG_M = 1e-4
+LINES = BODY.reshape(25, -1, 3)
+SERPENTINE = np.vstack([line[::(-1) ** number] for number, line in enumerate(LINES)])
+STUDY = parse_study(tomllib.loads(TEXT))
+SOME = [effect for effect in catalogue() if effect.name in (
+    "gain_x", "lag", "mapper_roll", "mapper_translation", "offset_x", "z_scale")]
+(LAG,) = [effect for effect in SOME if effect.name == "lag"]
+
+
+def map_of(points, lag_m, generator):
+    """A map by magpylib; the probe is behind on its way along z, and at rest when it begins one."""
+    behind = np.zeros_like(points)
+    step = np.diff(points[:, 2], prepend=points[0, 2])
+    behind[:, 2] = -lag_m * np.sign(np.where(np.abs(step) < 0.01, step, 0.0))
+    field = truth(generator).getB(points + behind)
+    return field_map(points, field + NOISE_T * generator.standard_normal(field.shape))
+
+
+def test_a_lag_is_named(session, generator):
+    """0.1 mm, of a step of 6 mm; with it in the study the update agrees with the map."""
+    data = map_of(SERPENTINE, LAG_M, generator)
+    found = diagnose(STUDY, data, session, effects=SOME)
+    assert [one.hypothesis.effect.name for one in found.identified] == ["lag"]
+    assert found.unknown is None
+    lag = found.identified[0]
+    assert lag.values == pytest.approx([LAG_M], abs=4 * lag.sd[0])
+    assert lag.sd[0] < LAG_M / 10
+    assert found.study.instrument.lag_m == pytest.approx(LAG_M, abs=4 * lag.sd[0])
+    update = infer(build_magnet(found.study), data, session)
+    assert update.prior_conflict < update.conflict_limit
+    # control: without it the update does not agree
+    assert found.before.prior_conflict > found.before.conflict_limit
+
+
+def test_lines_of_one_direction_show_no_lag(session, generator):
+    """The same lag is then a shift of the map, and is not offered."""
+    assert Campaign.of(STUDY, map_of(SERPENTINE, 0.0, generator)).places(LAG, STUDY)
+    data = map_of(BODY, LAG_M, generator)
+    assert Campaign.of(STUDY, data).places(LAG, STUDY) == []
+    found = diagnose(STUDY, data, session, effects=SOME)
+    assert not any(one.hypothesis.effect.name == "lag" for one in found.identified)
+
+
+def test_the_way_of_a_stage():
+    points = np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 2], [1, 0, 2], [1, 0, 1], [1, 0, 0],
+                       [9, 0, 0]])
+    way = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 0], [0, 0, -1], [0, 0, -1], [0, 0, 0]])
+    np.testing.assert_array_equal(motion(points), way)
+    turn = Rotation.from_rotvec([0.1, -0.4, 0.3])
+    np.testing.assert_allclose(motion(turn.apply(points)), turn.apply(way), atol=1e-12)
+    np.testing.assert_allclose(
+        sensor_positions(Instrument(lag_m=0.05), points)[:, 0], points - 0.05 * way)
+    assert not motion(np.zeros((3, 3))).any()
+    angle = np.arange(48) * np.pi / 12
+    helix = np.column_stack([np.cos(angle), np.sin(angle), np.repeat([0.0, 0.2], 24)])
+    assert not goes_both_ways(helix)  # two circles in the same sense
+    helix[24:] = helix[24:][::-1]
+    assert goes_both_ways(helix)
+    assert not goes_both_ways(points[:1])
