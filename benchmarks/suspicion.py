@@ -76,8 +76,9 @@ def with_readings(search: Search, update: InferenceResult, data: xr.Dataset) -> 
     readings = update.observation.read(data["B_T"].values)
     left = readings - update.response.offset - update.response.matrix @ update.prior.mean
     residual = update.errors.subset(rows).whiten(left[rows])
-    return replace(search, residual=residual, training=residual,
-                   evidence=search.marginal.evidence(search.columns, residual))
+    absorbed = search.marginal.absorbed(np.column_stack([search.columns, residual]))
+    return replace(search, residual=residual, training=residual, absorbed=absorbed,
+                   evidence=search.marginal.evidence(search.columns, residual, absorbed))
 
 
 def probability_at_most(search: Search, named: Sequence[IdentifiedEffect]) -> float:
