@@ -26,7 +26,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.point_maps import draw, panels
-from halbach_fe.report.words import decimals, flux_density, relative
+from halbach_fe.report.words import decimals, flux_density, relative, with_error
 from halbach_fe.study.types import COMPONENTS
 
 REMAINS = 0.3
@@ -37,6 +37,9 @@ ZERO = 1e-6
 
 ROWS_NAMED = 10
 """Number of broken rows that are listed by number."""
+
+TERMS_NAMED = 5
+"""Number of the instrument's parameters that are named beside the table, the most certain ones."""
 
 
 def answer(check: MapCheck) -> Answer:
@@ -146,10 +149,16 @@ def sentences(check: MapCheck) -> list[str]:
         more = f" and {len(rows) - ROWS_NAMED} more" if len(rows) > ROWS_NAMED else ""
         found.append(f"Left out because {BROKEN[kind]}: row{'s' if len(rows) > 1 else ''} "
                      f"{numbers}{more}.")
-    terms = [f"{term.name} {term.value:.3g} ± {term.sd:.1g} {term.unit}"
-             for term in check.terms if term.found]
+    terms = sorted((term for term in check.terms if term.found),
+                   key=lambda term: -abs(term.value) / term.sd)
     if terms:
-        found.append("The instrument is not what the map assumes: " + "; ".join(terms) + ".")
+        said = [f"{term.name} {with_error(term.value, term.sd)}\u00a0{term.unit}"
+                for term in terms[:TERMS_NAMED]]
+        others = len(terms) - TERMS_NAMED
+        found.append(f"The instrument is not what the map assumes: {'; '.join(said)}"
+                     + (f"; and {others} more of the parameters in the table" if others > 0
+                        else "")
+                     + ".")
     return found
 
 
@@ -218,7 +227,7 @@ def _component(name: str) -> str:
 def instrument_table(check: MapCheck) -> list[dict[str, str]]:
     """Return rows of text: the parameters of the instrument that the map determines."""
     return [{"parameter": term.name,
-             "value": f"{term.value:.2f} ± {term.sd:.2f} {term.unit}",
+             "value": f"{with_error(term.value, term.sd)}\u00a0{term.unit}",
              "": "found" if term.found else ""}
             for term in check.terms if term.determined]
 
@@ -335,6 +344,8 @@ def _maps(points: Floats, field: Floats, check: MapCheck) -> Figure:
     shown = [number for number in range(3)
              if np.nanmax(np.abs(field[:, number]), initial=0.0) > ZERO * largest]
     figure = figure_of(0.6 + 2.4 * len(shown))
+    # axes that are drawn to scale move their labels outwards
+    figure.set_layout_engine("constrained", rect=(0.03, 0.0, 0.95, 1.0))
     for column, row in zip(shown, figure.subplots(len(shown), 2, sharex=True, sharey=True,
                                                   squeeze=False), strict=True):
         residual = 1e6 * np.where(check.excluded, np.nan, check.residual_T[:, column])[panel.points]

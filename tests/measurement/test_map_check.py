@@ -184,6 +184,15 @@ def test_an_imperfect_instrument(generator):
     text = " ".join(sentences(check))
     assert "column Bz is −Bz" in text
     assert "row 51" in text
+    # the most certain parameters are named, with two digits of their errors
+    many = [replace(roll, name=f"term {number}", value=100.0 + number, sd=12.0)
+            for number in range(7)]
+    (*_, said) = sentences(replace(check, terms=tuple(many)))
+    assert "term 6 106\u00a0±\u00a012\u00a0mrad; term 5" in said
+    assert "term 2" in said
+    assert "term 1" not in said
+    assert said.endswith("and 2 more of the parameters in the table.")
+    assert "more of" not in sentences(replace(check, terms=tuple(many[:5])))[-1]
 
 
 def trust_white_noise(monkeypatch):
