@@ -39,6 +39,9 @@ POSTERIOR = "posterior.h5"
 MOST_ROWS = 40
 """Largest number of rows of a folded table. All of them are on its page."""
 
+LONGEST_GIST = 240
+"""Largest number of characters of an answer that the contents quote."""
+
 SHORT_DIGEST = 16
 """Digits of SHA-256 that the page shows."""
 
@@ -363,12 +366,20 @@ def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
             "name": _shown(PurePath(chapter.label) / PurePath(page.path).parent),
             "of": _shown(next(of, "")),
             "command": chapter.record.command, "ended": _date(chapter.record.ended),
-            "answer": answer, "next": done and first[done.label],
+            "answer": answer, "gist": _gist(answer.said) if answer else "",
+            "next": done and first[done.label],
             "where": "above" if earlier else "below",
             "picture": page.picture,
             "rows": rows[:MOST_ROWS], "all_rows": len(rows), "page": files.get(page.path),
             "files": {_shown(name): address for name, address in files.items()}})
     return found
+
+
+def _gist(said: str) -> str:
+    """Return the first sentence of an answer, or its beginning if that is long."""
+    first = re.split(r"(?<=[.!?]) (?=[A-Z])", said, maxsplit=1)[0]
+    return first if len(first) <= LONGEST_GIST else (
+        first[:LONGEST_GIST].rpartition(" ")[0].rstrip(",;:") + " …")
 
 
 def _shown(text: object) -> str:

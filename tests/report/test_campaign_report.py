@@ -21,7 +21,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import RECORD, result_folder
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
-from halbach_fe.report.campaign_report import _parts, read_campaign
+from halbach_fe.report.campaign_report import LONGEST_GIST, _gist, _parts, read_campaign
 from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import PAGE_RECORD, Picture
 from halbach_fe.report.result_files import OWNERS
@@ -491,6 +491,15 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert campaign.answer.trust.startswith("Yes: they are of")
     assert "simulated" not in campaign.answer.said
     assert (campaign.answer.sound, campaign.answer.step) == (True, "Step after infer.")
+
+
+def test_the_contents_say_what_each_result_says():
+    said = "The middle lies at 1.5 mm. Its odds are 1 : 1."
+    assert _gist(said) == "The middle lies at 1.5 mm."
+    assert _gist("Yes") == "Yes"
+    long = _gist("word, " * 100)
+    assert long.endswith("word …")
+    assert len(long) <= LONGEST_GIST + 2
 
 
 def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
