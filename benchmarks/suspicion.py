@@ -24,9 +24,11 @@ import xarray as xr
 from benchmarks.note import Note
 from benchmarks.unknown import FOLDER
 from halbach_fe.cli import common
+from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.model_selection import (
     EFFECT_PRIOR_ODDS,
     WIDE_PRIOR_SD,
@@ -106,6 +108,7 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
         effects = [effect for effect in catalogue() if effect.name in NAMES]
         base = score_hypotheses(STUDY, (), update, update.prior.mean, Campaign.of(STUDY, data),
                                 NominalSolver(session), effects, (), {})
+        _check_other_readings(base, update, effects, session)
         flexible = families_of(base, update)
         for seed in range(len(found), count):
             data, name = simulated(seed)
@@ -124,6 +127,23 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
                 "named": [effect.selection.candidate.effect for effect in named]})
             write_text(path, json.dumps(found) + "\n")
     return found
+
+
+def _check_other_readings(
+    base: Search, update: InferenceResult, effects: Sequence[Effect], session: Session
+) -> None:
+    """Check that the comparison for other readings is that of a search of its own.
+
+    One that kept what the first readings had absorbed suspected nothing in 3 000 maps.
+    """
+    data, _ = simulated(1)
+    own = infer(build_magnet(STUDY), data, session, None)
+    expected = score_hypotheses(STUDY, (), own, own.prior.mean, Campaign.of(STUDY, data),
+                                NominalSolver(session), effects, (), {})
+    found = with_readings(base, update, data)
+    for name in ("residual", "training", "absorbed"):
+        if not np.allclose(getattr(found, name), getattr(expected, name), atol=1e-8):
+            raise CheckFailedError(f"`{name}` of a search is not that of its readings.")
 
 
 def _listed(found: Sequence[Suspicion]) -> list[list[Any]]:

@@ -171,7 +171,10 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
             "the magnet, where there is some field", f"one at {farthest:.4g} m",
             "Are they in metres?"))
     points = np.vstack([baseline, candidates])
-    observation = observe(magnet.study, points, np.ones_like(points, bool))
+    # the order in which they would be measured is not known yet
+    steady = magnet.study.instrument.with_(lag_m=0.0)
+    observation = observe(magnet.study.with_(instrument=steady), points,
+                          np.ones_like(points, bool))
     noise = reading_noise(magnet, observation, xr.Dataset())
     model = response_matrix(magnet, observation, session)
     errors = noise.with_independent_errors(model.error)

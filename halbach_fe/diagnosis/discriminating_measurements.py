@@ -42,6 +42,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.result import HELD_OUT_MAP
 from halbach_fe.measurement.campaign import Data
+from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulation_choice import solve_nominal
@@ -99,6 +100,8 @@ class ProposedScan:
         Whether the mapper and its probe take the readings; False for an NMR teslameter.
     map : str or None
         Name of the map, of those that the study lists, whose mapper and probe take them.
+    way : ndarray, shape (n, 3), or None
+        See `NominalFields.way`; None if all lines go one way, so that a lag does not show.
     """
 
     points: Floats
@@ -110,6 +113,7 @@ class ProposedScan:
     temperature_known: bool = False
     mapped: bool = True
     map: str | None = None
+    way: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -325,10 +329,12 @@ def present_scan(diagnosis: Diagnosis, data: Data, name: str | None = None) -> P
     one = campaign.maps[0] if name is None else next(
         each for each in campaign.maps if each.name == name)
     turned = rotation_matrix(one.study_of(update.study).instrument.rotation_rad)
+    points = campaign.points_of(update.study)
+    way = np.vstack([motion(points[each.rows]) for each in campaign.maps])
     return ProposedScan(
-        campaign.points_of(update.study)[used], campaign.times[used],
+        points[used], campaign.times[used],
         sparse.csr_array(sparse.csc_array(analysis)[:, columns]),
-        NoiseCovariance(sparse.csr_array(covariance)), turned, np.eye(3), map=name)
+        NoiseCovariance(sparse.csr_array(covariance)), turned, np.eye(3), map=name, way=way[used])
 
 
 def distance(blocks: Marginal, signature: Floats, rivals: Floats) -> float:
@@ -408,7 +414,8 @@ class _Readings:
         self.scan, self.magnet, self.part = scan, magnet, part
         self.mapper = ScanFields(
             nominal.study, scan.points, scan.time, nominal.solve, nominal, part,
-            scan.magnet_rotation, np.eye(3))
+            scan.magnet_rotation, np.eye(3),
+            way=np.zeros_like(scan.points) if scan.way is None else scan.way)
         self.sensors = replace(self.mapper, probe_rotation=scan.probe_rotation)
         self.blocks = self._whitened(
             magnet.response[:, part] @ scan.magnet_rotation.T) @ diagnosis.before.prior.root

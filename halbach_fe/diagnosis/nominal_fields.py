@@ -47,6 +47,10 @@ class NominalFields:
     solve_iron : callable, optional
         Function of a study that returns the change (n, 3) in T that its iron makes to the field of
         blocks in vacuum, or None if `solve` takes no longer.
+    way : ndarray, shape (n, 3), or None
+        Unit vectors along which the stage came to each point, see
+        `halbach_fe.measurement.scan_lines.motion`; None if the points are all of a map, in its
+        order.
     measured_magnetizations : ndarray, shape (blocks, D), in A/m, or None
         Magnetizations that are expected from measurements of the single blocks, in D dimensions;
         None to use the nominal ones.
@@ -58,6 +62,7 @@ class NominalFields:
     solve: Callable[[Study], Floats]
     solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
+    way: Floats | None = field(default=None, kw_only=True)
     _gradients: dict[int, Floats] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property

@@ -152,7 +152,7 @@ class Campaign:
         """
         if effect.kind == "field" or not self.is_listed:
             return list(effect.places(study)) if any(
-                effect.can_show(one.points) for one in self.maps) else []
+                effect.can_show(one.points) for one in self.maps if not one.is_validation) else []
         found: dict[Place, list[str]] = {}
         for one in self.maps:
             if one.number is None or not effect.can_show(one.points):

@@ -636,9 +636,8 @@ def _terms(fitted: ProbeFit, beyond: float, shares: Floats) -> tuple[InstrumentT
     """Return the parameters of the instrument in the units of people.
 
     ``beyond`` is how many times farther off held-out lines are than fitted ones. What the charges
-    cannot follow is no white noise: it moves the parameters by as much more. ``shares`` (3,) are
-    those of the components in the mean square of the field: gains are relative to their mean with
-    these weights, so that the component that is most of the field keeps its size.
+    cannot follow is no white noise: it moves the parameters by as much more. ``shares`` (3, 3) is
+    how much each element of the matrix of gains and crosstalk changes |B|, see `ProbeModel.shares`.
     """
     value, found = fitted.instrument * fitted.prior_sd, []
     scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
@@ -661,9 +660,10 @@ def _terms(fitted: ProbeFit, beyond: float, shares: Floats) -> tuple[InstrumentT
     for (first, second), (one, other) in zip(pairs, mixed, strict=True):
         add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
             {one: 1.0, other: 1.0})
-    for own in np.flatnonzero(shares < ALL_OF_IT).tolist():
+    for own in np.flatnonzero(np.diag(shares) < ALL_OF_IT).tolist():
         add(f"gain of B{COMPONENTS[own]} relative to that of |B|", "%", 100.0,
-            {9 + 4 * other: float((own == other) - shares[other]) for other in range(3)})
+            {9 + 3 * first + second: float((own == first == second) - shares[first, second])
+             for first, second in product(range(3), repeat=2)})
     for (when, weights), own in product(CHANGES.items(), range(3)):
         add(f"turn about {COMPONENTS[own]} {when}", "mrad", 1e3,
             {TURNS.start + 3 * wave + own: weight for wave, weight in weights.items()})

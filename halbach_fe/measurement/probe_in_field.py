@@ -264,14 +264,17 @@ class ProbeModel:
         every = np.ones(len(self.points), bool)
         reads = np.stack([self._sensor(at, every, sensor)[1] for sensor in range(3)], axis=1)
         read, field = self.readings(at), self.charges.field(self.points, at.amplitudes)
-        gain = 1 + float(self.shares(at) @ np.diag(at.mixing))
+        gain = 1 + float(np.sum(self.shares(at) * at.mixing))
         return np.asarray(gain * (field + np.linalg.solve(
             reads, (self.field - read)[..., None])[..., 0]))
 
     def shares(self, at: ProbeFit) -> Floats:
-        """Return the share (3,) of each component in the mean square of the field."""
-        squares = np.mean(self.charges.field(self.points, at.amplitudes)**2, axis=0)
-        return np.asarray(squares / squares.sum())
+        """Return the mean products (3, 3) of two components, relative to the mean square of |B|.
+
+        They are how much each element of the matrix of gains and crosstalk changes |B|.
+        """
+        field = self.charges.field(self.points, at.amplitudes)
+        return np.asarray(field.T @ field / np.sum(field**2))
 
 
 def fit_probe(

@@ -5,23 +5,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from halbach_fe.core.arrays import Floats, Ints
 
 HELD_OUT_EVERY = 5
 """Every so many scan lines one is held out by default."""
 
-JUMP = 1.5
-"""Length of a step, relative to the median one, beyond which it is a jump to another line."""
+JUMP = 5.0
+"""Length of a step, relative to the next one along its line, beyond which it is a jump: some rows
+of a line may be missing, and points are farther apart where the field is smooth."""
 
 STRAIGHT = 0.5
 """Cosine of the angle between two steps from which they are of one line, or of one circle."""
 
-NEAR, AGAINST, MANY = 8, -0.7, 0.2
-"""Number of neighbours that are near, cosine of the angle to the way to a neighbour below which it
-is in the opposite direction, and share of points with such a neighbour that are many."""
+AGAINST, MANY = -0.5, 0.2
+"""Cosine of the angle between two ways below which they are opposite, and share of points with such
+a neighbour that are many."""
 
-ENOUGH = 20_000
+ENOUGH = 2000
 """Number of points that show how a stage moves."""
 
 
@@ -52,31 +54,36 @@ def scan_lines(points: Floats) -> Ints:
 def motion(points: Floats) -> Floats:
     """Return the unit vectors (n, 3) along which a stage came to each of its points (n, 3).
 
-    They are 0 for the first point of a line: the stage has stopped there.
+    The points are in the order of the scan. The vectors are 0 for the first point of a line, where
+    the stage has stopped. Repeated readings at a point have that of the first one.
     """
-    step = np.diff(points, axis=0, prepend=points[:1])
+    new = np.append(True, (points[1:] != points[:-1]).any(axis=1))
+    places = points[new]
+    step = np.diff(places, axis=0, prepend=places[:1])
     size = np.linalg.norm(step, axis=1)
-    usual = np.median(size[size > 0]) if size.any() else 0.0
-    moved = (size > 0) & (size <= JUMP * usual)
-    way = np.where(moved[:, None], step / np.where(moved, size, 1.0)[:, None], 0.0)
+    way = step / np.where(size > 0, size, 1.0)[:, None]
+    ratio = size[1:] / np.where(size[:-1] > 0, size[:-1], np.inf)
     goes_on = np.sum(way[1:] * way[:-1], axis=1) > STRAIGHT
-    on_a_line = np.zeros(len(points), bool)
-    on_a_line[1:] |= goes_on
-    on_a_line[:-1] |= goes_on
-    return np.asarray(way * on_a_line[:, None])
+    on_a_line = np.zeros(len(places), bool)
+    on_a_line[1:] |= goes_on & (ratio <= JUMP)
+    on_a_line[:-1] |= goes_on & (ratio >= 1 / JUMP)
+    return np.asarray((way * on_a_line[:, None])[np.cumsum(new) - 1])
 
 
 def goes_both_ways(points: Floats) -> bool:
-    """Tell whether many of a map's points (n, 3) were come to against the way to others nearby."""
+    """Tell whether many of a map's points (n, 3) were come to against the way to the nearest point
+    of another line.
+    """
     points = points[:ENOUGH]
     way = motion(points)
     moved = way.any(axis=1)
-    if moved.sum() < 2:
+    line = np.cumsum(~moved)[moved]
+    if len(np.unique(line)) < 2:
         return False
-    count = min(NEAR + 1, int(moved.sum()))
-    near = KDTree(points[moved]).query(points[moved], np.arange(2, count + 1))[1]
-    along = np.einsum("nc,nkc->nk", way[moved], way[moved][near])
-    return bool(np.mean((along < AGAINST).any(axis=1)) > MANY)
+    apart = cdist(points[moved], points[moved])
+    apart[line[:, None] == line] = np.inf
+    other = way[moved][apart.argmin(axis=1)]
+    return bool(np.mean(np.sum(way[moved] * other, axis=1) < AGAINST) > MANY)
 
 
 def held_out_lines(lines: Ints, every: int) -> NDArray[np.bool_]:

@@ -36,22 +36,32 @@ ROUGH_ROUNDS = 10
 def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
     """Return the rows that are zero, or repeat the row before them at another position.
 
-    Where the field is uniform, rounded readings repeat by chance. Rows that repeat one or two of
-    the components tell how often: if a component that may repeat does so with the probability p,
-    they are as 3 p (1 - p)^2 and 3 p^2 (1 - p), and p^3 is that of rows that repeat all three.
-    Those count only if they are more.
+    Where the field is uniform, rounded readings repeat by chance. How often all three components do
+    is estimated from rows that repeat only two: they are times the odds that the third one repeats,
+    which rows tell that repeat one of the two. Repetitions count only if there are more.
     """
     zero = (field == 0).all(axis=1)
     alike = field[1:] == field[:-1]
     moved = (points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
     repeated = np.zeros(len(field), bool)
     repeated[1:] = alike.all(axis=1) & moved
-    _, one, two, _ = np.bincount(alike[moved].sum(axis=1), minlength=4)
-    by_chance = two / 3 * two / max(one, 1)
+    by_chance = max(_all_alike_by_chance(alike[moved][:, order])
+                    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]))
     if repeated.any() and gammainc(repeated.sum(), by_chance) > CHANCE:  # of Poisson's distribution
         repeated[:] = False
     return {name: (1 + np.flatnonzero(rows)).tolist()
             for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
+
+
+def _all_alike_by_chance(alike: NDArray[np.bool_]) -> float:
+    """Return the expected number of rows (n, 3) that repeat all components.
+
+    The odds of the third one are those in rows that repeat one of the first two alone.
+    """
+    first, second, third = alike.T
+    one_of_two = first != second
+    repeats, changes = int((one_of_two & third).sum()), int((one_of_two & ~third).sum())
+    return float((first & second & ~third).sum() * repeats / max(changes, 1))
 
 
 def rough_rows(

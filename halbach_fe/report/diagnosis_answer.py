@@ -21,9 +21,8 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
-from halbach_fe.geometry.equal_blocks import turned_onto
+from halbach_fe.geometry.equal_blocks import own_turns
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.pose_space import right_angles
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.unknown_cause import (
@@ -63,6 +62,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
                    "Yes, but what is suspected is not in the model" if diagnosis.suspected else
                    "Yes")
         doubts[0] = f"{verdict}. {doubts[0]}"
+    if exchanged := _also_possible(diagnosis):
+        doubts.append(exchanged)
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
     remedies = _remedies(diagnosis) if sound else []
@@ -142,19 +143,19 @@ def _also_possible(diagnosis: Diagnosis) -> str:
     study = diagnosis.before.study
     instruments = [study.of_map(number).instrument for number in range(len(study.maps))] or [
         study.instrument]
-    if diagnosis.before.measured_blocks is not None or not any(
+    if diagnosis.before.measured_blocks is not None or not diagnosis.identified or not all(
             any(one.rotation_rad) or any(one.translation_m) for one in instruments):
         return ""
     magnet = build_magnet(study)
-    images = [found for turn in right_angles()[1:] if (found := turned_onto(magnet, turn))]
+    images = own_turns(magnet)
     numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
     said = []
     for effect in diagnosis.identified:
         place = effect.place
-        own = [numbers[ring, slot] for ring, slot in (
-            (place.ring, place.slot), place.other) if ring and slot]
+        own = sorted(numbers[ring, slot] for ring, slot in (
+            (place.ring, place.slot), place.other) if ring and slot)
         if own:
-            others = dict.fromkeys(tuple(image[each] for each in own) for image in images)
+            others = dict.fromkeys(tuple(sorted(image[each] for each in own)) for image in images)
             others.pop(tuple(own), None)
             if others:
                 blocks = " or ".join(place_in_words(place_of(*(
@@ -246,8 +247,6 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "The magnet is the same from several sides, so that the readings may be displaced by "
             f"{joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
             "first is used here.")
-    if exchanged := _also_possible(diagnosis):
-        sentences.append(exchanged)
     unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                for effect in diagnosis.identified
                if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]

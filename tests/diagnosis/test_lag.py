@@ -73,9 +73,36 @@ def test_the_way_of_a_stage():
     np.testing.assert_allclose(
         sensor_positions(Instrument(lag_m=0.05), points)[:, 0], points - 0.05 * way)
     assert not motion(np.zeros((3, 3))).any()
-    angle = np.arange(48) * np.pi / 12
-    helix = np.column_stack([np.cos(angle), np.sin(angle), np.repeat([0.0, 0.2], 24)])
-    assert not goes_both_ways(helix)  # two circles in the same sense
-    helix[24:] = helix[24:][::-1]
-    assert goes_both_ways(helix)
     assert not goes_both_ways(points[:1])
+    twice = np.repeat(points, 2, axis=0)  # every point is read twice
+    np.testing.assert_array_equal(motion(twice), np.repeat(way, 2, axis=0))
+    line = np.array([[0.0, 0, z] for z in (0, 1, 2, 4, 5, 6, 10, 14, 15)])  # steps of many lengths
+    np.testing.assert_array_equal(motion(line)[1:], np.tile([0.0, 0, 1], (8, 1)))
+
+
+def circles(angles, radii, heights, to_and_fro):
+    """Points on circles, which are read in one sense or to and fro."""
+    angle = 2 * np.pi * np.arange(angles) / angles
+    found = [np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle + height])
+             for radius in radii for height in heights]
+    return np.vstack([one[::(-1) ** number] if to_and_fro else one
+                      for number, one in enumerate(found)])
+
+
+@pytest.mark.parametrize(("angles", "radii", "heights"), [
+    (24, (1.0,), (0.0, 0.2)), (7, (0.015,), (0.0, 0.02, 0.04)), (8, (0.015,), (0.0, 0.02)),
+    (24, (5.0, 10.0, 30.0), (0.0, 1.0))])
+def test_circles_in_one_sense_show_no_lag(angles, radii, heights):
+    one_sense = circles(angles, radii, heights, False)
+    assert not goes_both_ways(one_sense)
+    assert goes_both_ways(circles(angles, radii, heights, True))
+    # of each circle all points, perhaps without the first
+    assert motion(one_sense).any(axis=1).sum() >= len(one_sense) * (angles - 1) // angles
+
+
+@pytest.mark.parametrize("apart", [0.3, 1.0, 10.0])
+def test_lines_far_apart_show_a_lag_too(apart):
+    lines = np.array([[[x, 0.0, z] for z in np.arange(30.0)] for x in apart * np.arange(5)])
+    assert not goes_both_ways(lines.reshape(-1, 3))
+    lines[1::2] = lines[1::2, ::-1]
+    assert goes_both_ways(lines.reshape(-1, 3))

@@ -273,9 +273,17 @@ def test_a_turn_of_the_magnet_exchanges_names(flat):
                                                   alternatives=())),))).trust
 
     assert "ring 1, slot 3 may be ring 2, slot 7 as well" in said(placed)
-    pair = "ring 1, slot 3 and ring 1, slot 4 may be ring 2, slot 7 and ring 2, slot 6 as well"
+    pair = "ring 1, slot 3 and ring 1, slot 4 may be ring 2, slot 6 and ring 2, slot 7 as well"
     assert pair in said(placed, two, "blocks_swapped")
-    # controls: the study leaves the map where it is, one block differs, blocks were measured
+    assert said(placed).startswith(said(parse_study(tomllib.loads(TEXT))))  # it is no doubt more
+    images = Place(1, 1, other=(2, 1))  # which are exchanged with each other
+    assert "as well" not in said(placed, images, "blocks_swapped")
+    # controls: the study leaves the map where it is, one block differs, something is turned not
+    # with the magnet, blocks were measured
+    with_field = parse_study(tomllib.loads(
+        TEXT + "\n[external]\nbackground_T = [0.0, 0.0, 1e-3]\n"
+        "\n[instrument]\nrotation_rad = [0.01, 0.0, 0.0]\n"))
+    assert "as well" not in said(with_field)
     assert "as well" not in said(parse_study(tomllib.loads(TEXT)))
     uneven = parse_study(tomllib.loads(
         TEXT + "\n[[array.exceptions]]\nring = 1\nslot = 2\nremanence_T = 1.25\n"

@@ -382,6 +382,17 @@ def test_the_corrected_map_keeps_the_size_of_the_field(generator):
         assert abs(found.value - value) < 4 * found.sd
 
 
+def test_crosstalk_keeps_the_size_of_an_oblique_field(generator):
+    """Along the diagonal of x and y, crosstalk of 3 % between them is a gain of 3 %."""
+    field = np.random.default_rng(2).standard_normal(21 + 3)
+    field = 1e-3 * solid_harmonic_fields(GRID / 0.02, 4) @ field + [0.04, 0.04, 0.0]
+    mixed = field + 0.03 * field[:, [1, 0, 2]] * [1, 1, 0]
+    mixed += 1e-6 * generator.standard_normal(field.shape)
+    corrected = check_map(field_map(GRID, mixed)).corrected_T
+    size, read = (float(np.sqrt(np.mean(each**2))) for each in (corrected, mixed))
+    assert size == pytest.approx(read, rel=2e-3)
+
+
 def test_rounded_readings_repeat_by_chance(generator):
     """In a uniform field, rounded to its noise, rows are alike by chance; a reading that stays
     where others move, in a map of all digits, is a repetition.
@@ -393,8 +404,10 @@ def test_rounded_readings_repeat_by_chance(generator):
     assert broken_rows(points, rounded) == {}
     field[100] = field[99]
     assert broken_rows(points, field) == {"repeated": [101]}
-    rounded[200:240] = rounded[200]  # a reading that hangs for long is no chance
-    assert set(range(202, 241)) <= set(broken_rows(points, rounded)["repeated"])
+    rounded[200:260] = rounded[200]  # a reading that hangs for long is no chance
+    assert set(range(202, 261)) <= set(broken_rows(points, rounded)["repeated"])
+    field[:, 1:] = 0.0  # what is always alike tells nothing
+    assert broken_rows(points, field) == {"repeated": [101]}
 
 
 def test_a_change_during_the_scan_must_predict_lines(generator):

@@ -23,12 +23,13 @@ class LagEffect(InstrumentEffect):
     parameters = (Parameter("distance", "m", 3e-4),)
 
     def can_show(self, points: Floats) -> bool:
-        """See `Effect.can_show`. A map with lines of one direction is only shifted or turned."""
+        """See `Effect.can_show`. In lines that all go one way, it is a shift or turn of the map."""
         return goes_both_ways(points)
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
-        return nominal.change_at_displaced_points(-motion(nominal.points))[None]
+        way = motion(nominal.points) if nominal.way is None else nominal.way
+        return nominal.change_at_displaced_points(-way)[None]
 
     def change(self, instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
         """See `InstrumentEffect.change`."""

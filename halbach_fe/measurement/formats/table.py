@@ -116,7 +116,7 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
             line, cell = table.texts[column]
             raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
                                            f"'{cell[:40]}'", comma_hint(cell) or (
-                    "Where nothing was read, write nan.")))
+                    "Where nothing was read, write nan." if name.startswith("B") else "")))
         if (np.abs(table.values[:, column]) > MAX_NUMBER).any():
             raise MeasurementError(must_be(name, table.where, f"below {MAX_NUMBER:g}", "more"))
     si = {name: units.in_si(table.values[:, column], unit_of[name])
