@@ -136,10 +136,8 @@ def sentences(check: MapCheck) -> list[str]:
     """Return what else the check found."""
     found = []
     if check.is_reoriented:
-        shown = ", ".join(f"column B{column} is {_component(name)}"
-                          for column, name in zip(COMPONENTS, check.orientation, strict=True))
-        found.append(f"The map obeys with other axes than it names: {shown} (or all of them with "
-                     "the opposite sign, which no map can show).")
+        found.append(f"The map obeys with other axes than it names: {_axes(check)} (or all of them "
+                     "with the opposite sign, which no map can show).")
     if check.alike:
         found.append(f"{len(check.alike)} other orientations fit as well: " + "; ".join(
             ", ".join(_component(name) for name in names) for names in check.alike[:5])
@@ -194,8 +192,8 @@ def verdict(check: MapCheck) -> str:
                 f"{_where(check, check.reach)}, and to "
                 f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
                 f"{flux_density(check.size_T)}.")
-    axes = (", once its columns are put along the axes that they show" if check.is_reoriented
-            else "")
+    axes = (f", once its columns are put along the axes that they show ({_axes(check)})"
+            if check.is_reoriented else "")
     return f"Passed{axes}. The map then obeys div B = 0 and curl B = 0 to {size}." if axes else (
         f"Passed. The map obeys div B = 0 and curl B = 0 to {size}.")
 
@@ -217,6 +215,13 @@ def _impossible(check: MapCheck) -> list[str]:
 def _violates(check: MapCheck) -> bool:
     """Whether the map does not obey Maxwell's equations with any likely probe."""
     return check.floor_rms_T > VIOLATED * check.size_T or bool(_impossible(check))
+
+
+def _axes(check: MapCheck) -> str:
+    """Say which component each column is that has another name."""
+    return ", ".join(f"column B{column} is {_component(name)}"
+                     for column, name in zip(COMPONENTS, check.orientation, strict=True)
+                     if name != column)
 
 
 def _component(name: str) -> str:

@@ -165,7 +165,9 @@ def test_an_imperfect_instrument(generator):
     # a common sign cannot be known: that of the first column is taken as it is
     assert check.orientation == ("y", "x", "-z")
     assert check.broken == {"zero": [51], "spike": [121]}
-    assert verdict(check).startswith("Passed, once its columns are put along the axes that they")
+    assert verdict(check).startswith(
+        "Passed, once its columns are put along the axes that they show (column Bx is By, column "
+        "By is Bx, column Bz is −Bz). The map then obeys")
     for sensor, (name, place) in enumerate(zip("xyz", sensors, strict=True)):
         for axis, along in enumerate("xyz"):
             term = named(check, f"{along} of the B{name} sensor from the mean of all")
