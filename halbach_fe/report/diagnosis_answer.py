@@ -84,8 +84,8 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
         return "No: the mesh is too coarse for readings of this noise."
     if diagnosis.unknown:
         return (f"No: what is missing can be described but not added to the model ({chi2} without "
-                f"it). It is no random noise, so that error bars of an update with this map are "
-                f"too small.")
+                "it). It is no random noise, so that error bars of an update with this map are "
+                "too small.")
     if diagnosis.suspected:
         return f"Only in part: a suspicion is no certainty. Without it {chi2}."
     if not _fails(diagnosis):

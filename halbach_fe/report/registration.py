@@ -252,8 +252,8 @@ def _fit_alike(one: Registration, other: Registration) -> bool:
 def is_symmetric_to(one: Registration, other: Registration) -> bool:
     """Tell whether the turn from one pose to another puts every nominal block onto an equal one.
 
-    Such poses predict the same readings, before and after an update. Magnets with permeable bodies
-    or with blocks of uneven magnetization are never said to be symmetric.
+    Such poses predict the same readings, before and after an update. `turned_onto` says which
+    magnets are never symmetric.
     """
     first, second = (_axes(each) for each in (one, other))
     turn = second @ first.T
