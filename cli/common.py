@@ -518,10 +518,10 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
     The folder becomes that of this verb and ``study``; shipped studies own theirs already.
     """
     from halbach_fe.solver.dask_cluster import connected
-    from halbach_fe.solver.getdp import find_getdp
+    from halbach_fe.solver.getdp import getdp_or_none
     from halbach_fe.solver.session import Session
 
-    getdp = find_getdp(arguments.getdp)
+    getdp = getdp_or_none(arguments.getdp)
     if study is not None:
         own_folder(arguments, f"halbach-fe {arguments.verb}", study.name)
     with progress_bar("solving") as show, ExitStack() as stack:

@@ -12,7 +12,15 @@ python=${PYTHON:-python3}
 libraries="libgl1 libglu1-mesa libxcursor1 libxft2 libxinerama1 libxrender1"
 missing=""
 getdp=${HALBACH_FE_GETDP:-getdp}
-command -v "$getdp" >/dev/null 2>&1 || missing="getdp"
+extras=$extra
+if ! command -v "$getdp" >/dev/null 2>&1; then
+    if [ "$(uname -sm)" != "Linux x86_64" ] || { command -v apt-get >/dev/null 2>&1 &&
+            { [ "$(id -u)" -eq 0 ] || command -v sudo >/dev/null 2>&1; }; }; then
+        missing="getdp"
+    else  # nobody here may install it: take the static build, a package of PyPI
+        extras=${extra:+$extra,}getdp
+    fi
+fi
 if [ "$extra" = test ]; then  # pages are opened in the one, runs shared by the other
     command -v chromium >/dev/null 2>&1 || missing="$missing chromium"
     command -v mpirun >/dev/null 2>&1 || missing="$missing openmpi-bin"
@@ -75,6 +83,6 @@ stamp=.venv/.installed${extra:+-$extra}
 if [ ! -e "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
     echo "Installing halbach-fe into .venv"
     [ -x .venv/bin/python ] || "$python" -m venv .venv
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".${extra:+[$extra]}"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".${extras:+[$extras]}"
     touch "$stamp"
 fi

@@ -3,7 +3,8 @@
 The ``.pre`` file lists the unknowns (degrees of freedom) by basis function and mesh entity. If
 edges or faces have unknowns, it also lists the edges and faces of every element. PETSc writes
 solutions and matrices in its big-endian binary format, GetDP's SaveSolution writes solutions as
-text.
+text. GetDP may be built with complex PETSc: every value then has an imaginary part, which must
+be 0.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from halbach_fe.core.errors import GetDPError
 
 _VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
 _UNKNOWN = 1  # the type that GetDP gives to a degree of freedom that is solved for
+_IMAGINARY = "imaginary parts, which a static field has not"
 MOST_ENTITIES = 100
 """Largest entity or unknown number in a list of unknowns, relative to the number of its rows.
 
@@ -145,12 +147,14 @@ def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> N
         If the file does not hold exactly ``before + solves`` solutions, or holds values that are
         not finite.
     """
-    size = 8 + 8 * unknowns
     try:
         raw = np.memmap(path, np.uint8, "r")
     except (OSError, ValueError) as error:
         raise GetDPError(f"GetDP's solutions {path.name} cannot be read ({error}).") from None
     total = before + solves
+    complex_scalars = len(raw) == total * (8 + 16 * unknowns)
+    scalar = 16 if complex_scalars else 8
+    size = 8 + scalar * unknowns
     if len(raw) != total * size:
         raise GetDPError(f"GetDP's file {path.name} holds {len(raw)} bytes in place of {total} "
                          f"solutions of {unknowns} unknowns; a full disk can cause this.")
@@ -158,9 +162,13 @@ def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> N
     if not (heads == [_VECTOR, unknowns]).all():
         raise GetDPError(f"GetDP's file {path.name} does not hold {total} PETSc vectors.")
     solutions = np.ndarray((solves, unknowns), ">f8", raw, offset=8 + before * size,
-                           strides=(size, 8))
+                           strides=(size, scalar))
     if not all(np.isfinite(solution).all() for solution in solutions):
         raise GetDPError(f"GetDP's file {path.name} holds values that are not finite.")
+    if complex_scalars and any(
+            part.any() for part in np.ndarray((solves, unknowns), ">f8", raw, strides=(size, 16),
+                                              offset=16 + before * size)):
+        raise GetDPError(f"GetDP's file {path.name} holds {_IMAGINARY}.")
     return solutions
 
 
@@ -175,8 +183,8 @@ def read_saved(path: Path, unknowns: int, count: int) -> Floats:
     try:
         parts = path.read_text(encoding="ascii").split("$Solution")[1:]
         # after the rest of the $Solution line and a line of numbers, every line holds one value
-        solutions = np.array([np.array(part.partition("$End")[0].split("\n")[2:-1], float)
-                              for part in parts])
+        solutions = np.array([
+            _real_values(part.partition("$End")[0].split("\n")[2:-1], unknowns) for part in parts])
     except (OSError, ValueError) as error:
         raise GetDPError(f"GetDP's solutions {path.name} cannot be read ({error}).") from None
     if solutions.shape != (count, unknowns):
@@ -185,6 +193,19 @@ def read_saved(path: Path, unknowns: int, count: int) -> Floats:
     if not np.isfinite(solutions).all():
         raise GetDPError(f"GetDP's file {path.name} holds values that are not finite.")
     return solutions
+
+
+def _real_values(lines: list[str], unknowns: int) -> Floats:
+    """Return the values in lines; a complex PETSc writes an imaginary part beside each, which is 0.
+
+    Raises ValueError for other text than numbers, or if an imaginary part is not 0.
+    """
+    values = np.array(" ".join(lines).split(), float)
+    if len(lines) == unknowns and len(values) == 2 * unknowns:
+        if values[1::2].any():
+            raise ValueError(_IMAGINARY)
+        values = values[::2]
+    return values
 
 
 def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
@@ -203,9 +224,13 @@ def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
         lengths = raw[16:16 + 4 * unknowns].view(">i4").astype(np.int64)
         start, count = 16 + 4 * unknowns, int(head[3])
         columns = raw[start:start + 4 * count].view(">i4").astype(np.int64)
-        values = raw[start + 4 * count:start + 12 * count].view(">f8").astype(float)
-        if lengths.sum() != count or len(values) != count or len(raw) != start + 12 * count:
+        scalar = 16 if len(raw) == start + 20 * count else 8
+        if lengths.sum() != count or len(raw) != start + (4 + scalar) * count:
             raise ValueError("truncated")
+        parts = raw[start + 4 * count:].view(">f8").astype(float).reshape(count, scalar // 8)
+        if parts[:, 1:].any():
+            raise ValueError(_IMAGINARY)
+        values = parts[:, 0].copy()
         if (lengths < 0).any() or (columns < 0).any() or (columns >= unknowns).any():
             # scipy does not check indices, and would read and write outside its arrays
             raise ValueError("entries outside the matrix")

@@ -10,6 +10,7 @@ number of the output are checked before a result is returned.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import shutil
@@ -20,6 +21,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -40,12 +42,14 @@ leaves 1e-13. A residual of 1e-8 of the source is still 1e-4 of the smallest err
 reported."""
 
 DIRECT_SOLVER = (
-    "-petsc_prealloc", "200",
-    "-ksp_type", "preonly", "-pc_type", "cholesky", "-pc_factor_mat_solver_type", "mumps",
+    "-petsc_prealloc", "200", "-ksp_type", "richardson", "-ksp_norm_type", "unpreconditioned",
+    "-ksp_rtol", "1e-10", "-ksp_max_it", "5",
+    "-pc_type", "cholesky", "-pc_factor_mat_solver_type", "mumps",
 )
 """PETSc options of the direct solver, MUMPS. The matrices are symmetric, so that a Cholesky
 factorization takes half the memory of LU. If rows were longer than preallocated, the assembly would
-be many times slower."""
+be many times slower. One step of Richardson's iteration is the direct solve, and the log shows its
+residual; of ``preonly`` PETSc 3.10 shows none."""
 
 DIRECT_SOLVER_OF_PLANE = (*DIRECT_SOLVER, "-mat_mumps_icntl_7", "2")
 """PETSc options of the same for a mesh of a plane that is factorized anew for each mode. With the
@@ -88,8 +92,14 @@ _TOGETHER = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1
 """Environment of a run by `mpirun`. Containers often have no user but root, and the number of
 processes is the user's choice, even if it exceeds the cores that Open MPI counts."""
 
-_INSTALL = ("Install it (Debian, Ubuntu: `apt-get install getdp libopenblas0-pthread`), or name it "
-            f"with --getdp or {ENVIRONMENT_VARIABLE}.")
+_PACKAGE = "pyonelab"
+"""Package of PyPI that contains the static build of GetDP's makers, for Linux on x86-64."""
+
+_PACKAGED_SHA256 = "ffc369cac19f88668d892cc07c8732c452b2a5331d99a623906e89d340a6b89a"
+"""SHA-256 of ``bin/Linux/getdp`` in pyonelab 1.0.5: only the build that was tested is started."""
+
+_INSTALL = ("Install it (`pip install 'halbach-fe[getdp]'`; Debian, Ubuntu: `apt-get install getdp "
+            "libopenblas0-pthread`), or name it with --getdp or " f"{ENVIRONMENT_VARIABLE}.")
 _COLOURS = re.compile(r"\x1b\[\d*m")
 DISK_FULL = "the disk is full"
 _NAMED_FAILURES = (  # pattern in the log, and its meaning
@@ -185,23 +195,52 @@ Run = Callable[
 `halbach_fe.solver.dask_cluster.Cluster.run`."""
 
 
+NO_GETDP = GetDP(Path(), "none", (), "")
+"""Stands for GetDP where it is not installed; only a run that needs GetDP refuses it."""
+
+
+def getdp_or_none(named: str | Path | None = None) -> GetDP:
+    """Return the GetDP of `find_getdp`, or `NO_GETDP` if none was named and none is installed.
+
+    What has a closed form needs no GetDP.
+    """
+    if named or os.environ.get(ENVIRONMENT_VARIABLE) or shutil.which("getdp") or _packaged():
+        return find_getdp(named)
+    return NO_GETDP
+
+
+def _packaged() -> Path | None:
+    """Return the GetDP of the package pyonelab, or None if that is not installed as tested."""
+    try:
+        files = metadata.files(_PACKAGE) or []
+    except metadata.PackageNotFoundError:
+        return None
+    for file in files:
+        path = Path(str(file.locate()))
+        if file.match("bin/Linux/getdp") and path.is_file():
+            content = path.read_bytes()
+            return path if hashlib.sha256(content).hexdigest() == _PACKAGED_SHA256 else None
+    return None
+
+
 def find_getdp(named: str | Path | None = None) -> GetDP:
     """Find the GetDP executable and read its version and build from ``getdp -info``.
 
     Parameters
     ----------
     named : str or Path, optional
-        The executable; by default that of $HALBACH_FE_GETDP, then of PATH.
+        The executable; by default that of $HALBACH_FE_GETDP, then of PATH, then of pyonelab.
 
     Raises
     ------
     GetDPNotFoundError
         If no executable is path, or if it does not answer like GetDP.
     """
-    wanted = str(named) if named else os.environ.get(ENVIRONMENT_VARIABLE) or "getdp"
-    path = shutil.which(wanted)
+    wanted = str(named) if named else os.environ.get(ENVIRONMENT_VARIABLE)
+    path = shutil.which(wanted or "getdp") or (None if wanted else _packaged())
     if path is None:
-        raise GetDPNotFoundError(f"GetDP was not found: `{wanted}` is no executable. {_INSTALL}")
+        raise GetDPNotFoundError(
+            f"GetDP was not found: `{wanted or 'getdp'}` is no executable. {_INSTALL}")
     try:
         answer = subprocess.run([path, "-info"], capture_output=True, text=True, timeout=30,
                                 errors="replace", check=False, env=os.environ | _ALONE)
@@ -255,7 +294,11 @@ def run(
     ------
     GetDPError
         Names the failure and the place of the log.
+    GetDPNotFoundError
+        If ``getdp`` is `NO_GETDP`.
     """
+    if getdp == NO_GETDP:
+        raise GetDPNotFoundError(f"This needs finite elements, and GetDP was not found. {_INSTALL}")
     _check_before(job, folder)
     arguments = [
         str(getdp.executable), job.problem, "-msh", job.mesh, "-solve", job.resolution,
@@ -273,6 +316,8 @@ def run(
         written = (*written, job.matrix)
     for output in written:
         (folder / output).unlink(missing_ok=True)  # GetDP may append to or leave an older file
+    if job.solutions is not None:
+        (folder / job.solutions).touch()  # PETSc 3.10 appends to files that exist only
     lines = _execute(arguments, job, folder, on_line, cancel)
     _check_log(lines, job, folder)
     for output in written:
@@ -514,7 +559,7 @@ def _check_residuals(lines: list[str], largest: float, folder: Path) -> int:
                 raise _failure(f"a linear solve left a residual of {last:.1e} of {first:.1e}: the "
                                "linear solver did not converge", folder)
             count += first is not None
-            first, last = residual, np.inf
+            first, last = residual, np.inf if residual else 0.0  # no source: 0 is the solution
         else:
             last = residual
     return count

@@ -19,7 +19,7 @@ from halbach_fe.core.pace import Progress
 from halbach_fe.core.result_folder import locked_folder
 from halbach_fe.core.temporary_files import remove_orphans, temporary_path
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.getdp import GetDP, Run, find_getdp
+from halbach_fe.solver.getdp import NO_GETDP, GetDP, Run, getdp_or_none
 from halbach_fe.solver.getdp_cache import Cache, default_cache
 
 DEFAULT_JOBS = 2
@@ -133,7 +133,8 @@ class Session:
             Largest number of parallel runs of GetDP; two by default, or one on a machine with one
             core.
         getdp : str, optional
-            GetDP executable; by default that of $HALBACH_FE_GETDP, then of PATH.
+            GetDP executable; by default that of $HALBACH_FE_GETDP, then of PATH, then of the
+            package pyonelab. Without any, what needs no finite elements still works.
         progress : callable, optional
             Called with the number of finished solves and the number of all solves.
 
@@ -144,7 +145,7 @@ class Session:
         Raises
         ------
         GetDPNotFoundError
-            If GetDP is not found, or does not answer like GetDP.
+            If ``getdp`` is not found, or does not answer like GetDP.
         StudyError
             If ``jobs`` is not at least 1.
 
@@ -155,14 +156,14 @@ class Session:
         """
         if jobs is not None:
             check_number("jobs", "Session.open", jobs, 1, whole=True)
-        return cls(find_getdp(getdp), Path(folder),
+        return cls(getdp_or_none(getdp), Path(folder),
                    jobs=jobs or min(DEFAULT_JOBS, os.cpu_count() or 1), progress=progress,
                    cache=default_cache(None))
 
     @classmethod
     def counting(cls, jobs: int) -> Session:
         """Return a session that counts runs of GetDP instead of starting them."""
-        return cls(GetDP(Path(), "", (), ""), Path(), jobs=jobs, counter=RunCounter())
+        return cls(NO_GETDP, Path(), jobs=jobs, counter=RunCounter())
 
     def within(self, name: str) -> Session:
         """Return the same session with a subfolder of this session's folder."""

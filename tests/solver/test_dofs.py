@@ -47,6 +47,37 @@ def test_damaged_solutions_are_refused(tmp_path, content, said):
         read_solutions(path, 3, 2)
 
 
+def complexified(content, skip, rows=1):
+    """The same file of a complex PETSc: an imaginary part of 0 behind every value."""
+    length = len(content) // rows
+    parts = [content[start:start + length] for start in range(0, len(content), length)]
+    return b"".join(part[:skip] + b"".join(part[at:at + 8] + bytes(8)
+                                           for at in range(skip, length, 8)) for part in parts)
+
+
+def test_a_complex_petsc_gives_the_same(tmp_path):
+    """Its files have imaginary parts of 0; one that is not 0 is refused."""
+    path, text = tmp_path / "x.bin", tmp_path / "x.res"
+    solutions = complexified(vectors([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), 8, rows=2)
+    path.write_bytes(solutions)
+    assert read_solutions(path, 3, 2).tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert read_solutions(path, 3, 1, before=1).tolist() == [[4, 5, 6]]
+    path.write_bytes(solutions[:-8] + np.array(1e-30, ">f8").tobytes())
+    with pytest.raises(GetDPError, match="imaginary"):
+        read_solutions(path, 3, 2)
+    head = 16 + 4 * 3 + 4 * 3  # sizes, lengths of rows, columns
+    path.write_bytes(complexified(matrix(ROWS), head))
+    assert read_matrix(path, 3).toarray().tolist() == [[1, 0, 2], [0, 0, 0], [0, -3.5, 0]]
+    path.write_bytes(complexified(matrix(ROWS), head)[:-8] + np.array(1.0, ">f8").tobytes())
+    with pytest.raises(GetDPError, match="imaginary"):
+        read_matrix(path, 3)
+    text.write_text(saved(SOLUTIONS).replace(".0\n", ".0 0\n").replace("e-17\n", "e-17 0\n"))
+    assert read_saved(text, 3, 2).tolist() == SOLUTIONS
+    text.write_text(text.read_text().replace("6.0 0", "6.0 1e-9"))
+    with pytest.raises(GetDPError, match="imaginary"):
+        read_saved(text, 3, 2)
+
+
 def matrix(rows, unknowns=3, identifier=1211216, lengths=None):
     """PETSc's binary format of sparse rows, {column: value} each."""
     lengths = lengths or [len(row) for row in rows]
