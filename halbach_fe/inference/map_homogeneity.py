@@ -3,13 +3,14 @@
 In the sphere about the region's centre that blocks and iron leave free, the field is a sum of
 gradients of solid harmonics. Their amplitudes have a normal prior, of the same width on that sphere
 for all, which the evidence of the readings chooses; the uniform field is as good as free. With the
-covariance that the noise of the readings leaves they give the field in a region within the map.
-Beside that of the nominal and of the updated magnet it shows how much the update explains.
+covariance that the noise of the readings leaves they give the field in a region within the map. Terms
+of the instruments of which the study states a standard deviation are parameters beside them: a map
+by itself does not tell a probe's gain from the field. Beside that of the nominal and of the updated magnet it shows how much the update explains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -18,10 +19,16 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.inference.result import HELD_OUT
-from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.harmonic_field import UNIFORM, fit_readings, solid_harmonic_fields
+from halbach_fe.measurement.campaign import Map, maps_of
+from halbach_fe.measurement.harmonic_field import (
+    UNIFORM,
+    HarmonicFit,
+    fit_readings,
+    solid_harmonic_fields,
+)
 from halbach_fe.response.homogeneity import DRAWS, Homogeneity, HomogeneityModel, sphere_points
 
 WITHIN = 0.75
@@ -72,13 +79,14 @@ def map_homogeneity(
     MeasurementError
         If the map does not fit the study, or the region reaches beyond it.
     """
-    readings = read_campaign(magnet, maps_of(magnet.study, data))
+    maps = maps_of(magnet.study, data)
+    readings = read_campaign(magnet, maps)
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
     free = _free_radius(magnet, np.array(model.region.centre_m))
-    found = {MAP: _fitted(readings, np.ones_like(held_out), model, free, seed)}
+    found = {MAP: _fitted(readings, np.ones_like(held_out), model, free, seed, maps)}
     if held_out.any():
-        found[HELD_OUT_PART] = _fitted(readings, held_out, model, free, seed)
+        found[HELD_OUT_PART] = _fitted(readings, held_out, model, free, seed, maps)
     return {name: known for name, (known, _) in found.items()}, found[MAP][1]
 
 
@@ -99,7 +107,7 @@ def _check_within(readings: Readings, model: HomogeneityModel) -> None:
 
 def _fitted(
     readings: Readings, chosen: NDArray[np.bool_], model: HomogeneityModel, free_m: float,
-    seed: int,
+    seed: int, maps: Sequence[Map],
 ) -> tuple[Homogeneity, float]:
     """Return the homogeneity of the fit of some readings, and its noise over the stated noise."""
     observation, region = readings.observation, model.region
@@ -116,15 +124,51 @@ def _fitted(
         (observation.points[seen] - centre) / free_m)) / sd[:, None]
     scaled = readings.values[used] / sd
     fit = fit_readings(design, [scaled])[0]
-    left = scaled - design @ fit.amplitudes
-    noise = float(np.linalg.norm(left) / np.sqrt(max(len(left) - fit.used, 1.0)))
-    values, vectors = np.linalg.eigh(design.T @ design)
-    root = vectors * (noise / np.sqrt(np.maximum(values, 0.0) + fit.penalty))
+    terms = _terms(readings, maps, lambda at: (_fields((at - centre) / free_m)
+                                               @ fit.amplitudes).reshape(-1, 3))[used] / sd[:, None]
+    mean, noise, root = _with_terms(design, terms, scaled, fit)
     normals = np.random.default_rng(seed).standard_normal((root.shape[1], DRAWS))
-    every = np.column_stack([fit.amplitudes, fit.amplitudes[:, None] + root @ normals])
+    every = np.column_stack([mean, mean[:, None] + root @ normals])
     points = (model.points[:len(model.weights)] - centre) / free_m
     fields = (_fields(points) @ every).reshape(len(points), 3, -1)
     return model.of_fields(fields[..., 0], fields[..., 1:]), noise
+
+
+def _terms(
+    readings: Readings, maps: Sequence[Map], field: Callable[[Floats], Floats]
+) -> Floats:
+    """Return the readings (n, terms) in T per prior sd of what is open about the instruments."""
+    opened = OpenTerms.of(maps)
+    if not len(opened):
+        return np.zeros((len(readings.values), 0))
+    return opened.columns(field, maps, readings) * opened.sd
+
+
+def _with_terms(
+    design: Floats, terms: Floats, scaled: Floats, fit: HarmonicFit
+) -> tuple[Floats, float, Floats]:
+    """Return mean (k,) of the amplitudes, noise over the stated noise, and a root of their
+    covariance (k, k + terms), with the terms of instruments beside them.
+    """
+    count, whole = design.shape[1], np.hstack([design, terms])
+    opened = np.arange(count, whole.shape[1])
+    information, seen = whole.T @ whole, whole.T @ scaled
+
+    def inverse(noise: float) -> tuple[Floats, Floats]:
+        own = information.copy()
+        own[opened, opened] += noise**2 - fit.penalty  # each has a prior sd of 1
+        values, vectors = np.linalg.eigh(own)
+        least = min(fit.penalty, noise**2) if len(opened) else fit.penalty
+        return np.maximum(values + fit.penalty, least), vectors
+
+    mean = fit.amplitudes
+    if len(opened):
+        values, vectors = inverse(1.0)
+        mean = vectors @ (vectors.T @ seen / values)
+    left = scaled - whole @ mean
+    noise = float(np.linalg.norm(left) / np.sqrt(max(len(left) - fit.used, 1.0)))
+    values, vectors = inverse(noise)
+    return mean[:count], noise, vectors[:count] * (noise / np.sqrt(values))
 
 
 def _fields(points: Floats) -> Floats:
