@@ -3,9 +3,10 @@
 In the sphere about the region's centre that blocks and iron leave free, the field is a sum of
 gradients of solid harmonics. Their amplitudes have a normal prior, of the same width on that sphere
 for all, which the evidence of the readings chooses; the uniform field is as good as free. With the
-covariance that the noise of the readings leaves they give the field in a region within the map. Terms
-of the instruments of which the study states a standard deviation are parameters beside them: a map
-by itself does not tell a probe's gain from the field. Beside that of the nominal and of the updated magnet it shows how much the update explains.
+covariance that the noise of the readings leaves they give the field in a region within the map.
+Terms of the instruments of which the study states a standard deviation are parameters beside them:
+a map by itself does not tell a probe's gain from the field. Beside the field of the nominal and of
+the updated magnet that of the map shows how much the update explains.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.linalg import block_diag, solve_triangular
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
@@ -149,26 +151,36 @@ def _with_terms(
 ) -> tuple[Floats, float, Floats]:
     """Return mean (k,) of the amplitudes, noise over the stated noise, and a root of their
     covariance (k, k + terms), with the terms of instruments beside them.
+
+    Where there are such terms, the prior of the amplitudes is centred on the fit, and leaves its
+    scale free. Otherwise it would tell how strong the field is, and so the gain.
     """
+    left = scaled - design @ fit.amplitudes
+    if not terms.shape[1]:
+        noise = _noise(left, fit)
+        values, vectors = np.linalg.eigh(design.T @ design)
+        return fit.amplitudes, noise, vectors * (
+            noise / np.sqrt(np.maximum(values, 0.0) + fit.penalty))
     count, whole = design.shape[1], np.hstack([design, terms])
-    opened = np.arange(count, whole.shape[1])
-    information, seen = whole.T @ whole, whole.T @ scaled
+    scale = fit.amplitudes / np.linalg.norm(fit.amplitudes)
+    prior = np.sqrt(fit.penalty) * (np.eye(count) - np.outer(scale, scale))
 
-    def inverse(noise: float) -> tuple[Floats, Floats]:
-        own = information.copy()
-        own[opened, opened] += noise**2 - fit.penalty  # each has a prior sd of 1
-        values, vectors = np.linalg.eigh(own)
-        least = min(fit.penalty, noise**2) if len(opened) else fit.penalty
-        return np.maximum(values + fit.penalty, least), vectors
+    def solved(noise: float) -> tuple[Floats, Floats]:
+        """Return the step from the fit (k + terms,), and a root over the noise."""
+        rows = np.vstack([whole, block_diag(prior, noise * np.eye(terms.shape[1]))])
+        size = np.linalg.norm(rows, axis=0)
+        turned, triangle = np.linalg.qr(rows / size)
+        root = solve_triangular(triangle, np.eye(len(triangle))) / size[:, None]
+        return root @ (turned[:len(left)].T @ left), root
 
-    mean = fit.amplitudes
-    if len(opened):
-        values, vectors = inverse(1.0)
-        mean = vectors @ (vectors.T @ seen / values)
-    left = scaled - whole @ mean
-    noise = float(np.linalg.norm(left) / np.sqrt(max(len(left) - fit.used, 1.0)))
-    values, vectors = inverse(noise)
-    return mean[:count], noise, vectors[:count] * (noise / np.sqrt(values))
+    step, _ = solved(1.0)
+    noise = _noise(left - whole @ step, fit)
+    return fit.amplitudes + step[:count], noise, noise * solved(noise)[1][:count]
+
+
+def _noise(left: Floats, fit: HarmonicFit) -> float:
+    """Return the noise that what is left of scaled readings shows, over the stated noise."""
+    return float(np.linalg.norm(left) / np.sqrt(max(len(left) - fit.used, 1.0)))
 
 
 def _fields(points: Floats) -> Floats:

@@ -135,8 +135,7 @@ def test_coverage(tmp_path):
 
 
 def test_without_open_terms_it_is_what_is_predicted(generator, tmp_path):
-    """By an exact probe; a stated gain is taken out of it, and a turned sensor reads along itself.
-    """
+    """By an exact probe; a stated gain is taken out, and a turned sensor reads along itself."""
     magnet_of = truth(generator)
     exact = updated(tmp_path / "exact", reading(magnet_of, generator, BODY, STRAIGHT))
     np.testing.assert_array_equal(exact.field.mean, exact.prediction_posterior.mean)
@@ -204,8 +203,8 @@ def test_the_solver_s_error_is_in_the_bars_and_in_words(generator, tmp_path):
     large = with_error(30 * result.noise.sd.max())
     assert large.field.sd.min() > 30 * result.noise.sd.min()
     said = answer(large)
-    assert "The model's own error dominates: the solver is off by up to 600\u00a0µT, rms 30 times " \
-        "the noise of the readings" in said.trust
+    assert ("The model's own error dominates: the solver is off by up to 600\u00a0µT, rms 30 "
+            "times the noise of the readings") in said.trust
     assert "It falls with a larger mesh.cells_per_side (now" in said.trust
     assert "block_size_m" not in said.trust
     near = with_error(30 * result.noise.sd.max(), prior_conflict=0.01)
