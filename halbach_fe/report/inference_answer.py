@@ -104,8 +104,9 @@ def _largest_field(result: InferenceResult) -> str:
     component = f"B{COMPONENTS[main]}" if np.linalg.norm(np.delete(along, main)) < ALONG_AN_AXIS \
         else f"B along ({_numbers(along, '.4f')})"
     moved = np.abs(place - 1e3 * result.observation.positions[most]).max() > 1e-3
-    return (f"The strongest component of the updated field at the map's positions, "
-            f"{component} at ({_numbers(place.round(3), '.5g')}) mm{' of the magnet' if moved else ''}, is "
+    where = f"({_numbers(place.round(3), '.5g')}) mm{' of the magnet' if moved else ''}"
+    return ("The strongest component of the updated field at the map's positions, "
+            f"{component} at {where}, is "
             f"{with_error(1e3 * abs(field.mean[most]), 1e3 * field.sd[most])} mT.")
 
 
