@@ -150,7 +150,12 @@ def _rms(
 
 
 def main_field_T(diagnosis: Diagnosis) -> float:  # noqa: N802 - a unit
-    """Return the largest reading that the diagnosed model predicts, in T."""
+    """Return the strongest component of the field of the diagnosed magnet at the map's positions,
+    in T; of Fourier coefficients, the largest one that the diagnosed model predicts.
+    """
+    field = diagnosis.after.field
+    if field.strongest is not None:
+        return float(abs(field.mean[field.strongest]))
     return float(np.abs(diagnosis.after.prediction_posterior.mean).max())
 
 

@@ -4,24 +4,33 @@ In the sphere about the region's centre that blocks and iron leave free, the fie
 gradients of solid harmonics. Their amplitudes have a normal prior, of the same width on that sphere
 for all, which the evidence of the readings chooses; the uniform field is as good as free. With the
 covariance that the noise of the readings leaves they give the field in a region within the map.
-Beside that of the nominal and of the updated magnet it shows how much the update explains.
+Terms of the instruments of which the study states a standard deviation are parameters beside them:
+a map by itself does not tell a probe's gain from the field. Beside the field of the nominal and of
+the updated magnet that of the map shows how much the update explains.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.linalg import block_diag, solve_triangular
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.inference.result import HELD_OUT
-from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.harmonic_field import UNIFORM, fit_readings, solid_harmonic_fields
+from halbach_fe.measurement.campaign import Map, maps_of
+from halbach_fe.measurement.harmonic_field import (
+    UNIFORM,
+    HarmonicFit,
+    fit_readings,
+    solid_harmonic_fields,
+)
 from halbach_fe.response.homogeneity import DRAWS, Homogeneity, HomogeneityModel, sphere_points
 
 WITHIN = 0.75
@@ -72,13 +81,14 @@ def map_homogeneity(
     MeasurementError
         If the map does not fit the study, or the region reaches beyond it.
     """
-    readings = read_campaign(magnet, maps_of(magnet.study, data))
+    maps = maps_of(magnet.study, data)
+    readings = read_campaign(magnet, maps)
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
     free = _free_radius(magnet, np.array(model.region.centre_m))
-    found = {MAP: _fitted(readings, np.ones_like(held_out), model, free, seed)}
+    found = {MAP: _fitted(readings, np.ones_like(held_out), model, free, seed, maps)}
     if held_out.any():
-        found[HELD_OUT_PART] = _fitted(readings, held_out, model, free, seed)
+        found[HELD_OUT_PART] = _fitted(readings, held_out, model, free, seed, maps)
     return {name: known for name, (known, _) in found.items()}, found[MAP][1]
 
 
@@ -99,7 +109,7 @@ def _check_within(readings: Readings, model: HomogeneityModel) -> None:
 
 def _fitted(
     readings: Readings, chosen: NDArray[np.bool_], model: HomogeneityModel, free_m: float,
-    seed: int,
+    seed: int, maps: Sequence[Map],
 ) -> tuple[Homogeneity, float]:
     """Return the homogeneity of the fit of some readings, and its noise over the stated noise."""
     observation, region = readings.observation, model.region
@@ -116,15 +126,61 @@ def _fitted(
         (observation.points[seen] - centre) / free_m)) / sd[:, None]
     scaled = readings.values[used] / sd
     fit = fit_readings(design, [scaled])[0]
-    left = scaled - design @ fit.amplitudes
-    noise = float(np.linalg.norm(left) / np.sqrt(max(len(left) - fit.used, 1.0)))
-    values, vectors = np.linalg.eigh(design.T @ design)
-    root = vectors * (noise / np.sqrt(np.maximum(values, 0.0) + fit.penalty))
+    terms = _terms(readings, maps, lambda at: (_fields((at - centre) / free_m)
+                                               @ fit.amplitudes).reshape(-1, 3))[used] / sd[:, None]
+    mean, noise, root = _with_terms(design, terms, scaled, fit)
     normals = np.random.default_rng(seed).standard_normal((root.shape[1], DRAWS))
-    every = np.column_stack([fit.amplitudes, fit.amplitudes[:, None] + root @ normals])
+    every = np.column_stack([mean, mean[:, None] + root @ normals])
     points = (model.points[:len(model.weights)] - centre) / free_m
     fields = (_fields(points) @ every).reshape(len(points), 3, -1)
     return model.of_fields(fields[..., 0], fields[..., 1:]), noise
+
+
+def _terms(
+    readings: Readings, maps: Sequence[Map], field: Callable[[Floats], Floats]
+) -> Floats:
+    """Return the readings (n, terms) in T per prior sd of what is open about the instruments."""
+    opened = OpenTerms.of(maps)
+    if not len(opened):
+        return np.zeros((len(readings.values), 0))
+    return opened.columns(field, maps, readings) * opened.sd
+
+
+def _with_terms(
+    design: Floats, terms: Floats, scaled: Floats, fit: HarmonicFit
+) -> tuple[Floats, float, Floats]:
+    """Return mean (k,) of the amplitudes, noise over the stated noise, and a root of their
+    covariance (k, k + terms), with the terms of instruments beside them.
+
+    Where there are such terms, the prior of the amplitudes is centred on the fit, and leaves its
+    scale free. Otherwise it would tell how strong the field is, and so the gain.
+    """
+    left = scaled - design @ fit.amplitudes
+    if not terms.shape[1]:
+        noise = _noise(left, fit)
+        values, vectors = np.linalg.eigh(design.T @ design)
+        return fit.amplitudes, noise, vectors * (
+            noise / np.sqrt(np.maximum(values, 0.0) + fit.penalty))
+    count, whole = design.shape[1], np.hstack([design, terms])
+    scale = fit.amplitudes / np.linalg.norm(fit.amplitudes)
+    prior = np.sqrt(fit.penalty) * (np.eye(count) - np.outer(scale, scale))
+
+    def solved(noise: float) -> tuple[Floats, Floats]:
+        """Return the step from the fit (k + terms,), and a root over the noise."""
+        rows = np.vstack([whole, block_diag(prior, noise * np.eye(terms.shape[1]))])
+        size = np.linalg.norm(rows, axis=0)
+        turned, triangle = np.linalg.qr(rows / size)
+        root = solve_triangular(triangle, np.eye(len(triangle))) / size[:, None]
+        return root @ (turned[:len(left)].T @ left), root
+
+    step, _ = solved(1.0)
+    noise = _noise(left - whole @ step, fit)
+    return fit.amplitudes + step[:count], noise, noise * solved(noise)[1][:count]
+
+
+def _noise(left: Floats, fit: HarmonicFit) -> float:
+    """Return the noise that what is left of scaled readings shows, over the stated noise."""
+    return float(np.linalg.norm(left) / np.sqrt(max(len(left) - fit.used, 1.0)))
 
 
 def _fields(points: Floats) -> Floats:

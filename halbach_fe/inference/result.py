@@ -25,7 +25,7 @@ from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
+from halbach_fe.stats.linear_gaussian import contraction, predict, row_slices, whitened
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 
@@ -43,8 +43,10 @@ COVERAGE_Z = 1.959964
 PREDICTION_COLUMNS = (
     "label", "x_m", "y_m", "z_m", "map", "region", "held_out", "part", "measured_T", "sigma_T",
     "solver_error_T", "prior_mean_T", "prior_sd_T", "posterior_mean_T", "posterior_sd_T",
-    "standardized_residual_prior", "standardized_residual")
-"""Columns of prediction.csv, one row per reading."""
+    "standardized_residual_prior", "standardized_residual",
+    "field_T", "field_sd_T", "place_x_m", "place_y_m", "place_z_m",
+    "along_x", "along_y", "along_z")
+"""Columns of prediction.csv, one row per reading. The last eight are those of `SensedField`."""
 
 
 TOO_NEAR = 0.1
@@ -79,6 +81,43 @@ class Prediction:
     sd: Floats
     root: Callable[[Ints], Floats]
     columns: int
+
+
+@dataclass(frozen=True)
+class SensedField:
+    """The field of the updated magnet where the sensors read it, without their own errors.
+
+    A reading is known as well as its noise. The field is not, if gain, crosstalk or pose are
+    uncertain: what the instrument may be wrong by, the magnet may have.
+
+    Attributes
+    ----------
+    places : ndarray, shape (readings, 3), in m
+        In the magnet, as the instrument is estimated. The field is that of these fixed places.
+    along : ndarray, shape (readings, 3)
+        Unit vectors in the magnet's axes, along which the sensors read: x, y or z, but for turns
+        and crosstalk.
+    mean, sd : ndarray, shape (readings,), in T
+        The component of B along these, and its standard deviation by blocks and solver. ``along``,
+        ``mean`` and ``sd`` are NaN for Fourier coefficients, which are sums over circles.
+    """
+
+    places: Floats
+    along: Floats
+    mean: Floats
+    sd: Floats
+
+    @property
+    def strongest(self) -> int | None:
+        """Number of the reading at which the field is strongest; None if no reading has one."""
+        return None if np.isnan(self.mean).all() else int(np.nanargmax(np.abs(self.mean)))
+
+    def summary(self) -> dict[str, object] | None:
+        """Return the strongest field as plain data for JSON; None if no reading has one."""
+        most = self.strongest
+        return None if most is None else {
+            "at_m": self.places[most].tolist(), "along": self.along[most].tolist(),
+            "mean_T": float(self.mean[most]), "sd_T": float(self.sd[most])}
 
 
 @dataclass(frozen=True)
@@ -346,18 +385,37 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def predictions(self) -> xr.Dataset:
-        """All readings with their noise, and the predictions of prior and posterior.
+        """All readings with their noise, the predictions of prior and posterior, and the field.
 
-        The variables are the columns of prediction.csv.
+        The variables are the columns of prediction.csv. What prior and posterior predict are
+        readings, with the gain and all else that the instrument does; `field` is without these.
         """
-        prior, posterior = self.prediction_prior, self.prediction_posterior
+        prior, posterior, field = self.prediction_prior, self.prediction_posterior, self.field
         columns = dict(zip(PREDICTION_COLUMNS, (
             np.array(self.observation.labels), *self.observation.positions.T,
             np.array(self.maps), np.array(self.regions), self.held_out.astype(int),
             np.array(self.parts), self.readings, self.noise.sd, self.response.error, prior.mean,
             prior.sd, posterior.mean, posterior.sd, self.standardized(prior),
-            self.standardized(posterior)), strict=True))
+            self.standardized(posterior), field.mean, field.sd, *field.places.T,
+            *field.along.T), strict=True))
         return xr.Dataset({name: ("reading", value) for name, value in columns.items()})
+
+    @cached_property
+    def field(self) -> SensedField:
+        """The field of the updated magnet at the places of the readings.
+
+        A reading is linear in B at its sensor, so that the field is what the magnetizations make of
+        the reading, divided by the sensor's sensitivity. Terms of the instrument that were
+        estimated with the magnetizations are in their covariance, not in the field.
+        """
+        observation, known = self.observation, self.prediction_posterior
+        mean, sd = known.mean, known.sd
+        if self.terms is not None:
+            mean, sd = predict(self.response.matrix, self.posterior)
+            mean = self.response.offset + mean
+        size = np.linalg.norm(observation.sensitivities, axis=1)
+        return SensedField(observation.places, observation.sensitivities / size[:, None],
+                           mean / size, np.hypot(sd, self.response.error) / size)
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:
@@ -422,10 +480,20 @@ class InferenceResult(ShownInNotebook):
         return float(left @ left) / count
 
     @property
+    def solver_over_noise(self) -> float:
+        """The solver's error over the noise of the training readings, both rms."""
+        training = ~self.held_out
+        return float(np.linalg.norm(self.response.error[training])
+                     / np.linalg.norm(self.noise.sd[training]))
+
+    @property
     def too_near(self) -> str:
-        """A sentence if noise or prior are stated too large, else an empty string."""
+        """A sentence if noise or prior are stated too large, else an empty string.
+
+        Readings may be nearer than error bars that the solver makes: these are upper bounds.
+        """
         chi2 = self.prior_conflict
-        if chi2 < TOO_NEAR:
+        if chi2 < TOO_NEAR and self.solver_over_noise < 1:
             return (f"The readings are {_times_nearer(chi2)} times nearer to the "
                     "model than their noise and the prior allow (chi² per reading is "
                     f"{chi2:.2g}, where 1 is expected): the study's sigma_T, position_sd_m or prior"

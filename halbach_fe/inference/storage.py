@@ -169,6 +169,7 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
         "parameters_learnt": update.parameters_learnt,
         "log_evidence": update.log_evidence,
         "information_left_out": update.left_out,
+        "strongest_field": update.field.summary(),
         "contraction_by_block": [None if np.isnan(value) else value for value in
                                  update.contraction.round(6).tolist()],
         "largest_shift_A_per_m": float(np.abs(shift).max()),

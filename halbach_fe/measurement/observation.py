@@ -75,6 +75,19 @@ class Observation:
         """Place (readings, 3) in m of each reading in the magnet: the first point it depends on."""
         return self.points[self.operator.indices[self.operator.indptr[:-1]] // len(COMPONENTS)]
 
+    @property
+    def sensitivities(self) -> Floats:
+        """Change (readings, 3) of each reading per component of B at its `places`.
+
+        Those of a flux density by an exact sensor are a unit vector. They are NaN for a Fourier
+        coefficient, which depends on B at all points of its circle.
+        """
+        rows = np.repeat(np.arange(len(self)), np.diff(self.operator.indptr))
+        found = np.zeros((len(self), len(COMPONENTS)))
+        np.add.at(found, (rows, self.operator.indices % 3), self.operator.data)
+        found[[not name for name in self.components]] = np.nan
+        return found
+
     def apply(self, fields: Floats) -> Floats:
         """Return the readings (..., readings) that the sensors give of fields B (..., n, 3) in T.
 

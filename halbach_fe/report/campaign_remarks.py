@@ -33,6 +33,10 @@ EXCEPTIONS = "array.exceptions"
 MOST_FILES, MOST_KEYS, MOST_VALUE = 6, 3, 40
 """Largest numbers of files and of keys that a sentence names, and of characters of a value."""
 
+WRITTEN, OF_SAME_MAGNET, OF_ANOTHER_MAGNET = "written", "of the same magnet", "of another magnet"
+"""How a version of the study belongs to the first one: a command wrote it, or it has the same
+magnet, or neither."""
+
 OF_MAPPER = ("instrument", "instrument_sd", "maps")
 """Tables of the study in which register writes the poses of maps and the probe."""
 
@@ -41,12 +45,15 @@ def doubts(chapters: Sequence[Chapter]) -> list[str]:
     """Return a sentence for everything that does not fit together."""
     return [*_changed(chapters), *_out_of_date(chapters), *_other_files(chapters),
             *_unused_findings(chapters), *_unused_blocks(chapters), *_unrelated(chapters),
-            *(text for text, known in _versions(chapters) if not known)]
+            *(text for text, kind in _versions(chapters) if kind == OF_ANOTHER_MAGNET)]
 
 
-def versions(chapters: Sequence[Chapter]) -> list[str]:
-    """Return a sentence for every version of the study of which there are results by intent."""
-    return [text for text, known in _versions(chapters) if known]
+def versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
+    """Return a sentence for every version of the study of which there are results by intent.
+
+    Each comes with whether a command wrote that version, `WRITTEN`, or not, `OF_SAME_MAGNET`.
+    """
+    return [(text, kind) for text, kind in _versions(chapters) if kind != OF_ANOTHER_MAGNET]
 
 
 def _changed(chapters: Sequence[Chapter]) -> list[str]:
@@ -140,12 +147,8 @@ def _unrelated(chapters: Sequence[Chapter]) -> list[str]:
     return found
 
 
-def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, bool]]:
-    """Say how each version of the study differs from the first.
-
-    Every sentence comes with whether that may be so: another command wrote the version, or it has
-    the same magnet.
-    """
+def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
+    """Say how each version of the study differs from the first, and how it belongs to that."""
     groups: list[tuple[Study, list[Chapter]]] = []
     for one in chapters:
         if (study := one.study) is None:
@@ -176,11 +179,11 @@ def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, bool]]:
             if other.verb == "register":
                 wrote += (" with the poses of maps and the errors of the probe that it found"
                           f"{'. Beside these' if changes else '; nothing else differs'}")
-            found.append((f"{wrote}{f': {changes}' if changes else ''}.", True))
+            found.append((f"{wrote}{f': {changes}' if changes else ''}.", WRITTEN))
         else:
             same = magnet_description(first) == magnet_description(study)
             found.append((f"{of} another version of the study than {groups[0][1][0].label}: "
-                          f"{changes}.", same))
+                          f"{changes}.", OF_SAME_MAGNET if same else OF_ANOTHER_MAGNET))
     return found
 
 

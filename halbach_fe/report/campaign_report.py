@@ -21,7 +21,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_folders import Chapter, Page, read_chapters
-from halbach_fe.report.campaign_remarks import OF_MEASURED, doubts, versions
+from halbach_fe.report.campaign_remarks import OF_MEASURED, WRITTEN, doubts, versions
 from halbach_fe.report.magnet_table import in_one_line
 from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
 from halbach_fe.report.page_record import Picture
@@ -71,7 +71,16 @@ class Campaign:
     @cached_property
     def versions(self) -> list[str]:
         """How versions of the study differ by intent, in sentences."""
-        return [printable(text, MAX_SENTENCE) for text in versions(self.chapters)]
+        return [printable(text, MAX_SENTENCE) for text, _ in versions(self.chapters)]
+
+    @property
+    def _studies(self) -> str:
+        """What studies the results are of, in words."""
+        if not self.versions:
+            return "one study"
+        if all(kind == WRITTEN for _, kind in versions(self.chapters)):
+            return "versions of the study that follow from each other"
+        return "versions of the study that have the same magnet and differ as is said below"
 
     @property
     def answered(self) -> list[tuple[Chapter, Page, Answer]]:
@@ -153,10 +162,8 @@ class Campaign:
             f"{', for a test' if simulated else ' as they stand'}."])
         trust = (
             "No: they do not all fit together, as is said below." if self.doubts else
-            "Yes: they are of " + (
-                "versions of the study that follow from each other" if self.versions else
-                "one study") + ", and no file was changed since. How far each can be trusted "
-            "stands with it below.")
+            f"{self._verdict(left)}: they are of {self._studies}, and no file "
+            "was changed since. How far each can be trusted stands with it below.")
         last = self._next()
         step = last.step if last else "Nothing that the results name is left to do."
         if loses:
@@ -168,6 +175,15 @@ class Campaign:
             step = f"Mend what does not fit together, as the list below says. After that: {step}"
         return Answer("What is known of this magnet?", said, trust, step,
                       last.command if last else "", sound=not (self.doubts or left))
+
+    def _verdict(self, left: Sequence[str]) -> str:
+        """Say whether all answers can be trusted; ``left`` are the folders of those that cannot."""
+        if not left:
+            return "Yes"
+        if not any(answer.sound for _, _, answer in self.answered):
+            return "No, for the reasons that stand below. But they belong together"
+        names = in_a_row([f"folder {each}" for each in left])
+        return f"Not {names}, for the reasons that stand below. The others, yes"
 
     def _newest(self) -> list[str]:
         """Return the last answer about the measured magnet that may be used, and before it that of

@@ -18,6 +18,12 @@ from halbach_fe.report.words import (
     place_of,
     with_error,
 )
+from halbach_fe.solver.formulation_choice import finer_in_words
+from halbach_fe.study.types import COMPONENTS
+
+ALONG_AN_AXIS = 1e-6
+"""Angle in rad up to which the direction of a sensor counts as an axis: of 1 T across it shows
+1 µT."""
 
 
 def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> Answer:
@@ -27,13 +33,12 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     """
     said = f"{_prediction(result)} {_blocks(result)}"
     question = "What is the measured magnet like?"
+    solver = _of_the_solver(result)
     if result.disagreement:
         return Answer(question, "Model and measurement disagree, so that these numbers and their "
                       f"error bars are not to be used as they stand. {said}",
-                      f"No. {result.disagreement}",
-                      "Look for what the study lacks. (Before that, halbach-fe check tests the map "
-                      "by itself, and register finds where it lies.)",
-                      "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
+                      f"No. {result.disagreement}{solver}",
+                      *_after_a_conflict(result), sound=False)
     tested = "" if result.held_out.any() else (
         " No reading was held out, so that this is no test of the predictions: hold some out by "
         "[inference.held_out] or --held-out.")
@@ -49,7 +54,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
-        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}",
+        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
+        f"{solver}",
         f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
         f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
         f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
@@ -65,16 +71,48 @@ def _of_the_probe(result: InferenceResult) -> str:
         "well it is known): if its gain is 0.1\u00a0% off, so is the field of the magnet.")
 
 
-def _largest_field(result: InferenceResult) -> str:
-    """Say how strong the updated field is at its strongest reading; empty if none is a field."""
-    if result.study.observation.quantity != "flux_density":
+def _of_the_solver(result: InferenceResult) -> str:
+    """Say that the solver's error dominates the error bars, and what lowers it; else nothing."""
+    if result.solver_over_noise < 1:
         return ""
-    known, observation = result.prediction_posterior, result.observation
-    most = int(np.argmax(np.abs(known.mean)))
-    at = ", ".join(f"{1e3 * value:.4g}" for value in observation.positions[most])
-    return (f"The strongest component of the updated field at the map's positions, "
-            f"{observation.labels[most]} at ({at}) mm, is "
-            f"{with_error(1e3 * abs(known.mean[most]), 1e3 * known.sd[most])} mT.")
+    return (" The model's own error dominates: the solver is off by up to "
+            f"{flux_density(float(result.response.error.max()))}, rms "
+            f"{decimals(result.solver_over_noise, 2)} times the noise of the readings, and the "
+            "error bars include it. It falls with "
+            f"{finer_in_words(result.magnet, result.observation.points)}.")
+
+
+def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
+    """Return the next step, and its command, if model and measurement disagree."""
+    if result.solver_over_noise >= 1:
+        return ("First lower the solver's error, as is said above, and update again: as it is, it "
+                "hides what the study may lack. This command shows how it falls.",
+                "halbach-fe verify STUDY -o DIR")
+    return ("Look for what the study lacks. (Before that, halbach-fe check tests the map by "
+            "itself, and register finds where it lies.)",
+            "halbach-fe diagnose STUDY --measurements MAP -o DIR")
+
+
+def _largest_field(result: InferenceResult) -> str:
+    """Say how strong the updated field is where it is strongest; empty if no reading has one."""
+    field = result.field
+    most = field.strongest
+    if most is None:
+        return ""
+    place, along = 1e3 * field.places[most], field.along[most]
+    main = int(np.argmax(np.abs(along)))
+    component = f"B{COMPONENTS[main]}" if np.linalg.norm(np.delete(along, main)) < ALONG_AN_AXIS \
+        else f"B along ({_numbers(along, '.4f')})"
+    moved = np.abs(place - 1e3 * result.observation.positions[most]).max() > 1e-3
+    where = f"({_numbers(place.round(3), '.5g')}) mm{' of the magnet' if moved else ''}"
+    return ("The strongest component of the updated field at the map's positions, "
+            f"{component} at {where}, is "
+            f"{with_error(1e3 * abs(field.mean[most]), 1e3 * field.sd[most])} mT.")
+
+
+def _numbers(values: Floats, form: str) -> str:
+    """Return numbers in a row, none of them -0."""
+    return ", ".join(f"{value:{form}}" for value in values.round(9) + 0.0)
 
 
 def _prediction(result: InferenceResult) -> str:

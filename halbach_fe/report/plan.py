@@ -18,6 +18,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.instrument_terms import prior_sd
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -32,7 +33,7 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.words import counted, fraction, ppm
-from halbach_fe.study.model import is_nonlinear
+from halbach_fe.study.model import Study, is_nonlinear
 
 LITTLE = 0.97
 """Uncertainty relative to that of as many of the study's positions from which on a plan is hardly
@@ -131,6 +132,7 @@ def answer(plan: MeasurementPlan) -> Answer:
         "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
         "difference to these numbers. Positions that are chosen one after another, as these are, "
         "tell nearly as much as the best choice of all at once."
+        + _of_the_instrument(plan.magnet.study)
         + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
            else ""),
         "Measure in this order, as far as there is time, and update the blocks. (Set plan.points "
@@ -139,6 +141,14 @@ def answer(plan: MeasurementPlan) -> Answer:
         "Measure there, and update the blocks. Ask for more positions (--points) to learn as much "
         "as from all of the study's.",
         "halbach-fe infer STUDY --measurements MAP -o DIR")
+
+
+def _of_the_instrument(study: Study) -> str:
+    """Say that the plan takes the instrument as exact, if the study does not."""
+    known = [study.instrument_sd, *(one.instrument_sd for one in study.maps if one.instrument_sd)]
+    return "" if not any(prior_sd(one).any() for one in known) else (
+        " They take the instrument as exact: what [instrument_sd] leaves open, such as a gain that "
+        "all readings share, is not in them, and leaves more of the blocks' common strength.")
 
 
 @own_style

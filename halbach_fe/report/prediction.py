@@ -168,7 +168,7 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
         for axis, values in ((top, 1e3 * measured), (bottom, residual)):
             axis.plot(line.place[mask], values[mask], ls="none", color=MEASURED, **MARKERS[part],
                       label=f"measured, {part}" if axis is top else None)
-    top.set_ylabel(f"{line.what} in mT")
+    top.set_ylabel(f"reading of {line.what}\nin mT")
     bottom.set_ylabel(f"measured − predicted\nin {unit}")
     bottom.set_xlabel(line.axis)
     legend_above(figure, top, bottom)

@@ -344,7 +344,8 @@ def circle_models(
 
     They include all orders that the readings resolve, the main order too, in units of the main
     multipole on the circle of the same radius that is nearest to z = 0. The list is empty if the
-    study reads no full circles, or if its instrument changes the readings.
+    study reads no full circles, or if its instrument changes or moves the readings: these are then
+    not on circles about the magnet's axis, or at other z than the map states.
 
     The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
     also contains (aliases with) order m - n, which the blocks' field in vacuum tells: it is
@@ -418,8 +419,7 @@ def _aliases(
     """Return what the angles of a circle mistake for its orders 1 ... K, in vacuum.
 
     The result is (K, parameters) in T per parameter, or (K, 1) for the whole nominal magnet. It is
-    the difference of the sums over the circle's own angles and over a multiple of them. A circle
-    that the mapper has displaced counts as if it were where the map says.
+    the difference of the sums over the circle's own angles and over a multiple of them.
     """
     magnet, points = deviations.magnet, observation.map_points
     here = points[np.isclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=SAME_RADIUS)
@@ -484,7 +484,8 @@ def _read_circles(
     positions, labels = observation.positions, np.array(observation.labels)
     settings, size = magnet.study.observation.positions, len(labels)
     plain = (observation.operator.shape == observation.analysis.shape
-             and (observation.operator != observation.analysis).nnz == 0)
+             and (observation.operator != observation.analysis).nnz == 0
+             and np.abs(observation.points - observation.map_points).max() < SAME_HEIGHT_M)
     if not isinstance(settings, CirclePositions) or not plain:
         return []
     pick = sparse.eye_array(size, format="csr")

@@ -45,6 +45,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import Session
+from halbach_fe.study.solver import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
 """Relative tolerance of the check that single blocks add up to the nominal array, if a direct
@@ -343,6 +344,20 @@ def _solve_nominal(magnet: Magnet, points: Floats, session: Session, route: str)
         return solve_samples(magnet, points, nominal_samples(magnet), session,
                              formulation_of(magnet, route))[0]
     return _solve(magnet, points, (), session, route)[0]
+
+
+def finer_in_words(magnet: Magnet, points: Floats) -> str:
+    """Return the keys that lower the solver's error at points (n, 3) in m, with their values."""
+    mesh, route = magnet.study.mesh, choose_route(magnet, points)
+    elements = f"a smaller mesh.block_size_m (now {1e3 * mesh.block_size_m:.3g} mm)"
+    if route != "moments":
+        return elements
+    cells = f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})"
+    modes = (magnet.study.solver.route == "auto" and not magnet.has_losses
+             and bool(few_modes_suffice(magnet, points).any()))
+    if not magnet.iron and not modes:
+        return cells
+    return f"{cells}{' and' if modes else ' and, for the iron,'} {elements}"
 
 
 def formulation_of(magnet: Magnet, route: str) -> Formulation:

@@ -107,3 +107,22 @@ def test_regions_beyond_the_map_are_refused(generator, tmp_path, errors):
     with pytest.raises(MeasurementError, match="within its points"):
         homogeneity(build_magnet(study()), Session.open(tmp_path), Region.sphere(0.05),
                     data=measured(generator, errors))
+
+
+def test_a_gain_that_is_not_known_is_in_the_mean(generator, tmp_path, errors):
+    """The map is 2 % too strong: by itself it does not tell that from the field."""
+    data = measured(generator, errors)
+    strong = data.assign(B_T=1.02 * data["B_T"])
+    points, weights, _ = region_points(build_magnet(study()), REGION)
+    mean = float(weights @ np.linalg.norm(true_field(1, points, errors=errors), axis=1))
+    magnets = (build_magnet(study().with_(instrument_sd=sd, inference={}))
+               for sd in ({"gain": 0.02}, {}))
+    known, exact = (homogeneity(magnet, Session.open(tmp_path), REGION, data=strong).of_map[MAP]
+                    for magnet in magnets)
+    assert known.mean_T == pytest.approx(mean, abs=3 * known.mean_sd_T)
+    # Maxwell's equations tie the three gains to each other, which leaves their mean
+    assert known.mean_sd_T == pytest.approx(0.02 / np.sqrt(3) * known.mean_T, rel=0.1)
+    # what all readings share is no deviation
+    assert known.rms_ppm == pytest.approx(exact.rms_ppm, rel=0.05)
+    # the control: the probe as exact
+    assert abs(exact.mean_T - mean) > 100 * exact.mean_sd_T

@@ -1,0 +1,219 @@
+"""The field of an updated magnet is not the reading of a probe that is roughly known."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.diagnosis.summary import main_field_T
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.result import PREDICTION_COLUMNS
+from halbach_fe.inference.storage import inference_summary
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.inference_answer import answer
+from halbach_fe.response.multipoles import circle_models
+from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.reader import parse_study
+from tests.support.short_dipole import BODY, NOISE_T, TEXT, field_of, reading, truth
+
+GAIN_SD = 0.02
+STRAIGHT = (Rotation.identity(), np.zeros(3))
+
+
+def updated(tmp_path, data, **known):
+    study = parse_study(tomllib.loads(TEXT) | known)
+    return infer(build_magnet(study), data, Session.open(tmp_path / "work"))
+
+
+def drawn(generator):
+    """A magnet of the study's prior."""
+    magnet_of = truth(generator)
+    common = 1 + 0.01 * generator.standard_normal()
+    for source in magnet_of.sources:
+        source.polarization = source.polarization * common
+    return magnet_of
+
+
+def true_field(magnet_of, result):
+    """magpylib's field at the places and along the directions of `InferenceResult.field`."""
+    places, number = np.unique(result.field.places, axis=0, return_inverse=True)
+    return np.sum(field_of(magnet_of, places)[number.ravel()] * result.field.along, axis=1)
+
+
+def said_field(result):
+    """Value and standard deviation in mT of the first sentence of the answer."""
+    return tuple(map(float, re.match(
+        r"The strongest component of the updated field .*, is ([\d.]+)\xa0±\xa0([\d.]+) mT\.",
+        answer(result).said).groups()))
+
+
+def test_a_gain_that_is_not_known(generator, tmp_path):
+    """Of a map times 1.02 the field is within its bars; the reading is not, by far."""
+    magnet_of = truth(generator)
+    result = updated(tmp_path, reading(magnet_of, generator, BODY, STRAIGHT, 1.02 * np.eye(3)),
+                     instrument_sd={"gain": GAIN_SD})
+    most = result.field.strongest
+    true = true_field(magnet_of, result)[most]
+    value, sd = said_field(result)
+    assert value == pytest.approx(1e3 * abs(true), abs=3 * sd)
+    # blocks of the prior are known to 1 % together, and a gain to 2 %
+    assert 0.005 * value < sd < 0.012 * value
+    old = result.prediction_posterior
+    assert abs(old.mean[most] - true) > 100 * old.sd[most]  # the negative control
+    table = result.predictions
+    assert tuple(map(str, table)) == PREDICTION_COLUMNS
+    assert table["field_T"].values[most] == result.field.mean[most]
+    assert table["posterior_mean_T"].values[most] == old.mean[most]
+    summary = inference_summary(result)["strongest_field"]
+    assert 1e3 * abs(summary["mean_T"]) == pytest.approx(value, abs=sd / 10)
+    assert summary["at_m"] == pytest.approx(result.field.places[most].tolist())
+    # and the page of a diagnosis has parts of the field, too
+    assert main_field_T(SimpleNamespace(after=result)) == abs(result.field.mean[most])
+
+
+def test_mean_and_sd_are_those_of_magpylib_s_blocks(generator, tmp_path):
+    """With the posterior's mean and covariance of the magnetizations, at the places of a pose."""
+    pose = Rotation.from_rotvec([0.004, -0.003, 0.006]), np.array([3e-4, -2e-4, 5e-4])
+    result = updated(tmp_path, reading(truth(generator), generator, BODY, pose),
+                     instrument_sd={"gain": 0.01, "translation_m": 1e-3, "rotation_rad": 0.01})
+    field = result.field
+    assert result.terms.at_rest
+    some = np.arange(0, len(field.mean), 97)
+    places, along = field.places[some], field.along[some]
+    # which are near those of the map, and not the same
+    assert 1e-4 < np.abs(places - result.observation.positions[some]).max() < 2e-3
+    rows = []
+    blocks = [(source.dimension, source.position) for source in truth(generator).sources]
+    for dimension, position in blocks:
+        for axis in np.eye(3):
+            one = SimpleNamespace(sources=[SimpleNamespace(
+                dimension=dimension, position=position, polarization=MU_0 * axis)])
+            rows.append(np.sum(field_of(one, places) * along, axis=1))
+    columns = np.array(rows).T
+    mean = columns @ result.posterior.mean
+    sd = np.sqrt(np.einsum("ij,jk,ik->i", columns, result.posterior.covariance, columns))
+    # a response is moved with the sensors, up to parts of the standard deviations
+    np.testing.assert_allclose(field.mean[some], mean, atol=0.1 * sd.max())
+    np.testing.assert_allclose(field.sd[some], sd, rtol=0.01, atol=1e-3 * sd.max())
+
+
+def test_coverage(tmp_path):
+    """Over campaigns of magnets, gains, crosstalk and poses that are drawn.
+
+    The sum of squares of 10 scores is within 1.5 to 30 with a probability of 0.998. That of the
+    readings that are predicted, the negative control, is not.
+    """
+    field, readings = [], []
+    for number in range(10):
+        generator = np.random.default_rng(number)
+        magnet_of = drawn(generator)
+        mixing = np.eye(3) + 0.003 * generator.standard_normal((3, 3))
+        mixing += np.diag(GAIN_SD * generator.standard_normal(3))
+        pose = (Rotation.from_rotvec(0.005 * generator.standard_normal(3)),
+                5e-4 * generator.standard_normal(3))
+        result = updated(tmp_path / str(number), reading(
+            magnet_of, generator, BODY[::2], pose, mixing), instrument_sd={
+                "gain": float(np.hypot(GAIN_SD, 0.003)), "crosstalk": 0.003,
+                "translation_m": 5e-4, "rotation_rad": 0.005})
+        most = result.field.strongest
+        true = true_field(magnet_of, result)[most]
+        field.append((result.field.mean[most] - true) / result.field.sd[most])
+        old = result.prediction_posterior
+        readings.append((old.mean[most] - true) / old.sd[most])
+    low, high = stats.chi2(len(field)).ppf([1e-3, 0.999])
+    assert low < np.sum(np.square(field)) < high
+    assert np.sum(np.square(readings)) > 100 * high
+
+
+def test_without_open_terms_it_is_what_is_predicted(generator, tmp_path):
+    """By an exact probe; a stated gain is taken out, and a turned sensor reads along itself."""
+    magnet_of = truth(generator)
+    exact = updated(tmp_path / "exact", reading(magnet_of, generator, BODY, STRAIGHT))
+    np.testing.assert_array_equal(exact.field.mean, exact.prediction_posterior.mean)
+    np.testing.assert_array_equal(exact.field.sd, exact.prediction_posterior.sd)
+    assert re.search(r", Bx at \([^)]+\) mm, is", answer(exact).said)
+    mixing = np.array([[1.02, 0.03, 0], [0, 1, 0], [0, 0, 1]])
+    known = {"gain": [0.02, 0, 0], "crosstalk": {"xy": 0.03}}
+    result = updated(tmp_path / "gain", reading(magnet_of, generator, BODY, STRAIGHT, mixing),
+                     instrument=known)
+    off = result.field.mean - true_field(magnet_of, result)
+    np.testing.assert_allclose(off / result.field.sd, 0, atol=5)  # of 975 normal ones
+    most = result.field.strongest
+    assert abs(result.prediction_posterior.mean[most] - true_field(magnet_of, result)[most]) > (
+        100 * result.field.sd[most])
+    assert "B along (0.9996, 0.0294, 0.0000) at (" in answer(result).said
+
+
+def test_circles_that_the_mapper_has_moved_are_none_of_the_magnet(generator, tmp_path):
+    """Their middle is not that of the magnet; the field is said at its place in the magnet."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    ring = 0.01 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    points = (ring + np.array([[[0, 0, 0]], [[0, 0, 0.05]]])).reshape(-1, 3)
+    observed = {"quantity": "flux_density", "positions": {
+        "kind": "circles", "radius_m": 0.01, "angles": 16, "z_min_m": 0, "z_max_m": 0.05,
+        "count": 2}}
+    magnet_of = truth(generator)
+    for shift, count in (([0, 0, 0], 2), ([0, 0, 0.05], 0), ([1e-3, 0, 0], 0)):
+        field = field_of(magnet_of, points + np.array(shift))
+        data = field_map(points, field + NOISE_T * generator.standard_normal(field.shape))
+        result = updated(tmp_path / str(shift), data, observation=observed, inference={},
+                         instrument={"translation_m": shift})
+        found = circle_models(result.magnet, result.observation, result.response)
+        assert len(found) == count
+        assert ("mm of the magnet, is" in answer(result).said) == (count == 0)
+        field = result.field
+        assert abs(field.mean[field.strongest]) == pytest.approx(np.abs(
+            true_field(magnet_of, result)).max(), abs=5 * field.sd.max())
+
+
+def test_fourier_coefficients_are_no_field_at_a_place(generator, tmp_path):
+    """They are sums over circles; their place alone is known."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    ring = 0.01 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    data = field_map(ring, field_of(truth(generator), ring))
+    result = updated(tmp_path, data, inference={}, observation={
+        "quantity": "fourier_coefficients", "harmonics": 3, "positions": {
+            "kind": "circles", "radius_m": 0.01, "angles": 16}})
+    assert result.field.strongest is None
+    assert np.isnan(result.field.mean).all()
+    assert inference_summary(result)["strongest_field"] is None
+    assert "strongest component" not in answer(result).said
+    assert main_field_T(SimpleNamespace(after=result)) == np.abs(
+        result.prediction_posterior.mean).max()
+
+
+def test_the_solver_s_error_is_in_the_bars_and_in_words(generator, tmp_path):
+    """Where it is above the noise; readings that are nearer than it do not blame the noise."""
+    result = updated(tmp_path, reading(truth(generator), generator, BODY, STRAIGHT))
+    permeable = result.magnet.with_(array__recoil_permeability=1.05, solver__route="moments")
+
+    def with_error(size, **changes):
+        return replace(result, magnet=permeable, response=replace(
+            result.response, error=np.full(len(result.readings), size)), **changes)
+
+    large = with_error(30 * result.noise.sd.max())
+    assert large.field.sd.min() > 30 * result.noise.sd.min()
+    said = answer(large)
+    assert ("The model's own error dominates: the solver is off by up to 600\u00a0µT, rms 30 "
+            "times the noise of the readings") in said.trust
+    assert "It falls with a larger mesh.cells_per_side (now" in said.trust
+    assert "block_size_m" not in said.trust
+    near = with_error(30 * result.noise.sd.max(), prior_conflict=0.01)
+    assert near.disagreement == ""
+    far = answer(with_error(30 * result.noise.sd.max(), prior_conflict=9.0))
+    assert "own error dominates" in far.trust
+    assert far.command == "halbach-fe verify STUDY -o DIR"
+    # the controls: an error below the noise
+    small = with_error(0.1 * result.noise.sd.min(), prior_conflict=0.01)
+    assert "their noise and the prior allow" in small.disagreement
+    assert "diagnose" in answer(small).command
+    assert "own error dominates" not in answer(small).trust
