@@ -15,6 +15,7 @@ import tomllib
 from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.block_export import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
@@ -48,6 +49,7 @@ def free_blocks_files(study: Path) -> list[Path]:
 def run(arguments: argparse.Namespace) -> int:
     """Read the map or study, write it in the other format, and report its size."""
     common.keep_input(arguments.output, arguments.input)
+    arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe export"))
     if arguments.format == BLOCKS:
         columns = blocks_table(build_magnet(read_study(arguments.input)))
         common.keep_input(arguments.output, *free_blocks_files(arguments.input))
