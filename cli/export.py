@@ -49,13 +49,14 @@ def free_blocks_files(study: Path) -> list[Path]:
 def run(arguments: argparse.Namespace) -> int:
     """Read the map or study, write it in the other format, and report its size."""
     common.keep_input(arguments.output, arguments.input)
-    arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe export"))
     if arguments.format == BLOCKS:
         columns = blocks_table(build_magnet(read_study(arguments.input)))
         common.keep_input(arguments.output, *free_blocks_files(arguments.input))
+        arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe export"))
         write_free_blocks(columns, arguments.output)
         common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}")
         return 0
+    arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe export"))
     data = read_map(arguments.input)
     export_map(data, arguments.format, arguments.output)
     common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")

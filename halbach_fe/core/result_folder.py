@@ -43,11 +43,11 @@ _OF_RUNS = ("mesh.msh", "meridian.msh", "iron.msh", "regions.json", "meridian-re
 
 WRITES = {
     "solve": ("field_map.*", "readings.csv", "multipoles.csv", "report.html", "geometry.png",
-              "field.png"),
+              "field.png", "stray_field.png"),
     "infer": ("posterior.h5", "prediction.csv", "summary.json", "sampled.json", "sampled.csv",
               "multipoles.csv", "study.updated.toml", "report.html", "blocks.png",
               "contraction.png", "maps.png", "profile*.png", "quantiles.png", "relative_error.png",
-              "residual*.png"),
+              "residual*.png", "stray_field.png"),
     "diagnose": ("diagnosis.json", "diagnosis.html", "diagnosis_*.png", "study.diagnosed.toml"),
     "verify": ("verification.*", "verification_*.png"),
     "multipoles": ("multipoles.*", "multipoles_*.png"),
@@ -291,7 +291,8 @@ def result_folder(
     base, inputs = folder.absolute(), list(inputs)
     with _locked(folder) as file:
         before = _own(file, folder / RECORD)
-        if before is None or not any((folder / name).exists() for name in before.files):
+        if before is None or not any(
+                (folder / name).exists() for name in (*before.files, *before.writing)):
             before = Record(command=command, study=study, kept=before.kept if before else [])
         if (before.command, before.study) != (command, study):
             of_study = f" of study {before.study}" if before.study else ""

@@ -347,13 +347,17 @@ class Homogeneity:
     direction_sd_rad : float
         Standard deviation of its angle, rms over the two directions across it.
     rms_ppm, peak_to_peak_ppm : float
-        Of the field of the mean magnetizations.
+        Of the field of the mean magnetizations; of what was measured the medians of the ranges:
+        the mean field lacks what is not known, so that it may be below all that is likely.
     rms_range_ppm, peak_to_peak_range_ppm : tuple of float
         Quantiles 2.5, 50 and 97.5 % of magnets that are drawn from the distribution. They are
         larger than those of the mean field if the distribution is wide, as that of magnets whose
         blocks were not measured.
     harmonics : tuple of Harmonic
         Empty unless the region is a sphere.
+    components : str
+        Names of the components whose size stands for |B|, if the others were not measured; there is
+        no direction then.
     """
 
     mean_T: float
@@ -365,6 +369,7 @@ class Homogeneity:
     rms_range_ppm: tuple[float, float, float]
     peak_to_peak_range_ppm: tuple[float, float, float]
     harmonics: tuple[Harmonic, ...]
+    components: str = ""
 
 
 @dataclass(frozen=True)
@@ -420,20 +425,25 @@ class HomogeneityModel:
     surface_degree: int
 
     @property
+    def nominal_mean(self) -> Floats:
+        """Mean of B (3,) in T over the region, of the nominal magnet."""
+        return np.asarray(self.weights @ self.field(self.response.nominal[:, None])[..., 0])
+
+    @property
     def solver_error_ppm(self) -> float:
         """Rms error bar of the solver for a component, relative to the nominal mean field."""
         field = self.field(self.response.nominal[:, None])[..., 0]
         mean = float(self.weights @ np.linalg.norm(field, axis=1))
         return PPM * float(np.sqrt(np.mean(self.response.error**2))) / mean
 
-    def of(self, parameters: Gaussian, seed: int = 0) -> Homogeneity:
+    def of(self, parameters: Gaussian, seed: int = 0, measured: bool = False) -> Homogeneity:
         """Return the homogeneity for a distribution of the magnetizations in A/m.
 
-        ``seed`` is that of the magnets that are drawn.
+        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`.
         """
         samples = parameters.sample(DRAWS, np.random.default_rng(seed))
         every = self.field(np.vstack([parameters.mean, samples]).T)
-        return self.of_fields(every[..., 0], every[..., 1:])
+        return self.of_fields(every[..., 0], every[..., 1:], measured)
 
     def field(self, magnetizations: Floats) -> Floats:
         """Return B (n, 3, d) in T at the region's points for magnetizations (parameters, d)."""
@@ -442,10 +452,11 @@ class HomogeneityModel:
         return np.asarray(self.response.offset[rows, None] + values).reshape(
             -1, 3, magnetizations.shape[1])
 
-    def of_fields(self, field: Floats, drawn: Floats) -> Homogeneity:
+    def of_fields(self, field: Floats, drawn: Floats, measured: bool = False) -> Homogeneity:
         """Return the homogeneity for a mean field (n, 3) and drawn fields (n, 3, d) in T.
 
-        The n points are those of the region.
+        The n points are those of the region. Of a ``measured`` field the deviations are medians of
+        the drawn ones.
         """
         mean = self.weights @ field
         direction = mean / np.linalg.norm(mean)
@@ -453,10 +464,12 @@ class HomogeneityModel:
         aside = along / np.linalg.norm(along, axis=0) - direction[:, None]
         size, rms, whole = self.deviations(field[..., None])
         sizes, every_rms, every_whole = self.deviations(drawn)
+        ranges = _quantiles(every_rms), _quantiles(every_whole)
         return Homogeneity(
             float(size[0]), float(np.std(sizes)), direction,
-            float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)), float(rms[0]), float(whole[0]),
-            _quantiles(every_rms), _quantiles(every_whole),
+            float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)),
+            *((ranges[0][1], ranges[1][1]) if measured else (float(rms[0]), float(whole[0]))),
+            *ranges,
             self._harmonics(field, drawn, direction, float(size[0]), sizes))
 
     def slices(self, mean: Floats) -> list[Slice]:

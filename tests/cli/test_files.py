@@ -194,7 +194,7 @@ def test_stale_results_go_even_if_nobody_reads_what_is_printed(tmp_path):
 
 
 def of(paths, *words):
-    """A command line; the words study, map, blocks, posterior and folder stand for their files."""
+    """A command line; the words study, map, table, posterior and folder stand for their files."""
     return [str(paths.get(word, word)) for word in words]
 
 
@@ -204,11 +204,11 @@ VERBS_WITH_FOLDERS = {
     "diagnose": ("study", "--measurements", "map", "--effects", "block_missing"),
     "verify": ("study",), "multipoles": ("study", *TARGET), "homogeneity": ("study",),
     "forces": ("study",), "cad": ("framed",), "design": ("rings",), "plan": ("study",),
-    "prior": ("study", "blocks"),
+    "prior": ("study", "table"),
     "shim": ("study", "--measurements", "map", *TARGET, "--swaps", "1"),
-    "shim-tray": ("tray", "--posterior", "posterior"), "sort": ("study", "blocks", *TARGET),
+    "shim-tray": ("tray", "--posterior", "posterior"), "sort": ("study", "table", *TARGET),
     "tolerance": ("study", *TARGET, "--draws", "100"), "demagnetization": ("hot", "--across", "2"),
-    "simulate-measurement": ("study",), "check": ("map",),
+    "simulate-measurement": ("study",), "check": ("volume",),
     "register": ("study", "--measurements", "map"), "report": ("folder",)}
 """Options of every command that writes a folder."""
 
@@ -234,7 +234,10 @@ def paths(tmp_path_factory, getdp):
     inferred = folder / "inferred"
     assert main(of(found, "infer", "study", "--measurements", folder / "map.csv", "-o", inferred,
                    "--json")) == 0
-    return found | {"map": folder / "map.csv", "blocks": folder / "blocks.csv",
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(-0.02, 0.02, 4)]), axis=-1).reshape(-1, 3)
+    write_map(field_map(grid, field_of(magnet.blocks, grid)), folder / "volume.csv")
+    return found | {"map": folder / "map.csv", "table": folder / "blocks.csv",
+                    "volume": folder / "volume.csv",
                     "posterior": inferred / "posterior.h5", "folder": inferred}
 
 

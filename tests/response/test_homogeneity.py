@@ -130,14 +130,12 @@ def test_extremes_lie_between_the_points(generator, region, order):
     dense = np.vstack(list(even_points(region, generator, 200_000)))
     size = np.linalg.norm(magnet.getB(dense), axis=1)
     span = size.max() - size.min()
-    # no point is beyond the extremes but for the local fit, measured 1e-5 of the span; the points
-    # themselves miss up to 6e-4 of it, and 3 % in the middle of a quadrupole, where |B| has a kink
-    assert high[0] > size.max() - 1e-4 * span
-    assert low[0] < size.min() + 1e-4 * span
-    assert high[0] == pytest.approx(size.max(), abs=1e-3 * span)
-    assert low[0] == pytest.approx(size.min(), abs=0.03 * span if order == 2 else 1e-3 * span)
-    sampled = np.linalg.norm(field, axis=1)
-    assert high[0] - low[0] > 1.0005 * np.ptp(sampled)  # the control: the points alone
+    # measured 2e-4 of the span, and 5e-3 at the middle of a quadrupole, where |B| has a kink; the
+    # points alone miss up to 8e-3 and 4e-2 of it
+    assert high[0] == pytest.approx(size.max(), abs=5e-4 * span)
+    assert low[0] == pytest.approx(size.min(), abs=1e-2 * span if order == 2 else 5e-4 * span)
+    if region.shape != "cylinder":  # whose extremes are at its rim, where there are points
+        assert np.ptp(np.linalg.norm(field, axis=1)) < 0.9985 * span  # the control
 
 
 def test_extremes_of_a_field_that_no_fit_follows(generator):
