@@ -127,11 +127,13 @@ def _of_map(found: HomogeneityResult) -> str:
 
 def _misfit(found: HomogeneityResult) -> str:
     """Say what the map does not tell, and that its fit cannot be relied on; nothing if it can."""
-    remarks = " ".join(found.map_remarks)
-    return remarks if found.map_misfit <= POOR or not found.of_map else remarks + (
-        f"{' ' * bool(remarks)}The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings are "
-        "too far apart for the field between them, or noisier than stated. What the map itself has "
-        "is uncertain beyond its error bars.")
+    remarks = list(found.map_remarks)
+    if found.of_map and found.map_misfit > POOR:
+        remarks.append(
+            f"The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings "
+            "are too far apart for the field between them, or noisier than stated. What the map "
+            "itself has is uncertain beyond its error bars.")
+    return " ".join(remarks)
 
 
 def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, bool]:
