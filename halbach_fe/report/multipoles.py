@@ -245,8 +245,8 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     if lacks_main(known):
         size, own = (1e2 * known.main * float(each) for each in (known.sizes[worst], sd))
         place = place_of(model)
-        return (f"{place[0].upper()}{place[1:]}: there is no main multipole, of order {model.main}, "
-                f"but for errors of the blocks, {main_in_words(model, known)}. "
+        return (f"{place[0].upper()}{place[1:]}: there is no main multipole, of order "
+                f"{model.main}, but for errors of the blocks, {main_in_words(model, known)}. "
                 f"The largest other one, of order {known.orders[worst]}, is "
                 f"{with_error(size, own)}\u00a0µ{model.unit} itself.")
     where = "" if alone else (
