@@ -68,16 +68,20 @@ def run(capsys, *arguments, code=0):
     return shown.err if code else json.loads(shown.out)
 
 
-@pytest.mark.parametrize(("angle", "cancels"), [(180.0, True), (0.0, False)])
+@pytest.mark.parametrize(("angle", "cancels"), [(179.9, True), (0.0, False)])
 def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
     """Of rings of opposite fields, as in an undulator, numbers are absolute."""
     document = changed(BASE, prior__mounting_sd_deg=0.5)
     del document["array"]["rings"]
-    document["array"]["ring"] = [{}, {"first_magnetization_angle_deg": angle}]
     study = tmp_path / "study.toml"
+    document["array"]["ring"] = [{}, {"first_magnetization_angle_deg": 180.0}]
     study.write_text(tomlkit.dumps(document))
-    run(capsys, "multipoles", study, "--reference-radius-m", "0.03", "-o", tmp_path / "out",
-        "--json")
+    command = ["multipoles", study, "--reference-radius-m", "0.03", "-o", tmp_path / "out"]
+    assert "ask on a circle at a pole: --at-z-m Z" in run(capsys, *command, code=3)
+    run(capsys, *command, "--at-z-m", "0.017", "--json")  # as the sentence advises
+    document["array"]["ring"] = [{}, {"first_magnetization_angle_deg": angle}]
+    study.write_text(tomlkit.dumps(document))
+    run(capsys, *command, "--json")
     said = page(tmp_path / "out" / "multipoles.html")
     assert ("there is no main multipole, of order 1, but for errors" in said) == cancels
     assert ("Only as absolute numbers" in said) == cancels
