@@ -112,19 +112,6 @@ def test_a_map_of_one_component(generator, tmp_path, errors, axis):
         assert low - (high - low) / 2 - 1e6 * second < rms < high + (high - low) / 2 + 1e6 * second
 
 
-def test_a_part_that_does_not_carry_the_field(generator, tmp_path, errors):
-    """Few readings are held out: what they leave open is not shown beside what the map tells."""
-    document = study().model_dump(mode="json", exclude_defaults=True)
-    document["inference"]["held_out"]["scan_lines_every"] = 40
-    magnet = build_magnet(parse_study(document))
-    found = homogeneity(magnet, Session.open(tmp_path), REGION, data=measured(generator, errors))
-    assert list(found.of_map) == [MAP]
-    (remark,) = found.map_remarks
-    assert remark.startswith("Its held-out part leaves ")
-    write_report(found, tmp_path / "page")
-    assert remark in (tmp_path / "page" / "homogeneity.html").read_text()
-
-
 def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
     """Noise of a tenth shows what harmonics of higher degrees than the fit's do."""
     magnet = build_magnet(study(0.1 * NOISE_T))
