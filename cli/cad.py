@@ -37,8 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
-    plan = cad(magnet, read_blocks(arguments.blocks) if arguments.blocks else None)
+    blocks = read_blocks(arguments.blocks) if arguments.blocks else None
     common.own_folder(arguments, "halbach-fe cad", magnet.name)
+    plan = cad(magnet, blocks)
     with common.progress_bar("solids") as show:
         write_assembly(plan, arguments.output, common.digests(
             {"study file": arguments.study, "blocks": arguments.blocks}), show)

@@ -154,7 +154,7 @@ def run_study(
     arguments = parser.parse_args()
 
     def whole(arguments: argparse.Namespace) -> int:
-        own_folder(arguments, f"study {output}")
+        own_folder(arguments, f"study {output}", solving=True)
         return run(arguments)
 
     return guarded(lambda: with_folder(whole, arguments))
@@ -174,7 +174,9 @@ DESCRIPTIONS = {"study": "study file", "held_out": "held-out map", "order": "ord
 from the latter."""
 
 
-def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> None:
+def own_folder(
+    arguments: argparse.Namespace, command: str, study: str = "", solving: bool = False
+) -> None:
     """Take the output folder for this command and study until the end of the run.
 
     It is called before the first file is written, and after the input was read, so that a refused
@@ -189,7 +191,7 @@ def own_folder(arguments: argparse.Namespace, command: str, study: str = "") -> 
               if isinstance(value, InputFile)]
     named = {word: path for word, path in _given(arguments).items() if path in inputs}
     arguments.at_end.enter_context(result_folder(
-        arguments.output, command, study, inputs, named))
+        arguments.output, command, study, inputs, named, solving))
     arguments.at_end.enter_context(known_paths({
         word: _from_here(path) for word, path in _paths_of(arguments).items()}))
     arguments.at_end.enter_context(known_inputs(_described(arguments)))
@@ -523,7 +525,7 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
 
     getdp = getdp_or_none(arguments.getdp)
     if study is not None:
-        own_folder(arguments, f"halbach-fe {arguments.verb}", study.name)
+        own_folder(arguments, f"halbach-fe {arguments.verb}", study.name, solving=True)
     with progress_bar("solving") as show, ExitStack() as stack:
         opened = Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),

@@ -15,6 +15,7 @@ import tomllib
 from pathlib import Path
 
 from halbach_fe.cli import common
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.block_export import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
@@ -51,9 +52,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.format == BLOCKS:
         columns = blocks_table(build_magnet(read_study(arguments.input)))
         common.keep_input(arguments.output, *free_blocks_files(arguments.input))
+        arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe export"))
         write_free_blocks(columns, arguments.output)
         common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}")
         return 0
+    arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe export"))
     data = read_map(arguments.input)
     export_map(data, arguments.format, arguments.output)
     common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")

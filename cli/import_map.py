@@ -15,6 +15,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.measurement.calibration import HEADER, read_calibration
 from halbach_fe.measurement.field_map import points_of, write_map
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
@@ -37,9 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the file, convert it, write the map, and print how the file was understood."""
-    imported = import_map(arguments.file, declared_format(arguments), arguments.format)
     common.keep_input(arguments.output, arguments.file, *(
         [arguments.calibration] if arguments.calibration else []))
+    arguments.at_end.enter_context(single_file(arguments.output, "halbach-fe import-map"))
+    imported = import_map(arguments.file, declared_format(arguments), arguments.format)
     corrections = {}
     if arguments.calibration:
         if imported.imported.cylindrical:

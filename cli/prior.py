@@ -28,8 +28,9 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
-    prior = prior_from_blocks(magnet, read_blocks(arguments.blocks))
+    table = read_blocks(arguments.blocks)
     common.own_folder(arguments, "halbach-fe prior", magnet.study.name)
+    prior = prior_from_blocks(magnet, table)
     write_prior(magnet, prior, arguments.output)
     if arguments.json:
         common.print_json(prior_summary(magnet, prior))

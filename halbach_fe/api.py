@@ -117,6 +117,8 @@ class HomogeneityResult(ShownInNotebook):
         That of a measured map itself, see `halbach_fe.inference.map_homogeneity`; empty without.
     map_misfit : float
         Noise that the fit of the map finds over the stated one; about 1 if that can be relied on.
+    map_remarks : tuple of str
+        Sentences about what the map does not tell.
 
     Examples
     --------
@@ -135,6 +137,7 @@ class HomogeneityResult(ShownInNotebook):
     stray_field: StrayField | None = None
     of_map: Mapping[str, Homogeneity] = field(default_factory=dict)
     map_misfit: float = 1.0
+    map_remarks: tuple[str, ...] = ()
 
 
 @alone
@@ -307,12 +310,14 @@ def homogeneity(
     check_number("degrees", "homogeneity", degrees, 1, HIGHEST_DEGREE, whole=True)
     model = homogeneity_model(magnet, region or default_region(magnet), session, degrees)
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
-    of_map, misfit = ({}, 1.0) if data is None else map_homogeneity(magnet, data, model)
+    of_map, misfit, remarks = ({}, 1.0, ()) if data is None else map_homogeneity(
+        magnet, data, model)
     return HomogeneityResult(magnet, model, {
-        name: model.of(distribution) for name, distribution in distributions.items()},
+        name: model.of(distribution, measured=name != "prior")
+        for name, distribution in distributions.items()},
         distributions, disagreement_of(posterior),
         stray_field(magnet, session, list(distributions.values())[-1]),
-        of_map, misfit)
+        of_map, misfit, remarks)
 
 
 @alone

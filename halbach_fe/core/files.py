@@ -8,7 +8,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cached_property
 from pathlib import Path, PosixPath
@@ -24,8 +24,11 @@ FULL_BYTES = 10_000_000
 """A disk with less free space is full: programs that met its end have removed some of their files.
 """
 
-_ON_WRITTEN: ContextVar[Callable[[Path], None] | None] = ContextVar("on_written", default=None)
-"""What `telling` has to call, if anything."""
+Writing = Callable[[Path, Path], AbstractContextManager[None]]
+"""A context in which a complete temporary file, the second path, is renamed to the first."""
+
+_WRITING: ContextVar[Writing | None] = ContextVar("writing", default=None)
+"""The context of `telling`, if there is one."""
 
 
 class InputFile(PosixPath):
@@ -103,27 +106,32 @@ def workbook_sentence(where: str, program: str) -> str:
 
 
 @contextmanager
-def telling(on_written: Callable[[Path], None]) -> Iterator[None]:
-    """Call a function with the path of every file that `atomic` has written within the block.
+def telling(writing: Writing) -> Iterator[None]:
+    """Rename every file that `atomic` writes within the block in a context, which may refuse it.
 
     Examples
     --------
-    >>> with telling(lambda path: print(path.name)):
+    >>> @contextmanager
+    ... def said(path: Path, temporary: Path) -> Iterator[None]:
+    ...     print(path.name, temporary.read_text())
+    ...     yield
+    >>> with telling(said):
     ...     write_text(Path("note.txt"), "text")
-    note.txt
+    note.txt text
     """
-    token = _ON_WRITTEN.set(on_written)
+    token = _WRITING.set(writing)
     try:
         yield
     finally:
-        _ON_WRITTEN.reset(token)
+        _WRITING.reset(token)
 
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` when the block succeeds.
 
-    A link at ``path`` is replaced, not followed. Who may read the file depends on the umask.
+    A link at ``path`` is replaced, not followed, unless `telling` refuses it. Who may read the file
+    depends on the umask.
 
     Raises
     ------
@@ -137,16 +145,15 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.open("xb").close()
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror}.") from None
+    writing = _WRITING.get()
     try:
         yield temporary
-        temporary.replace(path)
+        with writing(path, temporary) if writing else nullcontext():
+            temporary.replace(path)
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
     finally:
         temporary.unlink(missing_ok=True)
-    on_written = _ON_WRITTEN.get()
-    if on_written is not None:
-        on_written(path)
 
 
 def _write_bytes(content: bytes, path: Path) -> None:

@@ -3,13 +3,16 @@
 The file run.json in the folder names both, what the run read, and the results that runs have
 written there. A later run of the same command and study replaces them, and removes those that it
 did not write again: a table that the study no longer asks for would pass for a result of the study
-as it is. Another command or study is refused. While a run goes on, it locks the file; functions of
-the Python interface lock it too.
+as it is. Another command or study is refused, and so is a folder with any other file of a name that
+the command writes, or with a result that somebody has changed. While a run goes on, it locks the
+file; functions of the Python interface lock it too. A single file, which some commands write, has
+its record beside it, see `single_file`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -34,6 +37,47 @@ RECORD = "run.json"
 KEPT = ("*.msh", "*regions.json", "response.h5", "response-*.npy", "chains.nc")
 """Files that a later run may read instead of writing them again; each is verified when it is."""
 
+_OF_RUNS = ("mesh.msh", "meridian.msh", "iron.msh", "regions.json", "meridian-regions.json",
+            "iron-regions.json", "response.h5", "response-*.npy", "chains.nc", "getdp-*")
+"""Those of them that a command writes into its folder itself, and the folders of GetDP's runs."""
+
+WRITES = {
+    "solve": ("field_map.*", "readings.csv", "multipoles.csv", "report.html", "geometry.png",
+              "field.png", "stray_field.png"),
+    "infer": ("posterior.h5", "prediction.csv", "summary.json", "sampled.json", "sampled.csv",
+              "multipoles.csv", "study.updated.toml", "report.html", "blocks.png",
+              "contraction.png", "maps.png", "profile*.png", "quantiles.png", "relative_error.png",
+              "residual*.png", "stray_field.png"),
+    "diagnose": ("diagnosis.json", "diagnosis.html", "diagnosis_*.png", "study.diagnosed.toml"),
+    "verify": ("verification.*", "verification_*.png"),
+    "multipoles": ("multipoles.*", "multipoles_*.png"),
+    "homogeneity": ("homogeneity.*", "harmonics.csv", "harmonics.png", "stray_field.png"),
+    "forces": ("forces.*",),
+    "design": ("design.json", "design.html", "rings.csv", "rings.png", "front.png", "slices.png",
+               "study.designed.toml"),
+    "cad": ("blocks.step", "blocks.stl", "holder*.step", "holder*.stl", "magnet.step",
+            "assembly.*"),
+    "plan": ("plan.*", "plan_*.png"),
+    "prior": ("prior.*", "prior_*.png"),
+    "shim": ("shim.*", "shim_*.png", "study.shimmed.toml"),
+    "shim-tray": ("shim_tray.*", "before.png", "after.png"),
+    "sort": ("sort.*", "sort_*.png", "blocks.sorted.csv"),
+    "tolerance": ("tolerance.*", "tolerance_*.png"),
+    "demagnetization": ("demagnetization.*", "demagnetization_*.png"),
+    "simulate-measurement": ("blocks.csv", "map.csv", "map.h5", "held-out.csv", "held-out.h5",
+                             "truth/truth.json", "campaign.html", "campaign_*.png"),
+    "check": ("check.*", "check_*.png", "oriented_map.csv", "corrected_map.csv"),
+    "register": ("registration.*", "*/registration.*", "*/page.json", "study.registered.toml"),
+    "report": ("report.html",)}
+"""Names of the results of every command, beside page.json: what it must not find in its folder
+unless it is its own. A name that is missing here is refused only as it is written."""
+
+
+RUNS = "getdp-"
+"""Beginning of the names of run folders of GetDP."""
+
+MOST_NAMED = 5
+"""Largest number of files that a refusal names."""
 
 _HELD: ContextVar[tuple[Path, ...]] = ContextVar("held", default=())
 """The folders that this run, or this thread, has locked."""
@@ -61,6 +105,11 @@ class Record(BaseModel):
         Path of an input by the word that stands for it in commands: STUDY, MAP, BLOCKS, POSTERIOR.
     ended : str
         When the run ended, in ISO 8601 (UTC); empty until it has ended well.
+    kept : list of str or None
+        Those of the files `KEPT` that runs have written; None in records of earlier versions.
+    writing : dict of str to str
+        SHA-256 of a result that is about to appear. A run that is killed then leaves it, or the one
+        before it.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -70,6 +119,8 @@ class Record(BaseModel):
     inputs: dict[str, str] = {}
     named: dict[str, str] = {}
     ended: str = ""
+    kept: list[Annotated[str, AfterValidator(_inside)]] | None = None
+    writing: dict[Annotated[str, AfterValidator(_inside)], str] = {}
 
 
 @dataclass(frozen=True)
@@ -121,14 +172,111 @@ class Results:
         return found
 
 
+class _Writer:
+    """Renames complete files in a folder, and records them; refuses to replace any others.
+
+    Attributes
+    ----------
+    base : Path
+        The folder, as an absolute path.
+    record : Record
+    other : str
+        What a user who is refused may name another of: folder or file.
+    file : BinaryIO, optional
+        The open record; without it nothing can be written, but `refuse` works.
+    written : set of str
+        Names of the results of this run.
+    """
+
+    def __init__(
+        self, base: Path, record: Record, other: str, file: BinaryIO | None = None
+    ) -> None:
+        self.base, self.record, self.other, self.file = base, record, other, file
+        self.written: set[str] = set()
+
+    @contextlib.contextmanager
+    def __call__(self, path: Path, temporary: Path) -> Iterator[None]:
+        """Record a file as the block renames it."""
+        path, record = path.absolute(), self.record
+        if not path.is_relative_to(self.base):
+            yield
+            return
+        self.refuse([path])
+        name = str(path.relative_to(self.base))
+        if _is_kept(path):
+            if record.kept is not None and name not in record.kept:
+                record.kept.append(name)
+                self.save()
+            yield
+            return
+        record.writing[name] = _digest(temporary) or ""
+        self.save()
+        yield
+        record.files[name] = record.writing.pop(name)
+        self.written.add(name)
+        self.save()
+
+    def save(self) -> None:
+        """Write the record in its place, by one call of the system: a run may be killed any time.
+
+        A renamed file would lose the lock. What is left of a longer record is blank.
+        """
+        assert self.file is not None
+        try:
+            content = self.record.model_dump_json(indent=1).encode() + b"\n"
+            padded = content.ljust(os.fstat(self.file.fileno()).st_size)
+            self.file.seek(0)
+            if self.file.write(padded) < len(padded):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self.file.truncate(len(content))
+        except OSError as error:
+            raise OutputError(f"Cannot write {self.file.name}: {error.strerror}.") from None
+
+    def refuse(self, paths: Iterable[Path]) -> None:
+        """Raise OutputError if this run would replace what no run of its own has written."""
+        foreign = [path for path in paths if os.path.lexists(path) and not self._owns(path)]
+        if not foreign:
+            return
+        names = [str(path.relative_to(self.base)) for path in foreign]
+        changed = set(names) <= self.record.files.keys()
+        others = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        raise OutputError(
+            f"File {', '.join(names[:MOST_NAMED])}{others} in folder {self.base} "
+            + (f"changed after `{self.record.command}` had written it" if changed else
+               f"was not written by `{self.record.command}`")
+            + f", which would replace it. Name another {self.other}, or move this elsewhere.")
+
+    def _owns(self, path: Path) -> bool:
+        """Tell whether runs have written what is at a path, and nobody has changed it since."""
+        name, record = str(path.relative_to(self.base)), self.record
+        if path.name.startswith(RUNS):
+            return is_run_folder(path)
+        if path.is_symlink() or not path.is_file():
+            return False
+        if _is_kept(path):
+            return record.kept is None or name in record.kept
+        own = [known[name] for known in (record.files, record.writing) if name in known]
+        return bool(own) and _digest(path) in own
+
+    def remove_stale(self) -> None:
+        """Remove the results of earlier runs that this run, which has ended, did not write."""
+        for name in self.record.files.keys() - self.written:
+            # else somebody has changed it
+            if _digest(self.base / name) == self.record.files.pop(name):
+                (self.base / name).unlink(missing_ok=True)
+        self.record.ended = datetime.now(UTC).isoformat(timespec="seconds")
+        self.save()
+
+
 @contextlib.contextmanager
 def result_folder(
     folder: Path, command: str, study: str, inputs: Iterable[Path] = (),
-    named: Mapping[str, Path] = {},
+    named: Mapping[str, Path] = {}, solving: bool = False,
 ) -> Iterator[None]:
     """Own a folder while the block writes results of a command and a study into it.
 
-    ``named`` are those of the inputs that commands name, see `Record`.
+    ``named`` are those of the inputs that commands name, see `Record`. A block that is ``solving``
+    writes meshes, matrices and run folders of GetDP too.
 
     If the block succeeds, results of earlier runs that it did not write again are removed, unless
     somebody has changed them since.
@@ -137,16 +285,15 @@ def result_folder(
     ------
     OutputError
         If the folder cannot be written, another run is using it, it belongs to another command or
-        study, or one of the files ``inputs`` is a result in it, which this run would replace.
+        study, one of the files ``inputs`` is a result in it, which this run would replace, or it
+        has another file of a name that the command writes.
     """
     base, inputs = folder.absolute(), list(inputs)
     with _locked(folder) as file:
-        before = _read(file)
-        if before is None and _is_json(file):
-            raise OutputError(f"File {folder / RECORD} is not one of halbach-fe, which would "
-                              "replace it. Name another folder, or remove this file.")
-        if before is None or not any((folder / name).exists() for name in before.files):
-            before = Record(command=command, study=study)
+        before = _own(file, folder / RECORD)
+        if before is None or not any(
+                (folder / name).exists() for name in (*before.files, *before.writing)):
+            before = Record(command=command, study=study, kept=before.kept if before else [])
         if (before.command, before.study) != (command, study):
             of_study = f" of study {before.study}" if before.study else ""
             raise OutputError(
@@ -158,33 +305,67 @@ def result_folder(
                 raise OutputError(
                     f"Input {path} is a result of an earlier run in folder {folder}, which this "
                     "run would replace. Name another folder, or copy the input to another place.")
-        record, written = before.model_copy(deep=True), set[str]()
-        record.inputs, record.ended = _inputs(inputs), ""
-        record.named = {word: printable(path, MAX_QUOTED) for word, path in named.items()}
-        _write(file, record)
-
-        def note(path: Path) -> None:
-            path = path.absolute()
-            kept = any(fnmatch(path.name, pattern) for pattern in KEPT)
-            if path.is_relative_to(base) and not kept and (digest := _digest(path)):
-                record.files[str(path.relative_to(base))] = digest
-                written.add(str(path.relative_to(base)))
-                _write(file, record)
-
-        def remove_stale() -> None:
-            for name in record.files.keys() - written:
-                if _digest(base / name) == record.files.pop(name):  # else somebody has changed it
-                    (base / name).unlink(missing_ok=True)
-            record.ended = datetime.now(UTC).isoformat(timespec="seconds")
-            _write(file, record)
-
-        with telling(note):
+        writer = _Writer(base, before.model_copy(deep=True), "folder", file)
+        writer.refuse(_to_write(base, command, solving))
+        writer.record.inputs, writer.record.ended = _inputs(inputs), ""
+        writer.record.named = {
+            word: printable(path, MAX_QUOTED) for word, path in named.items()}
+        writer.save()
+        with telling(writer):
             try:
                 yield
             except BrokenPipeError:  # nobody reads what is printed, but all files are written
-                remove_stale()
+                writer.remove_stale()
                 raise
-        remove_stale()
+        writer.remove_stale()
+
+
+def _to_write(base: Path, command: str, solving: bool) -> Iterator[Path]:
+    """Yield the paths in a folder that a command may write; a study's own may write any result.
+
+    A folder within that has a record of its own belongs to another run.
+    """
+    every = tuple(name for names in WRITES.values() for name in names)
+    for name in (*WRITES.get(command.removeprefix("halbach-fe "), every), "page.json",
+                 *(_OF_RUNS if solving else ())):
+        if "*" not in name:
+            yield base / name
+        else:
+            yield from (path for path in sorted(base.glob(name))
+                        if path.parent == base or not (path.parent / RECORD).exists())
+
+
+def is_run_folder(path: Path) -> bool:
+    """Tell whether a path is the folder of a run of GetDP, which has a problem in it."""
+    return path.is_dir() and not path.is_symlink() and any(path.glob("*.pro"))
+
+
+@contextlib.contextmanager
+def single_file(path: Path, command: str) -> Iterator[None]:
+    """Let a command write one file in the block, but replace only one that it has written itself.
+
+    It is known by its SHA-256 in a hidden file beside it, one of each command in a folder.
+
+    Raises
+    ------
+    OutputError
+        If the file is a result of a run, or the command has not written it as it is.
+    """
+    keep_results(path)
+    whole = path.absolute()
+    notes = whole.with_name(f".{command.replace(' ', '-')}.json")
+    new = Record(command=command, study="", kept=[])
+    _Writer(whole.parent, _record_at(notes) or new, "file").refuse([whole])
+
+    @contextlib.contextmanager
+    def writing(target: Path, temporary: Path) -> Iterator[None]:
+        with _opened(notes, wait=True) as file:
+            writer = _Writer(whole.parent, _own(file, notes) or new, "file", file)
+            with writer(target, temporary):
+                yield
+
+    with telling(writing):
+        yield
 
 
 @contextlib.contextmanager
@@ -237,11 +418,7 @@ def keep_results(path: Path) -> None:
     OutputError
     """
     for folder in path.absolute().parents:
-        try:
-            with _regular(folder / RECORD) as file:
-                record = _read(file)
-        except (OSError, ValueError):
-            continue
+        record = _record_at(folder / RECORD)
         if record and str(path.absolute().relative_to(folder)) in record.files:
             raise OutputError(f"File {path} is a result of `{record.command}`, which this run "
                               "would replace. Name another file.")
@@ -253,11 +430,7 @@ def named_inputs(folder: Path) -> dict[str, Path]:
     Files that are not there any more, or have changed, are left out; so are all of a folder whose
     record cannot be read.
     """
-    try:
-        with _regular(folder / RECORD) as file:
-            record = _read(file)
-    except (OSError, ValueError):
-        return {}
+    record = _record_at(folder / RECORD)
     return {} if record is None else {
         word: Path(path) for word, path in record.named.items()
         if path in record.inputs and _digest(Path(path)) == record.inputs[path]}
@@ -268,11 +441,7 @@ def inputs_behind(path: Path) -> dict[str, str]:
 
     It is empty if the record of the file's folder does not have the file as it is.
     """
-    try:
-        with _regular(path.parent / RECORD) as file:
-            record = _read(file)
-    except (OSError, ValueError):
-        return {}
+    record = _record_at(path.parent / RECORD)
     digest = next(iter(_inputs([path]).values()), None)
     if record is None or digest is None or record.files.get(path.name) != digest:
         return {}
@@ -343,23 +512,24 @@ def _locked(folder: Path) -> Iterator[BinaryIO]:
         finally:
             _HELD.reset(token)
             record = _read(file)
-            if not (record.files if record else os.fstat(file.fileno()).st_size):
+            if not (record.files or record.kept or record.writing if record
+                    else os.fstat(file.fileno()).st_size):
                 path.unlink(missing_ok=True)
                 with contextlib.suppress(OSError):
                     if made:
                         folder.rmdir()
 
 
-def _opened(path: Path) -> BinaryIO:
-    """Open and lock a file, which is created if it does not exist."""
+def _opened(path: Path, wait: bool = False) -> BinaryIO:
+    """Open and lock a file, which is created if it does not exist; ``wait`` until it is free."""
     while True:
         try:
             number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise OutputError(f"Cannot write {path}: {error.strerror}.") from None
-        file = os.fdopen(number, "r+b")
+        file = os.fdopen(number, "r+b", buffering=0)
         try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(number, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             file.close()
             raise OutputError(f"Folder {path.parent} is in use by another run of halbach-fe. Wait "
@@ -380,22 +550,27 @@ def _read(file: BinaryIO) -> Record | None:
         return None
 
 
-def _is_json(file: BinaryIO) -> bool:
-    """Tell whether a file is JSON, which a record is not if its run was killed as it wrote it."""
-    file.seek(0)
+def _record_at(path: Path) -> Record | None:
+    """Return the record at a path; None if there is none that can be read."""
     try:
-        from_json(file.read())
-    except ValueError:
-        return False
-    return True
+        with _regular(path) as file:
+            return _read(file)
+    except (OSError, ValueError):
+        return None
 
 
-def _write(file: BinaryIO, record: Record) -> None:
-    """Write the record in its place: a renamed file would lose the lock."""
-    try:
+def _own(file: BinaryIO, path: Path) -> Record | None:
+    """Return the record in a file, None if it is new or damaged; refuse JSON of other programs."""
+    record = _read(file)
+    if record is None:
         file.seek(0)
-        file.write(record.model_dump_json(indent=1).encode() + b"\n")
-        file.truncate()
-        file.flush()
-    except OSError as error:
-        raise OutputError(f"Cannot write {file.name}: {error.strerror}.") from None
+        with contextlib.suppress(ValueError):
+            from_json(file.read())
+            raise OutputError(f"File {path} is not one of halbach-fe, which would replace it. "
+                              "Name another folder, or remove this file.")
+    return record
+
+
+def _is_kept(path: Path) -> bool:
+    """Tell whether a later run may read a file instead of writing it again."""
+    return any(fnmatch(path.name, pattern) for pattern in KEPT)

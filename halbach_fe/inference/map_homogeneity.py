@@ -7,15 +7,21 @@ covariance that the noise of the readings leaves they give the field in a region
 Terms of the instruments of which the study states a standard deviation are parameters beside them:
 a map by itself does not tell a probe's gain from the field. Beside the field of the nominal and of
 the updated magnet that of the map shows how much the update explains.
+
+Of a map that lacks components the uniform field along these is unknown, and with it |B|. If the
+main field is along components that it has, the size of these is |B| to first order, and is what is
+told; otherwise nothing is. Neither is what the readings leave open for the most part.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import block_diag, solve_triangular
 
 from halbach_fe.core.arrays import Floats
@@ -31,7 +37,8 @@ from halbach_fe.measurement.harmonic_field import (
     fit_readings,
     solid_harmonic_fields,
 )
-from halbach_fe.response.homogeneity import DRAWS, Homogeneity, HomogeneityModel, sphere_points
+from halbach_fe.response.homogeneity import DRAWS, PPM, Homogeneity, HomogeneityModel, sphere_points
+from halbach_fe.study.types import COMPONENTS
 
 WITHIN = 0.75
 """Radius up to which readings are used, relative to that of the free sphere: at its surface the
@@ -52,6 +59,18 @@ POOR = 1.15
 """Noise that a fit finds, relative to the stated one, above which it is not to be relied on: the
 readings are too far apart for the field between them, or noisier than stated."""
 
+OPEN = 0.2
+"""Deviation of |B| that readings leave open, relative to the one that they show, above which they
+do not carry it: how much of it is left then depends on the prior of the amplitudes."""
+
+SEEN = 0.1
+"""Part of the readings' sensitivity from which the field along a direction is measured: above the
+crosstalk of a probe, below a component of its own."""
+
+ALONG = 0.1
+"""Largest part of the main field that is across what was measured, relative to the whole: |B| then
+differs by 0.5 % at most from the size of the rest."""
+
 MAP, HELD_OUT_PART = "map", "map, held-out part"
 """Names of what is fitted: all readings, or those that do not update the magnet."""
 
@@ -59,11 +78,12 @@ MAP, HELD_OUT_PART = "map", "map, held-out part"
 def map_homogeneity(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], model: HomogeneityModel,
     seed: int = 0,
-) -> tuple[dict[str, Homogeneity], float]:
+) -> tuple[dict[str, Homogeneity], float, tuple[str, ...]]:
     """Return the homogeneity that a map has by itself, in the region of a model, and the misfit.
 
     It has the name `MAP`; if the study holds readings out, that of these alone is beside it. The
     misfit is the noise that the fit of all readings finds, relative to the stated one, see `POOR`.
+    What the readings do not tell is left out, and sentences, the third value, say so.
 
     Parameters
     ----------
@@ -86,10 +106,17 @@ def map_homogeneity(
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
     free = _free_radius(magnet, np.array(model.region.centre_m))
-    found = {MAP: _fitted(readings, np.ones_like(held_out), model, free, seed, maps)}
-    if held_out.any():
-        found[HELD_OUT_PART] = _fitted(readings, held_out, model, free, seed, maps)
-    return {name: known for name, (known, _) in found.items()}, found[MAP][1]
+    parts = {MAP: np.ones_like(held_out)} | (
+        {HELD_OUT_PART: held_out} if held_out.any() else {})
+    found, noises, remarks = {}, {}, []
+    for name, chosen in parts.items():
+        what = "The map" if name == MAP else "Its held-out part"
+        known, noises[name], remark = _fitted(readings, chosen, model, free, seed, maps)
+        if known is not None:
+            found[name] = known
+        if remark and (name == MAP or known is None):
+            remarks.append(f"{what} {remark}")
+    return found, noises[MAP], tuple(remarks)
 
 
 def _check_within(readings: Readings, model: HomogeneityModel) -> None:
@@ -110,8 +137,12 @@ def _check_within(readings: Readings, model: HomogeneityModel) -> None:
 def _fitted(
     readings: Readings, chosen: NDArray[np.bool_], model: HomogeneityModel, free_m: float,
     seed: int, maps: Sequence[Map],
-) -> tuple[Homogeneity, float]:
-    """Return the homogeneity of the fit of some readings, and its noise over the stated noise."""
+) -> tuple[Homogeneity | None, float, str]:
+    """Return the homogeneity of the fit of some readings, and its noise over the stated noise.
+
+    The third value is the end of a sentence about what the readings do not tell; if that is the
+    homogeneity, there is none.
+    """
     observation, region = readings.observation, model.region
     centre = np.array(region.centre_m)
     near = np.linalg.norm(observation.points - centre, axis=1) <= WITHIN * free_m
@@ -132,8 +163,47 @@ def _fitted(
     normals = np.random.default_rng(seed).standard_normal((root.shape[1], DRAWS))
     every = np.column_stack([mean, mean[:, None] + root @ normals])
     points = (model.points[:len(model.weights)] - centre) / free_m
-    fields = (_fields(points) @ every).reshape(len(points), 3, -1)
-    return model.of_fields(fields[..., 0], fields[..., 1:]), noise
+    told = _told(operator)
+    fields = np.einsum("ab,nbd->nad", told, (_fields(points) @ every).reshape(len(points), 3, -1))
+    lacking = _lacking(told)
+    main = model.nominal_mean
+    if np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
+        return None, noise, (f"has no {lacking}, along which much of the main field is: it does "
+                             "not tell how homogeneous |B| is.")
+    known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True)
+    left = PPM * _open(fields[..., 1:], known.direction, model.weights) / known.mean_T
+    if left > OPEN * known.rms_ppm:
+        return None, noise, (f"leaves {left:.0f} ppm rms of the field in the region open, of "
+                             f"{known.rms_ppm:.0f} ppm: it does not tell how homogeneous it is.")
+    if not lacking:
+        return known, noise, ""
+    has = " and ".join(f"B{name}" for name in COMPONENTS if f"B{name}" not in lacking)
+    return replace(known, components=has), noise, (
+        f"has no {lacking}. What is said of it is the size of {has} alone, which is |B| to first "
+        "order, as the main field is along it; the direction of the mean of B is not told.")
+
+
+def _told(operator: sparse.csr_array) -> Floats:
+    """Return the projector (3, 3) to the directions along which readings measure the field."""
+    rows = np.stack([np.asarray(operator[:, axis::3].sum(axis=1)).ravel() for axis in range(3)], 1)
+    values, vectors = np.linalg.eigh(rows.T @ rows)
+    along = vectors[:, values > SEEN**2 * values[-1]]
+    return np.asarray(along @ along.T)
+
+
+def _lacking(told: Floats) -> str:
+    """Return the names of the components that are not measured; empty if all are."""
+    return " and ".join(f"B{name}" for name, part in zip(COMPONENTS, np.diag(told), strict=True)
+                        if part < 1 - SEEN)
+
+
+def _open(drawn: Floats, direction: Floats, weights: Floats) -> float:
+    """Return how much the deviation along a direction (3,) varies in drawn fields (n, 3, d), rms
+    over the region, in T.
+    """
+    along = np.einsum("ncd,c->nd", drawn, direction)
+    deviation = along - weights @ along
+    return float(np.sqrt(weights @ np.var(deviation, axis=1)))
 
 
 def _terms(

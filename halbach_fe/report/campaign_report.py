@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 from halbach_fe.core.errors import MAX_QUOTED, MAX_SENTENCE, OutputError, must_be, printable
 from halbach_fe.core.files import as_path, write_text
-from halbach_fe.core.result_folder import keep_results, result_folder
+from halbach_fe.core.result_folder import result_folder, single_file
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.answer import Answer
@@ -338,8 +338,8 @@ def write_campaign_report(campaign: Campaign, output: Path) -> Path:
     """Write the page of a campaign; see `campaign_report`. Return its path."""
     with ExitStack() as stack:
         if output.suffix.lower() in (".html", ".htm"):
-            keep_results(output)
             path = output
+            stack.enter_context(single_file(path, "halbach-fe report"))
         else:
             path = output / PAGE
             stack.enter_context(result_folder(output, "halbach-fe report", campaign.study.name))

@@ -116,22 +116,24 @@ def answer(found: HomogeneityResult) -> Answer:
 
 def _of_map(found: HomogeneityResult) -> str:
     """Say what the map itself has, of readings that did not update the magnet if there are some."""
-    if not found.of_map:
-        return ""
+    remarks = "".join(f". {remark.rstrip('.')}" for remark in found.map_remarks)
+    if not found.of_map or found.map_misfit > POOR:
+        return remarks
     name, known = list(found.of_map.items())[-1]
     low, _, high = map(ppm, known.rms_range_ppm)
-    if found.map_misfit > POOR:
-        return ""
     return (f"; a fit to the {'held-out ' if name == HELD_OUT_PART else ''}readings alone has "
-            f"{ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high})")
+            f"{ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high}){remarks}")
 
 
 def _misfit(found: HomogeneityResult) -> str:
-    """Say that the fit of the map cannot be relied on; nothing if it can."""
-    return "" if found.map_misfit <= POOR else (
-        f"The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings are "
-        "too far apart for the field between them, or noisier than stated. What the map itself has "
-        "is uncertain beyond its error bars.")
+    """Say what the map does not tell, and that its fit cannot be relied on; nothing if it can."""
+    remarks = list(found.map_remarks)
+    if found.of_map and found.map_misfit > POOR:
+        remarks.append(
+            f"The fit of the map finds {found.map_misfit:.2g} times the stated noise: its readings "
+            "are too far apart for the field between them, or noisier than stated. What the map "
+            "itself has is uncertain beyond its error bars.")
+    return " ".join(remarks)
 
 
 def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, bool]:
@@ -179,8 +181,10 @@ def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]
             "rms, 95 % range in ppm": known.rms_range_ppm,
             "peak to peak, 95 % range in ppm": known.peak_to_peak_range_ppm}
         rows.append({
-            "magnet": name, "mean of |B|": _field(known),
-            "direction of the mean B": "none: it cancels"
+            "magnet": f"{name}, {known.components} alone" if known.components else name,
+            "mean of |B|": _field(known),
+            "direction of the mean B": "not measured" if known.components
+            else "none: it cancels"
             if _cancels(known) else direction_in_words(known.direction, known.direction_sd_rad),
             "rms in ppm": ppm(known.rms_ppm),
             "peak to peak in ppm": ppm(known.peak_to_peak_ppm),
@@ -231,6 +235,7 @@ def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
         "stray_field": None if found.stray_field is None else found.stray_field.summary(),
         **{name: plain_homogeneity(known) for name, known in found.by_name.items()},
         "map_misfit": found.map_misfit if found.of_map else None,
+        "map_remarks": list(found.map_remarks),
         "of_map": {name: plain_homogeneity(known) for name, known in found.of_map.items()}}
 
 

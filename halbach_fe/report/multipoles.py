@@ -45,6 +45,10 @@ MARKERS = ("o", "s", "^")
 SHIFT = 0.18
 """Horizontal distance between the markers of different magnets at the same order."""
 
+MAIN_FROM_SD = 3.0
+"""Size of the main multipole, in its standard deviations, up to which there is none."""
+
+
 
 def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, object]:
     """Return the reference of multipoles as entries of a JSON file."""
@@ -186,6 +190,12 @@ def answer(
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
+    if any(lacks_main(list(magnets.values())[-1]) for _, magnets in tables):
+        return Answer(
+            question, said, "Only as absolute numbers: the tables are in units of 1e-4 of a main "
+            "multipole that cancels, as along an undulator, and so is any limit in such units.",
+            "Ask on a circle where there is a main field: set Z to the middle of a pole.",
+            "halbach-fe multipoles STUDY --at-z-m Z -o DIR", sound=False)
     if not measured:
         return Answer(
             question, said, "Yes, for the magnet as ordered, not as it was built: ± is what the "
@@ -217,6 +227,14 @@ def _size_sd(known: Multipoles) -> Floats:
     return np.asarray(np.hypot(*known.sd.reshape(2, -1)) / np.sqrt(2))
 
 
+def lacks_main(known: Multipoles) -> bool:
+    """Tell whether the main multipole is 0 within its error, as of an undulator along its axis.
+
+    Units of 1e-4 of it mean nothing then.
+    """
+    return known.main <= MAIN_FROM_SD * known.main_sd
+
+
 def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     """Describe the last magnet of a table, which is the best known of them, in sentences."""
     model, magnets = table
@@ -224,6 +242,13 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     spread = _size_sd(known)
     worst = int(np.argmax(np.hypot(known.sizes, spread)))  # of nominal magnets all means are small
     sd = float(spread[worst])
+    if lacks_main(known):
+        size, own = (1e2 * known.main * float(each) for each in (known.sizes[worst], sd))
+        place = place_of(model)
+        return (f"{place[0].upper()}{place[1:]}: there is no main multipole, of order "
+                f"{model.main}, but for errors of the blocks, {main_in_words(model, known)}. "
+                f"The largest other one, of order {known.orders[worst]}, is "
+                f"{with_error(size, own)}\u00a0µ{model.unit} itself.")
     where = "" if alone else (
         "Of the field integrated along z, " if model.integrated else f"On {place_of(model)}, ")
     start = f"{where}the largest unwanted multipole " + (

@@ -145,8 +145,8 @@ def answer(prior: MeasuredPrior) -> Answer:
             f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
             + (", most of which is the calibration of the coil, which all blocks share"
                if common > MOSTLY * spread else "") + ". " + (
-                "Ring and slot of every block are known: each has its own measurement."
-                if prior.placed else "Which block is in which slot is not known: all blocks of a "
+                "The place of every block is known: each has its own measurement."
+                if prior.placed else "Which block is in which place is not known: all blocks of a "
                 "type have its mean and spread."))
     odd = [samples.label for samples in prior.types if not samples.normal]
     tested = _tested(prior)
@@ -193,7 +193,13 @@ def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
             "along it, and across it")}, folder)
     write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
                summary=summary, rows=type_table(prior), tested=_tested(prior), answer=answer(prior),
-               parts=parts_table(magnet, prior))
+               parts=parts_table(magnet, prior), types_of_table=_of_table(magnet))
+
+
+def _of_table(magnet: Magnet) -> bool:
+    """Tell whether the types are those of the table of free blocks, see `types_of`."""
+    table = magnet.array.free_blocks
+    return bool(table is not None and table.type and not magnet.study.prior.types)
 
 
 def _mean_of_type(samples: TypeSamples) -> Floats:

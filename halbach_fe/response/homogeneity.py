@@ -1,8 +1,8 @@
 """Homogeneity of the field in a region, with error bars: ppm and spherical harmonics.
 
 Deviations are those of |B| from its mean over the region's volume, relative to that mean. The rms
-is over the volume; the peak-to-peak value is that of all points, of which most are on the surface,
-where a harmonic function has its extremes.
+is over the volume; the peak-to-peak value is that of the extremes between the points too, most of
+which are on the surface, where the component along the field has its extremes: see `extremes`.
 
 In a sphere of radius R the component of B along the mean field is expanded as ``B_n = sum_lm
 (r/R)^l P_lm(cos theta) (a_lm cos(m phi) + b_lm sin(m phi))`` about its centre. The polar axis is
@@ -29,6 +29,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import vector
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.session import Session
@@ -57,8 +58,24 @@ ELONGATED = 1.5
 """Ratio of length and width from which an ellipsoid is integrated in panels along z."""
 
 SURFACE_DEGREE = 36
-"""Least degree of the functions that the points of the surface resolve. They are 10° from each
-other, so that the extremes of a function of degree 2 between them are 1 % larger at most."""
+"""Least degree of the functions that the points of the surface resolve; they are 10° from each
+other."""
+
+STARTS = 2
+"""Number of points from which each extreme is looked for, the best ones that are not near each
+other: of two peaks the higher one may have the lower points."""
+
+LOCAL_DEGREES = 7
+"""Degrees of the solid harmonics about a point that are fitted to the field at the points near."""
+
+NEAR, WEIGHED = 3.0, 1.5
+"""How far these points are from it, and the distance at which one counts less by a factor of e,
+in distances of points from each other."""
+
+TRIED, WIDTH = 7, 1.5
+"""Number of places along each coordinate about a point, up to a distance in distances of points,
+among which the extreme is looked for. A parabola along each coordinate through the best one and its
+neighbours gives the rest."""
 
 HIGHER_DEGREES = 1e-4
 """Size up to which harmonics of a degree that the surface does not resolve are left out, relative
@@ -170,6 +187,32 @@ class Region:
         if self.shape == "cylinder":
             return np.asarray((np.hypot(x, y) <= 1) & (np.abs(z) <= 1))
         return np.asarray(x**2 + y**2 + z**2 <= 1)
+
+    def around(self, unit: Floats, width: float, count: int) -> Floats:
+        """Return places (count, count, count, 3) of the region about one (3,), along coordinates
+        of which one is normal to the surface.
+
+        All are relative to the half axes, and up to ``width`` away, but within the region.
+        """
+        def span(middle: float) -> Floats:
+            return np.linspace(max(middle - width, -1.0), min(middle + width, 1.0), count)
+
+        aside = np.linspace(-width, width, count)
+        if self.shape == "cylinder":
+            radius, angle = np.hypot(*unit[:2]), np.arctan2(unit[1], unit[0])
+            if radius <= 0.5:
+                return np.stack(np.meshgrid(unit[0] + aside, unit[1] + aside, span(unit[2]),
+                                            indexing="ij"), axis=-1)
+            r, phi, z = np.meshgrid(span(radius), angle + aside, span(unit[2]), indexing="ij")
+            return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+        radius = float(np.linalg.norm(unit))
+        if radius <= 0.5:
+            return unit + np.stack(np.meshgrid(*3 * [aside], indexing="ij"), axis=-1)
+        normal = unit / radius
+        across = np.linalg.svd(normal[None])[2][1:]
+        r, first, second = np.meshgrid(span(radius), aside, aside, indexing="ij")
+        direction = normal + first[..., None] * across[0] + second[..., None] * across[1]
+        return r[..., None] * direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
     def points(
         self, surface_degree: int, panel_m: float = np.inf, angular_degree: int = ANGULAR_DEGREE
@@ -304,13 +347,17 @@ class Homogeneity:
     direction_sd_rad : float
         Standard deviation of its angle, rms over the two directions across it.
     rms_ppm, peak_to_peak_ppm : float
-        Of the field of the mean magnetizations.
+        Of the field of the mean magnetizations; of what was measured the medians of the ranges:
+        the mean field lacks what is not known, so that it may be below all that is likely.
     rms_range_ppm, peak_to_peak_range_ppm : tuple of float
         Quantiles 2.5, 50 and 97.5 % of magnets that are drawn from the distribution. They are
         larger than those of the mean field if the distribution is wide, as that of magnets whose
         blocks were not measured.
     harmonics : tuple of Harmonic
         Empty unless the region is a sphere.
+    components : str
+        Names of the components whose size stands for |B|, if the others were not measured; there is
+        no direction then.
     """
 
     mean_T: float
@@ -322,6 +369,7 @@ class Homogeneity:
     rms_range_ppm: tuple[float, float, float]
     peak_to_peak_range_ppm: tuple[float, float, float]
     harmonics: tuple[Harmonic, ...]
+    components: str = ""
 
 
 @dataclass(frozen=True)
@@ -377,20 +425,25 @@ class HomogeneityModel:
     surface_degree: int
 
     @property
+    def nominal_mean(self) -> Floats:
+        """Mean of B (3,) in T over the region, of the nominal magnet."""
+        return np.asarray(self.weights @ self.field(self.response.nominal[:, None])[..., 0])
+
+    @property
     def solver_error_ppm(self) -> float:
         """Rms error bar of the solver for a component, relative to the nominal mean field."""
         field = self.field(self.response.nominal[:, None])[..., 0]
         mean = float(self.weights @ np.linalg.norm(field, axis=1))
         return PPM * float(np.sqrt(np.mean(self.response.error**2))) / mean
 
-    def of(self, parameters: Gaussian, seed: int = 0) -> Homogeneity:
+    def of(self, parameters: Gaussian, seed: int = 0, measured: bool = False) -> Homogeneity:
         """Return the homogeneity for a distribution of the magnetizations in A/m.
 
-        ``seed`` is that of the magnets that are drawn.
+        ``seed`` is that of the magnets that are drawn; ``measured`` as in `of_fields`.
         """
         samples = parameters.sample(DRAWS, np.random.default_rng(seed))
         every = self.field(np.vstack([parameters.mean, samples]).T)
-        return self.of_fields(every[..., 0], every[..., 1:])
+        return self.of_fields(every[..., 0], every[..., 1:], measured)
 
     def field(self, magnetizations: Floats) -> Floats:
         """Return B (n, 3, d) in T at the region's points for magnetizations (parameters, d)."""
@@ -399,10 +452,11 @@ class HomogeneityModel:
         return np.asarray(self.response.offset[rows, None] + values).reshape(
             -1, 3, magnetizations.shape[1])
 
-    def of_fields(self, field: Floats, drawn: Floats) -> Homogeneity:
+    def of_fields(self, field: Floats, drawn: Floats, measured: bool = False) -> Homogeneity:
         """Return the homogeneity for a mean field (n, 3) and drawn fields (n, 3, d) in T.
 
-        The n points are those of the region.
+        The n points are those of the region. Of a ``measured`` field the deviations are medians of
+        the drawn ones.
         """
         mean = self.weights @ field
         direction = mean / np.linalg.norm(mean)
@@ -410,10 +464,12 @@ class HomogeneityModel:
         aside = along / np.linalg.norm(along, axis=0) - direction[:, None]
         size, rms, whole = self.deviations(field[..., None])
         sizes, every_rms, every_whole = self.deviations(drawn)
+        ranges = _quantiles(every_rms), _quantiles(every_whole)
         return Homogeneity(
             float(size[0]), float(np.std(sizes)), direction,
-            float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)), float(rms[0]), float(whole[0]),
-            _quantiles(every_rms), _quantiles(every_whole),
+            float(np.sqrt(np.mean(np.sum(aside**2, axis=0)) / 2)),
+            *((ranges[0][1], ranges[1][1]) if measured else (float(rms[0]), float(whole[0]))),
+            *ranges,
             self._harmonics(field, drawn, direction, float(size[0]), sizes))
 
     def slices(self, mean: Floats) -> list[Slice]:
@@ -432,8 +488,9 @@ class HomogeneityModel:
         size = np.linalg.norm(fields, axis=1)
         mean = self.weights @ size
         deviation = PPM * (size / mean - 1)
-        return (mean, np.sqrt(self.weights @ deviation**2),
-                np.asarray(deviation.max(axis=0) - deviation.min(axis=0)))
+        low, high = extremes(self.region, self.points[:len(size)],
+                             2 * np.pi / (self.surface_degree + 1), fields)
+        return mean, np.sqrt(self.weights @ deviation**2), PPM * (high - low) / mean
 
     def _harmonics(
         self, field: Floats, drawn: Floats, direction: Floats, size: float, sizes: Floats
@@ -449,6 +506,85 @@ class HomogeneityModel:
             "ncd,c->nd", drawn[:self.surface], direction))
         return tuple(Harmonic(*term, float(value), float(sd)) for term, value, sd in zip(
             terms, mean, np.std(every, axis=1), strict=True))
+
+
+def extremes(
+    region: Region, points: Floats, step: float, fields: Floats
+) -> tuple[Floats, Floats]:
+    """Return the least and the largest |B| (d,) in a region, of fields (n, 3, d) at its points.
+
+    Between the points a field is a sum of solid harmonics about the best of them, of which the
+    points near determine the amplitudes. Where such a fit is no better than what it adds, as in a
+    field that varies from point to point, the value at the best point is returned.
+
+    Parameters
+    ----------
+    region : Region
+    points : ndarray, shape (n, 3), in m
+    step : float
+        Distance of the points of the surface from each other, relative to the half axes.
+    fields : ndarray, shape (n, 3, d)
+    """
+    size = np.linalg.norm(fields, axis=1)
+    unit = (points - region.centre_m) / region.half_axes_m
+    found = []
+    for sign in (-1.0, 1.0):
+        left = sign * size
+        value = left.max(axis=0)
+        for _ in range(STARTS):
+            best = left.argmax(axis=0)
+            for start in np.unique(best):
+                own = np.flatnonzero(best == start)
+                value[own] = np.maximum(value[own], _climbed(
+                    region, unit, int(start), step, fields[..., own], sign))
+                near = np.linalg.norm(unit - unit[start], axis=1) <= 2 * step
+                left[np.ix_(near, own)] = -np.inf
+        found.append(sign * value)
+    return found[0], found[1]
+
+
+def _climbed(
+    region: Region, unit: Floats, start: int, step: float, fields: Floats, sign: float
+) -> Floats:
+    """Return ``sign`` times the extremes (d,) of |B| near a point; see `extremes`.
+
+    ``unit`` are the points relative to the half axes of the region.
+    """
+    distance = np.linalg.norm(unit - unit[start], axis=1)
+    unknowns = LOCAL_DEGREES * (LOCAL_DEGREES + 2)
+    near = distance <= max(NEAR * step, np.sort(distance)[min(unknowns, len(unit)) - 1])
+    away = (unit[near] - unit[start]) * region.half_axes_m
+    scale = float(np.linalg.norm(away, axis=1).max())
+    weight = np.exp(-(distance[near] / (WEIGHED * step))**2)[:, None, None]
+    design = solid_harmonic_fields(away / scale, LOCAL_DEGREES)
+    amplitudes = np.linalg.lstsq((weight * design).reshape(-1, unknowns),
+                                 (weight * fields[near]).reshape(-1, fields.shape[2]),
+                                 rcond=None)[0]
+    rest = np.linalg.norm(weight * (fields[near] - design @ amplitudes), axis=1).max(axis=0)
+    places = region.around(unit[start], WIDTH * step, TRIED).reshape(-1, 3) - unit[start]
+    found = sign * np.linalg.norm(solid_harmonic_fields(
+        places * region.half_axes_m / scale, LOCAL_DEGREES) @ amplitudes, axis=1)
+    value = _vertex(found.reshape(*3 * [TRIED], -1))
+    sampled = sign * np.linalg.norm(fields[start], axis=0)
+    return np.where(value - sampled > rest, value, sampled)
+
+
+def _vertex(values: Floats) -> Floats:
+    """Return the largest values (d,) of functions at the points of a cube (k, k, k, d), with what
+    a parabola along each axis adds.
+    """
+    size, every = values.shape[0], np.arange(values.shape[3])
+    best = np.array(np.unravel_index(values.reshape(-1, len(every)).argmax(axis=0), 3 * (size,)))
+    middle = values[(*best, every)]
+    total = middle.copy()
+    for axis in range(3):
+        before, after = best.copy(), best.copy()
+        before[axis], after[axis] = best[axis] - 1, np.minimum(best[axis] + 1, size - 1)
+        low, high = values[(*before, every)], values[(*after, every)]
+        bend = 2 * middle - low - high
+        inside = (best[axis] > 0) & (best[axis] < size - 1) & (bend > 0)
+        total += np.where(inside, (high - low)**2 / (8 * np.where(inside, bend, 1.0)), 0.0)
+    return total
 
 
 def real_harmonics(

@@ -470,7 +470,8 @@ def _turn(magnet: Magnet, row: Complexes, model: Response) -> float:
         raise StudyError(must_be(
             "`array`", f"study {magnet.name}",
             f"that of a magnet with a multipole of order {magnet.array.multipole_order}",
-            "a magnet without it", "Check multipole_order and its exceptions."))
+            "a magnet without it", "Check multipole_order and its exceptions; of an undulator, "
+            "whose field cancels along z, ask on circles at poles: --at-z-m Z."))
     return float(np.angle(own)) / magnet.array.multipole_order
 
 

@@ -6,6 +6,7 @@ runs are kept, so that a run can be repeated by hand.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import threading
@@ -21,6 +22,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import GetDPError, NotConvergedError, OutputError
 from halbach_fe.core.files import is_full, make_folder
 from halbach_fe.core.pace import Progress
+from halbach_fe.core.result_folder import is_run_folder
 from halbach_fe.core.temporary_files import remove_orphans, temporary_path
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import Job
@@ -235,8 +237,9 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
 
 
 def _replace(folder: Path, target: Path) -> None:
-    """Rename a folder to ``target``, and remove an older folder or a link of that name."""
-    if target.is_symlink():
-        target.unlink()
+    """Rename a folder to ``target``, and remove the folder of an older run of that name."""
+    if os.path.lexists(target) and not is_run_folder(target):
+        raise OutputError(f"{target} is no folder of a run of GetDP, which would replace it. Name "
+                          "another folder, or move this to another place.")
     shutil.rmtree(target, ignore_errors=True)
     folder.rename(target)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from dataclasses import dataclass, replace
@@ -120,7 +121,7 @@ def write_new_study(path: Path, magnet: MagnetTemplate) -> None:
     OutputError
         If the file exists already, or cannot be written.
     """
-    if path.exists():
+    if os.path.lexists(path):
         raise OutputError(must_be("path", "new study", "a file that does not exist yet",
                                   f"'{path}'", "Choose another name, or remove it."))
     text = new_study(path.stem, magnet, path.parent)

@@ -9,15 +9,25 @@ import os
 import subprocess
 import sys
 import threading
+from fnmatch import fnmatch
 
 import numpy as np
 import pytest
+import tomlkit
 
 from halbach_fe.cli import main
+from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.files import InputFile
-from halbach_fe.core.result_folder import RECORD
+from halbach_fe.core.result_folder import RECORD, WRITES
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
-from tests.conftest import circle
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.study.reader import read_study
+from tests.cli.test_all_keys import BASE, measured_blocks
+from tests.cli.test_cli import refused
+from tests.conftest import changed, circle
 from tests.support.pages import page
 
 STUDY = """
@@ -181,3 +191,109 @@ def test_stale_results_go_even_if_nobody_reads_what_is_printed(tmp_path):
     assert (done.returncode, done.stderr) == (141, b"")
     assert not (out / "old.csv").exists()
     assert "old.csv" not in json.loads((out / "run.json").read_text())["files"]
+
+
+def of(paths, *words):
+    """A command line; the words study, map, table, posterior and folder stand for their files."""
+    return [str(paths.get(word, word)) for word in words]
+
+
+TARGET = ("--reference-radius-m", "0.03")
+VERBS_WITH_FOLDERS = {
+    "solve": ("study",), "infer": ("study", "--measurements", "map"),
+    "diagnose": ("study", "--measurements", "map", "--effects", "block_missing"),
+    "verify": ("study",), "multipoles": ("study", *TARGET), "homogeneity": ("study",),
+    "forces": ("study",), "cad": ("framed",), "design": ("rings",), "plan": ("study",),
+    "prior": ("study", "table"),
+    "shim": ("study", "--measurements", "map", *TARGET, "--swaps", "1"),
+    "shim-tray": ("tray", "--posterior", "posterior"), "sort": ("study", "table", *TARGET),
+    "tolerance": ("study", *TARGET, "--draws", "100"), "demagnetization": ("hot", "--across", "2"),
+    "simulate-measurement": ("study",), "check": ("volume",),
+    "register": ("study", "--measurements", "map"), "report": ("folder",)}
+"""Options of every command that writes a folder."""
+
+WHOLE_RUN = ("solve", "infer", "multipoles", "homogeneity", "forces", "plan", "prior", "sort",
+             "tolerance", "demagnetization", "check", "report", "simulate-measurement", "shim",
+             "diagnose", "cad")
+"""Those that are run to their end; the others take long, and their names are in the same table."""
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory, getdp):
+    """A study with a map, blocks, a posterior, and a folder of results."""
+    folder = tmp_path_factory.mktemp("campaign")
+    found = {"study": folder / "study.toml", "hot": folder / "study.toml",
+             "framed": folder / "framed.toml"}
+    study = changed(BASE, plan__points=3)
+    found["study"].write_text(tomlkit.dumps(study))
+    found["framed"].write_text(tomlkit.dumps(study | {"holder": {}}))
+    magnet = build_magnet(read_study(found["study"]))
+    points = points_from(magnet.study.observation.positions)
+    write_map(field_map(points, field_of(magnet.blocks, points)), folder / "map.csv")
+    write_blocks(measured_blocks(magnet), folder / "blocks.csv")
+    inferred = folder / "inferred"
+    assert main(of(found, "infer", "study", "--measurements", folder / "map.csv", "-o", inferred,
+                   "--json")) == 0
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(-0.02, 0.02, 4)]), axis=-1).reshape(-1, 3)
+    write_map(field_map(grid, field_of(magnet.blocks, grid)), folder / "volume.csv")
+    return found | {"map": folder / "map.csv", "table": folder / "blocks.csv",
+                    "volume": folder / "volume.csv",
+                    "posterior": inferred / "posterior.h5", "folder": inferred}
+
+
+def test_every_verb_is_in_the_table():
+    single_files = {"new", "import-map", "export"}
+    nothing = {"cache", "doctor", "schema", "completion"}  # which write no file of a user's choice
+    assert set(VERBS) == {*VERBS_WITH_FOLDERS, *single_files, *nothing}
+    assert set(WRITES) == set(VERBS_WITH_FOLDERS)
+
+
+@pytest.mark.parametrize("verb", WHOLE_RUN)
+def test_what_each_verb_writes_is_refused_unless_it_is_its_own(paths, tmp_path, capsys, verb):
+    """A table of names that misses one would let a command begin, and stop at its end."""
+    command = of(paths, verb, *VERBS_WITH_FOLDERS[verb], "--json")
+    out = tmp_path / "out"
+    assert main([*command, "-o", str(out)]) == 0, capsys.readouterr().err
+    names = set(json.loads((out / RECORD).read_text())["files"])
+    known = (*WRITES[verb], "page.json")
+    assert {name for name in names if not any(fnmatch(name, own) for own in known)} == set()
+    assert main([*command, "-o", str(out)]) == 0  # its own results are replaced
+    foreign = tmp_path / "foreign"
+    for name in names:
+        (foreign / name).parent.mkdir(parents=True, exist_ok=True)
+        (foreign / name).write_text(f"my own {name}")
+    before = {path: path.read_bytes() for path in foreign.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    code, said = refused([*command, "-o", foreign], capsys)
+    assert code == 8
+    assert sum(name in said for name in names) >= min(len(names), 5)
+    assert {path: path.read_bytes() for path in foreign.rglob("*") if path.is_file()} == before
+
+
+def test_single_files_of_commands(paths, tmp_path, capsys):
+    """A file of the user's is refused by name, a link as well; an own one is replaced."""
+    target = tmp_path / "precious.csv"
+    page = tmp_path / "precious.html"
+    for path, command in (
+            (target, of(paths, "import-map", "map", "-o", target)),
+            (target, of(paths, "export", "map", "--format", "csv", "-o", target)),
+            (target, of(paths, "export", "study", "--format", "blocks", "-o", target)),
+            (page, of(paths, "report", "folder", "-o", page)),
+            (target, of(paths, "new", target))):
+        path.write_text("precious")
+        code, said = refused(command, capsys)
+        assert code == 8
+        assert path.name in said
+        assert path.read_text() == "precious"
+        path.unlink()
+        path.symlink_to(tmp_path / "nowhere")
+        assert refused(command, capsys)[0] == 8
+        path.unlink()
+        assert main(command) == 0
+        if command[0] != "new":
+            assert main(command) == 0
+        path.unlink()
+        capsys.readouterr()
+    code, said = refused(of(paths, "import-map", "map", "-o", "posterior"), capsys)
+    assert code == 8
+    assert "a result of `halbach-fe infer`" in said

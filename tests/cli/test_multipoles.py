@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import tomlkit
 
 from halbach_fe.cli import common, main
 from halbach_fe.geometry.magnet import build_magnet
@@ -14,6 +15,8 @@ from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import read_map
 from halbach_fe.response.multipoles import UNITS
 from halbach_fe.study.reader import read_study
+from tests.cli.test_all_keys import BASE
+from tests.conftest import changed
 from tests.support.pages import page
 
 STUDY = """
@@ -63,6 +66,25 @@ def run(capsys, *arguments, code=0):
     assert main([str(one) for one in arguments]) == code
     shown = capsys.readouterr()
     return shown.err if code else json.loads(shown.out)
+
+
+@pytest.mark.parametrize(("angle", "cancels"), [(179.9, True), (0.0, False)])
+def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
+    """Of rings of opposite fields, as in an undulator, numbers are absolute."""
+    document = changed(BASE, prior__mounting_sd_deg=0.5)
+    del document["array"]["rings"]
+    study = tmp_path / "study.toml"
+    document["array"]["ring"] = [{}, {"first_magnetization_angle_deg": 180.0}]
+    study.write_text(tomlkit.dumps(document))
+    command = ["multipoles", study, "--reference-radius-m", "0.03", "-o", tmp_path / "out"]
+    assert "ask on circles at poles: --at-z-m Z" in run(capsys, *command, code=3)
+    document["array"]["ring"] = [{}, {"first_magnetization_angle_deg": angle}]
+    study.write_text(tomlkit.dumps(document))
+    run(capsys, *command, "--json")
+    said = page(tmp_path / "out" / "multipoles.html")
+    assert ("there is no main multipole, of order 1, but for errors" in said) == cancels
+    assert ("Only as absolute numbers" in said) == cancels
+    assert ("µT m itself" in said.replace("\u00a0", " ")) == cancels
 
 
 def rows_of(path, magnet):

@@ -17,10 +17,14 @@ from halbach_fe.core.errors import OutputError
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import (
     RECORD,
+    WRITES,
+    Record,
+    _Writer,
     finished_results,
     keep_results,
     locked_folder,
     result_folder,
+    single_file,
 )
 
 
@@ -94,6 +98,149 @@ def test_a_run_that_is_killed(tmp_path):
         run(tmp_path, "x.csv", study="b")
     run(tmp_path, "new.csv")
     assert listed(tmp_path) == {RECORD, "new.csv"}
+
+
+IN_BETWEEN = """
+import os, pathlib, signal, sys
+from halbach_fe.core import files
+from halbach_fe.core.result_folder import result_folder
+rename = pathlib.Path.replace
+def killed(self, target):
+    if sys.argv[2] == "after":
+        rename(self, target)
+    os.kill(os.getpid(), signal.SIGKILL)
+with result_folder(pathlib.Path(sys.argv[1]), "solve", "a"):
+    for name in ("mesh.msh", "old.csv"):
+        pathlib.Path.replace = rename if name == "mesh.msh" else killed
+        files.write_text(pathlib.Path(sys.argv[1], name), "of the killed run")
+"""
+
+
+@pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_run_that_is_killed_as_a_file_appears(tmp_path, before, moment):
+    """Its files are its own, whether they are the old ones or the new."""
+    if before:
+        run(tmp_path, "old.csv")
+    subprocess.run([sys.executable, "-c", IN_BETWEEN, str(tmp_path), moment], check=False)
+    with result_folder(tmp_path, "solve", "a", solving=True):
+        for name in ("mesh.msh", "old.csv"):
+            write_text(tmp_path / name, name)
+    assert (tmp_path / "old.csv").read_text() == "old.csv"
+    assert json.loads((tmp_path / RECORD).read_text())["writing"] == {}
+
+
+def place(kind, path, elsewhere):
+    """Put something of a user at a path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "file":
+        path.write_text("precious")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(elsewhere)
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+@pytest.mark.parametrize("command", WRITES)
+def test_what_a_command_has_not_written(tmp_path, command, kind):
+    """It is refused by name before anything is done, and stays as it is."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("precious")
+    for number, pattern in enumerate((*WRITES[command], "page.json", "mesh.msh", "response.h5",
+                                      "response-1.npy", "chains.nc", "getdp-real")):
+        folder = tmp_path / str(number)
+        path = folder / pattern.replace("*", "csv")
+        place(kind, path, elsewhere)
+        with (pytest.raises(OutputError, match=f"{path.name} in folder .* not written by"),
+              result_folder(folder, f"halbach-fe {command}", "a", solving=True)):
+            raise AssertionError("work is done")
+        assert [one for one in folder.rglob("*") if one.name != path.parent.name] == [path]
+        assert elsewhere.read_text() == "precious"
+        os.rename(path, tmp_path / f"{number}-moved")  # as the sentence advises
+        with result_folder(folder, f"halbach-fe {command}", "a", solving=True):
+            write_text(folder / "page.json", "own")
+
+
+def test_a_name_of_no_table_is_refused_as_it_is_written(tmp_path):
+    (tmp_path / "unforeseen.csv").write_text("precious")
+    with pytest.raises(OutputError, match=r"unforeseen\.csv in folder"):
+        run(tmp_path, "unforeseen.csv")
+    assert (tmp_path / "unforeseen.csv").read_text() == "precious"
+    assert listed(tmp_path) == {"unforeseen.csv"}
+
+
+def test_results_that_somebody_has_changed(tmp_path):
+    """What was edited is somebody's work; the command says so and does not begin."""
+    run(tmp_path, "report.html", "readings.csv", command="halbach-fe solve")
+    (tmp_path / "readings.csv").write_text("edited by hand")
+    with pytest.raises(OutputError, match=r"readings\.csv .* changed after `halbach-fe solve` had"):
+        run(tmp_path, "report.html", command="halbach-fe solve")
+    (tmp_path / "readings.csv").rename(tmp_path / "mine.csv")
+    run(tmp_path, "report.html", "readings.csv", command="halbach-fe solve")
+    assert (tmp_path / "mine.csv").read_text() == "edited by hand"
+
+
+def test_a_record_of_an_earlier_version(tmp_path):
+    """It does not list meshes and matrices, which are then taken for those of its runs."""
+    run(tmp_path, "report.html")
+    record = json.loads((tmp_path / RECORD).read_text())
+    del record["kept"], record["writing"]
+    (tmp_path / RECORD).write_text(json.dumps(record))
+    (tmp_path / "mesh.msh").write_text("of the earlier run")
+    with result_folder(tmp_path, "solve", "a", solving=True):
+        write_text(tmp_path / "mesh.msh", "new")
+
+
+def test_a_shorter_record_is_valid_at_every_moment(tmp_path):
+    """It is written over the longer one, of which blanks are left until the file is cut."""
+    run(tmp_path, *(f"{number}.csv" for number in range(500)))
+    whole = (tmp_path / RECORD).stat().st_size
+    seen = []
+
+    def look(file, length):
+        seen.append(json.loads((tmp_path / RECORD).read_text()))
+        os.ftruncate(file.fileno(), length)
+
+    record = Record(command="solve", study="a")
+    with open(tmp_path / RECORD, "r+b", buffering=0) as file:
+        class Looking:
+            def __getattr__(self, name):
+                return (lambda length: look(file, length)) if name == "truncate" else getattr(
+                    file, name)
+
+        _Writer(tmp_path, record, "folder", Looking()).save()
+    assert seen == [record.model_dump()]
+    assert (tmp_path / RECORD).stat().st_size < whole
+
+
+def test_single_files(tmp_path):
+    """A command replaces the file that it has written, unless it was changed; no other one."""
+    def one(path, text, command="halbach-fe import-map"):
+        with single_file(path, command):
+            write_text(path, text)
+
+    path = tmp_path / "map.csv"
+    one(path, "first")
+    one(path, "second")
+    one(tmp_path / "other.csv", "other")
+    for command in ("halbach-fe export", "halbach-fe import-map"):
+        if command == "halbach-fe import-map":
+            path.write_text("edited")
+        before = path.read_text()
+        with pytest.raises(OutputError, match=r"map\.csv in folder .* Name another file"):
+            one(path, "third", command)
+        assert path.read_text() == before
+    run(tmp_path / "out", "posterior.h5", command="halbach-fe infer")
+    with pytest.raises(OutputError, match="a result of `halbach-fe infer`"):
+        one(tmp_path / "out" / "posterior.h5", "map")
+    link = tmp_path / "link.csv"
+    link.symlink_to(tmp_path / "other.csv")
+    with pytest.raises(OutputError, match=r"link\.csv"):
+        one(link, "third")
+    (tmp_path / "response.h5").write_text("mine")  # no file of this command is kept
+    with pytest.raises(OutputError, match=r"response\.h5"):
+        one(tmp_path / "response.h5", "third")
 
 
 def test_two_runs_at_once(tmp_path):

@@ -77,6 +77,41 @@ def test_beside_the_true_field(generator, tmp_path, errors):
     assert np.sqrt(np.mean(score**2)) > 20
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_map_of_one_component(generator, tmp_path, errors, axis):
+    """Along the main field it tells |B| to first order; across it, nothing."""
+    magnet = build_magnet(study())
+    data = measured(generator, errors)
+    data["B_T"].values[:, [other for other in range(3) if other != axis]] = np.nan
+    found = homogeneity(magnet, Session.open(tmp_path), REGION, data=data)
+    points, weights, _ = region_points(magnet, REGION)
+    field = true_field(1, points, errors=errors)
+    size = np.linalg.norm(field, axis=1)
+    mean = float(weights @ size)
+    rms = 1e6 * float(np.sqrt(weights @ (size / mean - 1)**2))
+    main = int(np.argmax(np.abs(weights @ field)))
+    write_report(found, tmp_path / "page")
+    page = (tmp_path / "page" / "homogeneity.html").read_text()
+    if axis != main:
+        assert not found.of_map
+        assert "does not tell how homogeneous" in page
+        return
+    known = found.of_map[MAP]
+    assert known.components == f"B{'xyz'[axis]}"
+    assert f"map, B{'xyz'[axis]} alone" in page
+    assert "the direction of the mean of B is not told" in page
+    # what lies across adds (B_across / B)^2 / 2 to |B|
+    across = np.linalg.norm(np.delete(field, axis, axis=1), axis=1)
+    second = float(np.max(across**2 / size**2)) / 2
+    assert known.mean_T == pytest.approx(mean, abs=4 * known.mean_sd_T + second * mean)
+    assert known.mean_sd_T < 1e-4 * mean  # which was ten times the field
+    for each in found.of_map.values():
+        low, middle, high = each.rms_range_ppm
+        assert each.rms_ppm == middle  # no estimate is outside of its own range
+        assert each.peak_to_peak_ppm == each.peak_to_peak_range_ppm[1]
+        assert low - (high - low) / 2 - 1e6 * second < rms < high + (high - low) / 2 + 1e6 * second
+
+
 def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
     """Noise of a tenth shows what harmonics of higher degrees than the fit's do."""
     magnet = build_magnet(study(0.1 * NOISE_T))
