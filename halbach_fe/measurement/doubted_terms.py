@@ -26,8 +26,9 @@ FACTOR_OFF = 0.1
 """Part by which readings must differ in size from the model for their unit to be suspected: blocks
 of another grade are a few per cent off."""
 
-NEAR_FACTOR = 0.02
-"""Part by which a factor may differ from that of a known error: blocks of one batch are 1 % off."""
+NEAR_FACTOR = 0.05
+"""Part by which a factor may differ from that of a known error: blocks of another batch or
+temperature are a few per cent off."""
 
 FACTORS = {
     1e-4: "as if numbers in T were taken for G", 1e-3: "as if numbers in T were taken for mT",
@@ -69,12 +70,23 @@ class Term:
         return abs(self.value) / self.prior_sd if self.prior_sd else 0.0
 
     @property
+    def size(self) -> str:
+        """Its change, for people."""
+        unit, factor = UNITS[self.unit]
+        sign = "\u2212" if self.value < 0 else "+"
+        return f"{sign}{decimals(factor * abs(self.value))}\u00a0{unit}"
+
+    @property
+    def known(self) -> str:
+        """What was known of it before, for people."""
+        unit, factor = UNITS[self.unit]
+        return f"±\u00a0{decimals(factor * self.prior_sd, 2)}\u00a0{unit}"
+
+    @property
     def in_words(self) -> str:
         """The term with its prior, for people."""
-        unit, factor = UNITS[self.unit]
-        value = f"{factor * self.value:+.3g}".replace("-", "\u2212")
-        return (f"{self.name} by {value}\u00a0{unit}, where ±\u00a0{factor * self.prior_sd:.2g} "
-                f"{unit} was known before ({decimals(self.distance, 2)} times that)")
+        return (f"{self.name} by {self.size}, where {self.known} was known before "
+                f"({decimals(self.distance, 2)} standard deviations)")
 
     def plain(self) -> dict[str, object]:
         """Return it as plain data."""
@@ -166,11 +178,16 @@ def factor_in_words(factor: float) -> str:
     """Say that readings are a factor times the field of the model; nothing if they are not."""
     if abs(factor - 1) < FACTOR_OFF:
         return ""
-    known = next((f" ({words})" for value, words in FACTORS.items()
-                  if abs(factor / value - 1) < NEAR_FACTOR), "")
+    known = known_factor(factor)
     return (f"The readings are {decimals(factor)} times the field of the magnet as it was ordered"
-            f"{known}: look at their unit, sign and factor in the file, and at the remanence in the"
+            f"{f' ({known})' if known else ''}: look at their unit, sign and factor in the file, and at the remanence in the"
             " study, first.")
+
+
+def known_factor(factor: float) -> str:
+    """Return what error of a file a factor is near to, in words; nothing if none."""
+    return next((words for value, words in FACTORS.items()
+                 if abs(factor / value - 1) < NEAR_FACTOR), "")
 
 
 def factor_of(readings: Floats, field: Floats) -> float:

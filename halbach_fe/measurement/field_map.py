@@ -103,7 +103,8 @@ def refuse_undirected(data: xr.Dataset) -> None:
             f"column {UNDIRECTED_COLUMN}", f"map {data.encoding.get('source', '')}".rstrip(),
             f"named {', '.join(FIELD_COLUMNS[:2])} or {FIELD_COLUMNS[2]}",
             "a component of which nobody has said which it is", "If you do not know it either, "
-            "halbach-fe register tries all three and writes the map of the one that it finds."))
+            "halbach-fe register of this map alone tries all three and writes the map of the one "
+            "that it finds."))
 
 
 def readings_sha256(data: xr.Dataset) -> str:
