@@ -37,6 +37,9 @@ FACTORS = {
     1e4: "as if numbers in G were taken for T"}
 """Ratios of readings to fields that errors of a file make."""
 
+ALL_BLOCKS = "strength of all blocks together"
+"""Name of the mean deviation of all blocks."""
+
 MOST_NAMED = 5
 """Largest number of doubted terms that a sentence names."""
 
@@ -85,6 +88,11 @@ class Term:
     @property
     def in_words(self) -> str:
         """The term with its prior, for people."""
+        if self.name == ALL_BLOCKS:
+            return (f"the blocks would have to be {decimals(100 * abs(self.value))}\u00a0% "
+                    f"{'weaker' if self.value < 0 else 'stronger'} than they were ordered "
+                    f"({decimals(self.distance, 2)} standard deviations of a block, "
+                    f"{self.known})")
         return (f"{self.name} by {self.size}, where {self.known} was known before "
                 f"({decimals(self.distance, 2)} standard deviations)")
 
@@ -114,7 +122,7 @@ def doubts_in_words(found: Sequence[Term]) -> str:
     if not found:
         return ""
     more = len(found) - MOST_NAMED
-    return ("For that the fit had to change, far beyond what was known before: " + "; ".join(
+    return ("For that these would have to be changed far beyond what was known before: " + "; ".join(
         one.in_words for one in found[:MOST_NAMED]) + (
         f"; and {more} more" if more > 0 else "") + ".")
 
@@ -164,7 +172,7 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
     axes = nominal[there] / size[there, None]
     along = np.sum(axes * change, axis=1)
     own = float(np.sqrt(np.mean(np.sum(axes**2 * sd**2, axis=1))))
-    common = Term("strength of all blocks together", "", float(along.mean()), own)
+    common = Term(ALL_BLOCKS, "", float(along.mean()), own)
     if found := doubts([common], sd.size):
         return found
     away = np.abs(change) / np.where(sd > 0, sd, np.inf)

@@ -26,7 +26,13 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.pace import Pace, Progress
-from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of
+from halbach_fe.measurement.doubted_terms import doubted_from
+from halbach_fe.measurement.field_map import (
+    check_magnitudes,
+    checked_map,
+    points_of,
+    refuse_undirected,
+)
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,
@@ -96,10 +102,6 @@ WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
 
-PLAUSIBLE = 4.0
-"""Prior standard deviations beyond which no instrument is. Such a fit explains what is no error of
-an instrument."""
-
 DETERMINED = 0.5
 """A parameter is determined if its standard deviation is below this part of its prior one."""
 
@@ -159,7 +161,7 @@ class InstrumentTerm:
     determined : bool
         Whether the map tells more about it than its prior.
     plausible : bool
-        Whether an instrument may have that value.
+        Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
     predictive : bool
         Whether scan lines that are left out are predicted better with it.
     """
@@ -369,6 +371,7 @@ def check_map(
     True
     """
     data = checked_map(data, "`data`")
+    refuse_undirected(data)
     check_magnitudes(data)
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
@@ -642,13 +645,15 @@ def _terms(fitted: ProbeFit, beyond: float, shares: Floats) -> tuple[InstrumentT
     value, found = fitted.instrument * fitted.prior_sd, []
     scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
 
+    limit = doubted_from(len(fitted.prior_sd))
+
     def add(name: str, unit: str, factor: float, weights: dict[int, float]) -> None:
         row = np.zeros(len(value))
         row[list(weights)] = factor * np.array(list(weights.values()))
         sd = beyond * float(np.sqrt(row @ scaled @ row))
         prior = float(np.linalg.norm(row * fitted.prior_sd))
         found.append(InstrumentTerm(name, unit, float(row @ value), sd, sd < DETERMINED * prior,
-                                    abs(float(row @ value)) <= PLAUSIBLE * prior, prior > 0))
+                                    abs(float(row @ value)) <= limit * prior, prior > 0))
 
     for sensor, along in product(range(3), repeat=2):
         add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",

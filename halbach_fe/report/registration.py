@@ -91,6 +91,12 @@ NOT_AT_REST = (
     "farther away than the error bars say.")
 
 
+USE_ANY = (
+    " The field that infer finds at the places of the map is the same in all of them, so that any "
+    "may be used. Only the names of blocks are exchanged, which matters if you look for one block "
+    "or give measured blocks (--blocks): then find out by a mark on the magnet which pose is the "
+    "real one.")
+
 CERTAIN_SD = 3.0
 """Standard deviations up to which a pose or an error of a probe counts as zero: of some 25 such
 numbers that are zero, one is farther away in one of 15 maps."""
@@ -311,10 +317,7 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
         said.append(
             f"{others} {'predicts' if one else 'predict'} the same readings, because the nominal "
             "magnet is the same after the turn from one pose to the other: no reading can tell "
-            "them apart. The field that infer finds at the places of the map is the same in all "
-            "of them, so that any may be used. Only the names of blocks are exchanged, which "
-            "matters if you look for one block or give measured blocks (--blocks): then find out "
-            "by a mark on the magnet which pose is the real one.")
+            "them apart." + (USE_ANY if is_sound(found[0]) else ""))
     elif alike:
         said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
                     "how the map was measured which one is real.")
