@@ -206,14 +206,13 @@ def _is_of_the_file(best: Registration) -> bool:
 def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
     """Return the next step and its command after a fit with doubts."""
     again = f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR"
-    alone = len(_measured(best)) == 1 and not best.component
-    if factor_in_words(best.factor) and (known_factor(best.factor) or not alone):
-        return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
-                "instrument.flux_density_unit_T in the study), and register it again.", again)
-    if alone:
+    if len(_measured(best)) == 1 and not best.component:
         return (f"Is the component really B{_measured(best)[0]}, along the map's own axes? If that "
                 f"is not certain, name its column {UNDIRECTED_COLUMN} (import-map: --component "
                 "unknown), and register finds which one it is.", again)
+    if factor_in_words(best.factor):
+        return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
+                "instrument.flux_density_unit_T in the study), and register it again.", again)
     return ("Look whether rows, axes, components and units of the map are what its columns say "
             "(halbach-fe check does, for maps of a volume), and state in [instrument_sd] if less "
             "is known of the probe. Then register it again.", again)
