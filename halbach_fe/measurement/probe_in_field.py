@@ -440,7 +440,7 @@ def scatter_of(gradient: Floats, residual: Floats) -> Scatter:
     do not follow, near edges of magnets, grows faster. Then the group of readings in which the
     least is left for each T/m tells what positions may be at most: everything else only adds.
     """
-    noise, displaced = noise_of(gradient, residual)
+    noise, displaced = map(float, noise_of(gradient, residual))
     if not displaced:
         return Scatter(noise, 0.0)
     steepness, squares = np.sum(gradient**2, axis=2).ravel(), residual.ravel()**2

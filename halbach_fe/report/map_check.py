@@ -124,7 +124,9 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 "as where the field varies more between neighbouring readings than the fit "
                 "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
                 "repeatedly at one place.")
-    noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
+    noise = ("The noise of a reading is "
+             f"{'at most ' if check.position_noise_at_most else ''}"
+             f"{flux_density(check.noise_T, 2)}")
     where = "put that into the study as sigma_T, unless you know better"
     if check.is_displaced:
         return (f"{noise}, and where the field is steep, readings are off as if their positions "
