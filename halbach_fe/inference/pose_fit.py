@@ -340,7 +340,7 @@ class PoseFit:
             self._doubts(scaled, blocks), self._factor(pose, values))
 
     def _doubts(self, scaled: Floats, blocks: Gaussian) -> tuple[Term, ...]:
-        """Return what a fit has taken far from its prior, see `halbach_fe.measurement.doubted_terms`.
+        """Return the terms that a fit has taken far from their priors.
 
         ``scaled`` (p,) are its parameters less their prior means, in prior standard deviations.
         """

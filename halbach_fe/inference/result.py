@@ -430,7 +430,7 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def _doubted(self) -> str:
-        """Sentences about `doubts`, and about a factor of the readings; nothing if there are none."""
+        """Sentences about `doubts` and a factor of the readings; nothing if there are none."""
         chosen = ~self.held_out
         factor = factor_of(self.readings[chosen], self.prediction_prior.mean[chosen])
         said = [doubts_in_words(self.doubts), factor_in_words(factor) if self.doubts else ""]

@@ -122,9 +122,9 @@ def doubts_in_words(found: Sequence[Term]) -> str:
     if not found:
         return ""
     more = len(found) - MOST_NAMED
-    return ("For that these would have to be changed far beyond what was known before: " + "; ".join(
-        one.in_words for one in found[:MOST_NAMED]) + (
-        f"; and {more} more" if more > 0 else "") + ".")
+    named = "; ".join(one.in_words for one in found[:MOST_NAMED])
+    return ("For that these would have to be changed far beyond what was known before: "
+            f"{named}{f'; and {more} more' if more > 0 else ''}.")
 
 
 def words_of(name: str) -> tuple[str, str]:
@@ -186,10 +186,10 @@ def factor_in_words(factor: float) -> str:
     """Say that readings are a factor times the field of the model; nothing if they are not."""
     if abs(factor - 1) < FACTOR_OFF:
         return ""
-    known = known_factor(factor)
+    known = f" ({words})" if (words := known_factor(factor)) else ""
     return (f"The readings are {decimals(factor)} times the field of the magnet as it was ordered"
-            f"{f' ({known})' if known else ''}: look at their unit, sign and factor in the file, and at the remanence in the"
-            " study, first.")
+            f"{known}: look at their unit, sign and factor in the file first, and at the remanence in "
+            "the study.")
 
 
 def known_factor(factor: float) -> str:

@@ -131,16 +131,17 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
     if check.is_displaced:
         return (f"{noise}, and where the field is steep, readings are off as if their positions "
                 f"were {_length(check.position_noise_m)} off, at a spacing of "
-                f"{_length(check.spacing_m)}. That is no noise of positions: rows of the map are at "
-                "other places than it says (columns or lines exchanged, a stage that lost steps, "
+                f"{_length(check.spacing_m)}. That is no noise of positions: rows of the map are "
+                "at other places than it says (columns or lines exchanged, a stage that lost steps, "
                 "the unit of one axis), or the field has sources within the map. Do not put it "
                 "into the study.")
     if check.position_noise_at_most and check.position_noise_m >= SCATTERED_M:
         limit = _length(check.position_noise_m)
-        return (f"{noise}. Where the field is steep, more is left than noise and positions make, as "
-                f"the fit does not follow the field there: positions are at most {limit} off. "
-                + (f"Put the noise into the study as sigma_T, and of position_sd_m what you know of "
-                   f"the stage, at most {limit}." if keys else "")).rstrip()
+        known = (" Put the noise into the study as sigma_T, and as position_sd_m what you know of "
+                 f"the stage, at most {limit}." if keys else "")
+        return (f"{noise}. Where the field is steep, more is left than noise and positions make, "
+                "as the fit does not follow the field there: positions are at most "
+                f"{limit} off.{known}")
     if check.position_noise_m >= SCATTERED_M:
         noise += (", and where the field is steep, readings scatter like positions that are "
                   f"{_length(check.position_noise_m, check.position_noise_sd_m)} off")

@@ -24,11 +24,7 @@ from halbach_fe.inference.registration import (
     turn_from_axes,
 )
 from halbach_fe.measurement.campaign import Map
-from halbach_fe.measurement.doubted_terms import (
-    doubts_in_words,
-    factor_in_words,
-    known_factor,
-)
+from halbach_fe.measurement.doubted_terms import doubts_in_words, factor_in_words, known_factor
 from halbach_fe.measurement.field_map import (
     UNDIRECTED_COLUMN,
     directed,
