@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
+from halbach_fe.diagnosis.summary import EMPTY_CELL
 from halbach_fe.geometry.equal_blocks import turned_onto
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import Registration
@@ -44,14 +45,7 @@ from halbach_fe.report.page import (
     save,
     write_page,
 )
-from halbach_fe.report.words import (
-    EMPTY_CELL,
-    counted,
-    decimals,
-    flux_density,
-    in_a_row,
-    with_error,
-)
+from halbach_fe.report.words import counted, decimals, flux_density, in_a_row, with_error
 from halbach_fe.report.words import probability as in_per_cent
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
