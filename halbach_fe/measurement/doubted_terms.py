@@ -188,8 +188,8 @@ def factor_in_words(factor: float) -> str:
         return ""
     known = f" ({words})" if (words := known_factor(factor)) else ""
     return (f"The readings are {decimals(factor)} times the field of the magnet as it was ordered"
-            f"{known}: look at their unit, sign and factor in the file first, and at the remanence in "
-            "the study.")
+            f"{known}: look at their unit, sign and factor in the file first, and at the remanence "
+            "in the study.")
 
 
 def known_factor(factor: float) -> str:
