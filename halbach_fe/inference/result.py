@@ -22,6 +22,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import ONLY_MAP
 from halbach_fe.measurement.doubted_terms import (
+    ALL_BLOCKS,
     Term,
     block_doubts,
     doubts,
@@ -417,16 +418,20 @@ class InferenceResult(ShownInNotebook):
 
     @cached_property
     def doubts(self) -> tuple[Term, ...]:
-        """Terms of instruments and blocks that are far from their priors; see
+        """Terms of instruments, and all blocks together, that are far from their priors; see
         `halbach_fe.measurement.doubted_terms`.
+
+        A single block may be what the update is to find: the answer names it, and chi-squared
+        judges it.
         """
         magnet, terms = self.magnet, []
         if self.terms is not None:
             for name, change, sd in zip(self.terms.names, self.terms.change.tolist(),
                                         self.terms.prior_sd.tolist(), strict=True):
                 terms.append(Term(*words_of(name.removeprefix(f"{ONLY_MAP}.")), change, sd))
-        return doubts(terms, magnet.dimension * len(magnet.blocks)) + block_doubts(
-            magnet, self.posterior.mean, self.prior.mean, self.prior.sd)
+        blocks = block_doubts(magnet, self.posterior.mean, self.prior.mean, self.prior.sd)
+        return doubts(terms, magnet.dimension * len(magnet.blocks)) + tuple(
+            one for one in blocks if one.name == ALL_BLOCKS)
 
     @property
     def _doubted(self) -> str:
