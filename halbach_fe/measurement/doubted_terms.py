@@ -38,7 +38,7 @@ FACTORS = {
 """Ratios of readings to fields that errors of a file make."""
 
 ALL_BLOCKS = "strength of all blocks together"
-"""Name of the mean deviation of all blocks."""
+"""Name of the median deviation of all blocks."""
 
 MOST_NAMED = 5
 """Largest number of doubted terms that a sentence names."""
@@ -158,8 +158,9 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
     Returns
     -------
     tuple of Term
-        The mean of all blocks along their magnetizations in parts of 1, compared with the standard
-        deviation of one block; or the block that is farthest from its prior.
+        The median of all blocks along their magnetizations in parts of 1 (a reversed block moves
+        the mean), compared with the standard deviation of one block; or the block that is farthest
+        from its prior.
     """
     count = len(magnet.blocks)
     change, sd, nominal = (values[:magnet.dimension * count].reshape(count, -1) for values in (
@@ -172,7 +173,7 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
     axes = nominal[there] / size[there, None]
     along = np.sum(axes * change, axis=1)
     own = float(np.sqrt(np.mean(np.sum(axes**2 * sd**2, axis=1))))
-    common = Term(ALL_BLOCKS, "", float(along.mean()), own)
+    common = Term(ALL_BLOCKS, "", float(np.median(along)), own)
     if found := doubts([common], sd.size):
         return found
     away = np.abs(change) / np.where(sd > 0, sd, np.inf)
