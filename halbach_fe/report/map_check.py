@@ -133,8 +133,8 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 f"were {_length(check.position_noise_m)} off, at a spacing of "
                 f"{_length(check.spacing_m)}. That is no noise of positions: rows of the map are "
                 "at other places than it says (columns or lines exchanged, a stage that lost "
-                "steps, the unit of one axis), or the field has sources within the map. Do not put it "
-                "into the study.")
+                "steps, the unit of one axis), or the field has sources within the map. Do not put "
+                "it into the study.")
     if check.position_noise_at_most and check.position_noise_m >= SCATTERED_M:
         limit = _length(check.position_noise_m)
         known = (" Put the noise into the study as sigma_T, and as position_sd_m what you know of "
