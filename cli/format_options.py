@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
+from halbach_fe.measurement.formats.declared import FORMATS, UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.units import ANGLES, FIELDS, LENGTHS
 
 AXES = ("x", "y", "z")
@@ -22,8 +22,9 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
                         help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
                         "dx, dy, dz (moves of a stage from reading to reading), t (time), or - "
                         "for a column that is ignored; a unit may follow, as in Bx[mT], t[s]")
-    parser.add_argument("--component", choices=AXES, default="",
-                        help="component of the field in a column B")
+    parser.add_argument("--component", choices=(*AXES, UNKNOWN), default="",
+                        help="component of the field in a column B; unknown, if nobody knows it, "
+                        "for halbach-fe register to find")
     parser.add_argument("--at", type=coordinates, default={}, metavar="AXIS=M,...",
                         help="constant coordinates in m that the file does not contain, for "
                         "example x=0,y=0")

@@ -17,7 +17,7 @@ from halbach_fe.cli.format_options import add_format_arguments, declared_format
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.measurement.calibration import HEADER, read_calibration
-from halbach_fe.measurement.field_map import points_of, write_map
+from halbach_fe.measurement.field_map import UNDIRECTED, is_undirected, points_of, write_map
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
 from halbach_fe.study.types import COMPONENTS
 
@@ -70,7 +70,8 @@ def summary(file: ImportedFile) -> dict[str, object]:
     measured = [i for i in range(3) if not np.isnan(field[:, i]).all()]
     return {
         "format": file.format, "readings": len(points),
-        "components": [COMPONENTS[i] for i in measured],
+        "components": [UNDIRECTED] if is_undirected(file.data) else [
+            COMPONENTS[i] for i in measured],
         "length_units": list(file.imported.length_units),
         "field_units": list(file.imported.field_units),
         "ignored_columns": list(file.imported.ignored),

@@ -14,8 +14,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_space import Field, misfit_of, right_angles, same_pose
+from halbach_fe.solver.separate_blocks import field_in_vacuum
 
 RADII, ANGLES = (0.0, 0.35, 0.7), 8
 """Distances of the lines from the axis, in units of the bore's radius, and angles beside it. The
@@ -60,16 +62,14 @@ def along_the_axis(matrix: Floats, direction: Floats) -> bool:
 
 
 def poses_along(
-    magnet: Magnet, vacuum: Field, points: Floats, readings: Floats, training: NDArray[np.bool_],
-    direction: Floats, across_m: float,
+    magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_],
+    direction: Floats, across_m: float, pace: Pace,
 ) -> list[tuple[float, Floats]]:
     """Return poses (6,) of a line along the magnet with their misfits in T, the best first.
 
     Parameters
     ----------
     magnet : Magnet
-    vacuum : callable
-        The field of the nominal blocks in vacuum.
     points, readings : ndarray, shape (n, 3)
         In m and T; the middle of the points is at the origin.
     training : ndarray of bool, shape (n, 3)
@@ -78,10 +78,12 @@ def poses_along(
         Of the line, in the map's coordinates.
     across_m : float
         Prior standard deviation of the line's distance from the axis along x and y.
+    pace : Pace
     """
     rows = np.flatnonzero(training.any(axis=1))
     rows = rows[np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).astype(int)]
     points, used, seen = points[rows], np.where(training, readings, 0.0)[rows], training[rows]
+    vacuum = field_in_vacuum(magnet.blocks)
     starts = _transverse_starts(magnet, across_m)
     table = _Table.of(magnet, vacuum, starts, float(np.ptp(points @ direction)))
     candidates = []
@@ -105,7 +107,9 @@ def poses_along(
         if len(chosen) == IMPROVED:
             break
     found: list[tuple[float, Floats]] = []
-    for place, matrix in chosen:
+    pace.begin("search of the line, candidates improved")
+    for number, (place, matrix) in enumerate(chosen):
+        pace.advance(number, len(chosen))
         misfit, pose = _improved(magnet, vacuum, place, matrix, points, used, seen, across_m)
         if misfit is not None and not any(same_pose(pose, other) for _, other in found):
             found.append((misfit, pose))

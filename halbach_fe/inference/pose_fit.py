@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
+from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
@@ -35,6 +36,14 @@ from halbach_fe.inference.pose_space import (
     share_of,
 )
 from halbach_fe.measurement.campaign import middle_of
+from halbach_fe.measurement.doubted_terms import (
+    UNITS,
+    Term,
+    block_doubts,
+    doubts,
+    factor_of,
+    words_of,
+)
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
@@ -44,6 +53,7 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.measurement.instrument_terms import (
     DIFFERENCE_M,
+    NAMES,
     POSE,
     SMALL,
     STEADY,
@@ -258,7 +268,7 @@ class PoseFit:
         """Return the study of a pose and of the other parameters."""
         return self._magnet(values).study.with_(instrument=self.instrument(pose, values))
 
-    def refined(self, pose: Floats) -> Registration:
+    def refined(self, pose: Floats, pace: Pace | None = None) -> Registration:
         """Return the registration to which least squares leads from a pose (6,)."""
         prior_sd = self.prior_sd()
         start, values = pose, np.zeros(len(prior_sd))
@@ -276,7 +286,9 @@ class PoseFit:
                 return state.reach * (
                     NEAR * blurred / self.smallest_sigma if self.on_a_line else 1.0)
 
-            for _ in range(ITERATIONS):
+            for number in range(ITERATIONS):
+                if pace is not None:
+                    pace.advance(number, ITERATIONS)
                 # noise of positions grows with the gradient, and a fit would look for one: so it
                 # is held, on a line always, and elsewhere while a step is tried
                 held = state.sigma if sigma is None else sigma
@@ -315,6 +327,7 @@ class PoseFit:
         scaled = self.scaled(pose, values, start)
         sd = state.step(rows, scaled)[1]
         updated, log_evidence, mean, covariance = state.updated(rows, scaled)
+        blocks = self._blocks(columns.directions, mean, covariance)
         return Registration(
             self.study_of(pose, values), pose[:3], sd[:3], sd[3:6], self.pose_sd,
             {each.key: (value, error) for each, value, error in zip(
@@ -323,8 +336,34 @@ class PoseFit:
             _mean_square(updated / state.sigma, self.held_out),
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
-            log_evidence, at_rest, _probe_sd(sd[6:6 + PROBE]),
-            self._blocks(columns.directions, mean, covariance))
+            log_evidence, at_rest, _probe_sd(sd[6:6 + PROBE]), blocks,
+            self._doubts(scaled, blocks), self._factor(pose, values))
+
+    def _doubts(self, scaled: Floats, blocks: Gaussian) -> tuple[Term, ...]:
+        """Return the terms that a fit has taken far from their priors.
+
+        ``scaled`` (p,) are its parameters less their prior means, in prior standard deviations.
+        """
+        named = [words_of(name) for name in NAMES[STEADY]]
+        for each in self.open:
+            unit = each.key.rpartition("_")[2]
+            named.append((f"`{each.key}`", unit if unit in UNITS else ""))
+        sd = np.concatenate([self.pose_sd, self.prior_sd()])
+        terms = [Term(*name, float(away * one), float(one))
+                 for name, away, one in zip(named, scaled, sd, strict=True)]
+        count = 3 * len(self.magnet.blocks)
+        return doubts(terms, count) + block_doubts(
+            self.magnet, blocks.mean, self.prior.mean, self.prior.sd)
+
+    def _factor(self, pose: Floats, values: Floats) -> float:
+        """Return how many times the readings are what a probe without errors reads of the magnet.
+
+        A wrong unit shows in it, which gains, blocks and offsets share out among them otherwise.
+        """
+        sensors = sensor_positions(self.instrument(pose, values), self.points)
+        exact = self.instrument(pose, np.append(np.zeros(PROBE), values[PROBE:]))
+        expected = seen(sensor_matrix(exact), field_at_sensors(self._field(values), sensors)[0])
+        return factor_of(self.readings[self.training], expected[self.training])
 
     def _check_effects(self, state: _State) -> None:
         """Raise a StudyError if an open key changes no reading that is fitted."""

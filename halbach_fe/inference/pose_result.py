@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
@@ -46,6 +48,12 @@ class ProbePrior:
     gain: float = 0.003
     offset_T: float = 1e-3
     sensor_m: float = 1e-4
+
+    @classmethod
+    def of(cls, known: InstrumentSd) -> ProbePrior:
+        """Return the prior of a probe of which a study may state that less is known."""
+        return cls(max(cls.crosstalk, known.crosstalk), max(cls.gain, known.gain),
+                   max(cls.offset_T, known.offset_T), max(cls.sensor_m, known.sensor_position_m))
 
 
 SEARCHED_M = 1e-3
@@ -198,6 +206,13 @@ class Registration:
         Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
         They serve to register another map of the same magnet: what permeable blocks answer to a
         change of others is left out.
+    doubts : tuple of Term
+        Terms of pose, probe, open keys and blocks that this fit has taken far from their priors,
+        see `halbach_fe.measurement.doubted_terms`.
+    factor : float
+        How many times the readings are what a probe without errors reads of the nominal magnet.
+    component : str
+        Which component the readings were taken for, where the map does not say it; else empty.
     """
 
     study: Study
@@ -216,6 +231,9 @@ class Registration:
     at_rest: bool
     probe: ProbePrior
     blocks: Gaussian = dataclasses.field(repr=False)
+    doubts: tuple[Term, ...] = ()
+    factor: float = 1.0
+    component: str = ""
 
     @property
     def instrument(self) -> Instrument:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.line_search import along_the_axis, line_of, poses_along
 from halbach_fe.inference.pose_space import (
@@ -71,7 +72,7 @@ DIFFERENCE_M = 2e-4
 
 def coarse_poses(
     magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_],
-    across_m: float = np.inf,
+    across_m: float = np.inf, pace: Pace | None = None,
 ) -> list[Floats]:
     """Return poses (6,), the best first: where the map's middle lies in m, and a rotation vector.
 
@@ -86,6 +87,8 @@ def coarse_poses(
         The readings that may be used.
     across_m : float, optional
         Prior standard deviation of the middle's distance from the axis along x and y.
+    pace : Pace, optional
+        Reports how many places and candidates are left, and the time.
     """
     rows = np.flatnonzero(training.any(axis=1))
     used = np.where(training, readings, 0.0)
@@ -93,11 +96,12 @@ def coarse_poses(
         raise MeasurementError(must_be("map", "registration", "of some field", "zero everywhere"))
     points = points - middle_of(points)
     line = line_of(points[rows], NARROW * magnet.bore_radius)
-    improved = _searched(magnet, points, used, training, line, across_m)
+    pace = pace or Pace(lambda _: None)
+    improved = _searched(magnet, points, used, training, pace, line, across_m)
     best = improved[0][0]
     size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))
     if line is None and best > SUSPICIOUS * size:  # a line is its own mirror image
-        mirrored = _searched(magnet, points * MIRROR, -used * MIRROR, training)[0][0]
+        mirrored = _searched(magnet, points * MIRROR, -used * MIRROR, training, pace)[0][0]
         if mirrored < best / MIRRORED:
             raise MeasurementError(must_be(
                 "map", "registration", "that of the study's magnet",
@@ -114,7 +118,7 @@ def coarse_poses(
 
 
 def _searched(
-    magnet: Magnet, points: Floats, used: Floats, training: NDArray[np.bool_],
+    magnet: Magnet, points: Floats, used: Floats, training: NDArray[np.bool_], pace: Pace,
     line: Floats | None = None, across_m: float = np.inf,
 ) -> list[tuple[float, Floats]]:
     """Return the rms residuals in T of poses, and these, the best first.
@@ -124,11 +128,12 @@ def _searched(
     """
     vacuum = field_in_vacuum(magnet.blocks)
     improved = [] if line is None else poses_along(
-        magnet, vacuum, points, used, training, line, across_m)
+        magnet, points, used, training, line, across_m, pace)
     rotations = [matrix for matrix in right_angles()
                  if line is None or not along_the_axis(matrix, line)]
-    improved += _on_the_axis(magnet, vacuum, points, used, training, rotations,
-                             improved[0][0] if improved else np.inf)
+    scores = _scores(magnet, vacuum, points, used, training, rotations, pace)
+    improved += _all_improved(magnet, vacuum, points, used, training, _worth_trying(
+        scores, improved[0][0] if improved else np.inf), pace)
     if not improved:
         raise MeasurementError(must_be(
             "map", "registration", "one that fits into the bore, or beside the magnet",
@@ -138,21 +143,24 @@ def _searched(
     return sorted(improved, key=lambda each: each[0])
 
 
-def _on_the_axis(
-    magnet: Magnet, vacuum: Field, points: Floats, used: Floats, training: NDArray[np.bool_],
-    rotations: Sequence[Floats], known: float,
-) -> list[tuple[float, Floats]]:
-    """Return misfits in T and poses (6,) to which least squares leads from places on the axis.
-
-    ``known`` is the misfit in T of the best pose that is known already.
-    """
+def _chosen(training: NDArray[np.bool_], count: int) -> Ints:
+    """Return at most so many rows throughout the scan that have readings."""
     rows = np.flatnonzero(training.any(axis=1))
-    few, more = (rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
-                 for count in (COARSE_POINTS, MIDDLE_POINTS))
+    return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
+
+
+def _scores(
+    magnet: Magnet, vacuum: Field, points: Floats, used: Floats, training: NDArray[np.bool_],
+    rotations: Sequence[Floats], pace: Pace,
+) -> list[tuple[float, float, Floats]]:
+    """Return misfits in T of places on the axis in m, and of rotations, the best first."""
+    rows, few = np.flatnonzero(training.any(axis=1)), _chosen(training, COARSE_POINTS)
     reach = magnet.half_length + float(np.linalg.norm(np.ptp(points[rows], axis=0)))
     steps = max(3, int(np.ceil(2 * reach / (STEP * magnet.bore_radius))))
     scores = []
-    for matrix in rotations:
+    pace.begin("search of the pose, rotations by right angles compared")
+    for number, matrix in enumerate(rotations):
+        pace.advance(number, len(rotations))
         turned = points[few] @ matrix.T
         shifts = np.linspace(-reach, reach, steps)
         places = turned[None] + np.outer(shifts, [0, 0, 1])[:, None]
@@ -162,15 +170,37 @@ def _on_the_axis(
             continue
         fields = vacuum(places.reshape(-1, 3)).reshape(len(shifts), -1, 3) @ matrix
         scores += [(misfit_of(field, used[few], training[few])[0], shift, matrix)
-                   for shift, field in zip(shifts, fields, strict=True)]
-    scores.sort(key=lambda each: each[0])
-    improved: list[tuple[float, Floats]] = []
+                   for shift, field in zip(shifts.tolist(), fields, strict=True)]
+    return sorted(scores, key=lambda each: each[0])
+
+
+def _worth_trying(
+    scores: Sequence[tuple[float, float, Floats]], known: float
+) -> list[tuple[float, Floats]]:
+    """Return places and rotations that are improved, of scores with the best first.
+
+    ``known`` is the misfit in T of the best pose that is known already.
+    """
     tried: dict[bytes, int] = {}
+    found = []
     for rough, shift, matrix in scores:
         key = matrix.tobytes()
         tried[key] = tried.get(key, 0) + 1
-        if rough > WORTH_TRYING * min(scores[0][0], known) or tried[key] > CANDIDATES:
-            continue
+        if rough <= WORTH_TRYING * min(scores[0][0], known) and tried[key] <= CANDIDATES:
+            found.append((shift, matrix))
+    return found
+
+
+def _all_improved(
+    magnet: Magnet, vacuum: Field, points: Floats, used: Floats, training: NDArray[np.bool_],
+    worth: Sequence[tuple[float, Floats]], pace: Pace,
+) -> list[tuple[float, Floats]]:
+    """Return misfits in T and different poses (6,) to which least squares leads from some."""
+    more = _chosen(training, MIDDLE_POINTS)
+    improved: list[tuple[float, Floats]] = []
+    pace.begin("search of the pose, candidates improved")
+    for number, (shift, matrix) in enumerate(worth):
+        pace.advance(number, len(worth))
         pose = np.concatenate([[0.0, 0.0, shift], Rotation.from_matrix(matrix).as_rotvec()])
         misfit, pose = _improved(magnet, vacuum, pose, points[more], used[more], training[more])
         if misfit is not None and not any(same_pose(pose, other) for _, other in improved):

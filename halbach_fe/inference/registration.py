@@ -15,7 +15,9 @@ map's coordinates to those of the magnet.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -23,11 +25,13 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.pace import QUIET_S, Pace, duration
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.pose_search import coarse_poses
-from halbach_fe.measurement.field_map import checked_map
+from halbach_fe.inference.pose_space import right_angles
+from halbach_fe.measurement.field_map import checked_map, directed, is_undirected
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
@@ -62,13 +66,16 @@ def register(
     data : Dataset
         The map, see `halbach_fe.read_map`, with components along axes of one sign; see
         `halbach_fe.check_map`. A line of readings, or a single component, determines a part of the
-        pose only; the prior holds the others, as the standard deviations say.
+        pose only; the prior holds the others, as the standard deviations say. A component of which
+        nobody has said which it is is taken for Bx, By and Bz, and the evidence compares them.
     session : Session
     probe : ProbePrior, optional
+        By default that of the study's ``instrument_sd``, where it is wider than the usual one.
     open_keys : sequence of OpenKey, optional
         Numbers of the study that are fitted too.
     say : callable, optional
-        Called with a description of each step before it starts.
+        Called with a description of each step before it starts, and now and then with what is left
+        of a step that takes long.
     blocks : Gaussian, optional
         `Registration.blocks` of another map, which replace the study's prior.
     pose : PosePrior, optional
@@ -93,12 +100,35 @@ def register(
     """
     data = checked_map(data, "`data`")
     prior = pose or PosePrior()
-    fits = [PoseFit.of(magnet, data, session, probe or ProbePrior(), tuple(keys), prior,
-                    blocks)
-            for keys in (open_keys, *alternatives)]
-    fit = fits[0]
+    probe = probe or ProbePrior.of(magnet.study.instrument_sd)
+
+    def fits_of(readings: xr.Dataset) -> list[PoseFit]:
+        return [PoseFit.of(magnet, readings, session, probe, tuple(keys), prior, blocks)
+                for keys in (open_keys, *alternatives)]
+
+    if not is_undirected(data):
+        return least_turned_first(_registered(fits_of(data), prior, most, say))
+    found: list[Registration] = []
+    refused: MeasurementError | None = None
+    for name in COMPONENTS:
+        say(f"taking the readings for those of B{name}")
+        try:
+            found += [replace(each, component=name) for each in _registered(
+                fits_of(directed(data, name)), prior, most, say)]
+        except MeasurementError as error:
+            refused = error
+    if refused is not None and not found:
+        raise refused
+    return least_turned_first(found)
+
+
+def _registered(
+    fits: Sequence[PoseFit], prior: PosePrior, most: int | None, say: Callable[[str], None]
+) -> list[Registration]:
+    """Return the poses of a map by some hypotheses about what is open, see `register`."""
+    fit, magnet, pace = fits[0], fits[0].magnet, Pace(say)
     say("searching the pose among rotations by right angles and shifts along the axis")
-    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0])
+    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0], pace)
     starts = [each for each in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), each)]
     starts = starts[:most]
     if prior.stage is not None and starts:
@@ -109,12 +139,15 @@ def register(
             "points inside blocks in every likely pose", "Check its unit of length."))
     found: list[Registration] = []
     by_fit: list[list[Registration]] = []
+    begun = time.monotonic()
     for fit in fits:
         by_fit.append([])
         for number, start in enumerate(starts):
-            say(f"fitting pose {number + 1} of {len(starts)} with the blocks"
-                + (f" and {', '.join(each.key for each in fit.open)}" if fit.open else ""))
-            by_fit[-1].append(fit.refined(start))
+            what = f"fitting pose {number + 1} of {len(starts)} with the blocks" + (
+                f" and {', '.join(each.key for each in fit.open)}" if fit.open else "")
+            say(what + _time_left(begun, sum(map(len, by_fit)), len(starts) * len(fits)))
+            pace.begin(f"{what}, steps of the fit")
+            by_fit[-1].append(fit.refined(start, pace))
     best = max((each for own in by_fit for each in own), key=lambda each: each.log_evidence)
     for fit, own in zip(fits, by_fit, strict=True):
         # no hypothesis shall lose because it came to rest somewhere else
@@ -123,7 +156,13 @@ def register(
         own.sort(key=lambda each: -each.log_evidence)
         found += [each for number, each in enumerate(own)
                   if not any(_same(each, other) for other in own[:number])]
-    return least_turned_first(found)
+    return found
+
+
+def _time_left(begun: float, done: int, total: int) -> str:
+    """Return words about the time left of fits that take long; nothing before the first."""
+    left = (time.monotonic() - begun) * (total - done) / max(done, 1)
+    return f" (about {duration(left)} left)" if done and left >= QUIET_S else ""
 
 
 def least_turned_first(found: Sequence[Registration]) -> list[Registration]:
@@ -176,17 +215,21 @@ def turn_from_axes(instrument: Instrument) -> Floats:
     axes were put along those of `axes_of_map`.
     """
     matrix = Rotation.from_rotvec(instrument.rotation_rad).as_matrix()
-    nearest = np.zeros((3, 3))
-    for number, axis in enumerate(axes_of_map(instrument).values()):
-        nearest[COMPONENTS.index(axis[-1]), number] = -1.0 if axis.startswith("-") else 1.0
-    if not np.linalg.det(nearest) > 0:  # two axes of the map are nearest to the same one
-        return np.array(instrument.rotation_rad)
-    return np.asarray(Rotation.from_matrix(matrix @ nearest.T).as_rotvec())
+    return np.asarray(Rotation.from_matrix(
+        matrix @ nearest_right_angles(instrument).T).as_rotvec())
+
+
+def nearest_right_angles(instrument: Instrument) -> Floats:
+    """Return the rotation by right angles (3, 3) that is nearest to that of a map."""
+    matrix = Rotation.from_rotvec(instrument.rotation_rad).as_matrix()
+    return max(right_angles(), key=lambda other: float(np.sum(other * matrix)))
 
 
 def axes_of_map(instrument: Instrument) -> dict[str, str]:
-    """Return for each axis of the map the magnet's axis that is nearest, such as ``-z``."""
-    matrix = Rotation.from_rotvec(instrument.rotation_rad).as_matrix()
+    """Return for each axis of the map that of the magnet, such as ``-z``, by the rotation by right
+    angles that is nearest.
+    """
+    matrix = nearest_right_angles(instrument)
     found: dict[str, str] = {}
     for number, name in enumerate(COMPONENTS):
         column = matrix[:, number]

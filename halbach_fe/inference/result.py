@@ -20,6 +20,17 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.campaign import ONLY_MAP
+from halbach_fe.measurement.doubted_terms import (
+    ALL_BLOCKS,
+    Term,
+    block_doubts,
+    doubts,
+    doubts_in_words,
+    factor_in_words,
+    factor_of,
+    words_of,
+)
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
@@ -459,9 +470,34 @@ class InferenceResult(ShownInNotebook):
     @property
     def disagreement(self) -> str:
         """Sentences if prior, model and maps cannot all be right, else an empty string."""
-        found = [self._conflict or self.too_near, self.held_out_conflict,
+        found = [self._conflict or self.too_near, self.held_out_conflict, self._doubted,
                  *(each.disagreement for each in self.overlaps)]
         return " ".join(sentence for sentence in found if sentence)
+
+    @cached_property
+    def doubts(self) -> tuple[Term, ...]:
+        """Terms of instruments, and all blocks together, that are far from their priors; see
+        `halbach_fe.measurement.doubted_terms`.
+
+        A single block may be what the update is to find: the answer names it, and chi-squared
+        judges it.
+        """
+        magnet, terms = self.magnet, []
+        if self.terms is not None:
+            for name, change, sd in zip(self.terms.names, self.terms.change.tolist(),
+                                        self.terms.prior_sd.tolist(), strict=True):
+                terms.append(Term(*words_of(name.removeprefix(f"{ONLY_MAP}.")), change, sd))
+        blocks = block_doubts(magnet, self.posterior.mean, self.prior.mean, self.prior.sd)
+        return doubts(terms, magnet.dimension * len(magnet.blocks)) + tuple(
+            one for one in blocks if one.name == ALL_BLOCKS)
+
+    @property
+    def _doubted(self) -> str:
+        """Sentences about `doubts` and a factor of the readings; nothing if there are none."""
+        chosen = ~self.held_out
+        factor = factor_of(self.readings[chosen], self.prediction_prior.mean[chosen])
+        said = [doubts_in_words(self.doubts), factor_in_words(factor) if self.doubts else ""]
+        return " ".join(each for each in said if each)
 
     @cached_property
     def noise_ratio(self) -> float:

@@ -5,7 +5,9 @@ A map is an `xarray.Dataset` with
 * ``B_T`` (point, component): flux density in T, NaN where a component was not measured;
 * coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m and ``component`` = x, y, z;
 * optionally ``sigma_T`` (point, component), ``time_s`` (point) and ``scan`` (point);
-* attributes: provenance, as free text by key.
+* attributes: provenance, as free text by key. `DIRECTION` = `UNDIRECTED` marks a map of a single
+  component of which nobody has said which it is. It stands where Bz does, and only `register`,
+  which tries all three, reads it.
 
 HDF5 and CSV files hold all of these and read back equal. VTU files, for ParaView, hold all but
 scans and attributes.
@@ -41,6 +43,12 @@ POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
 SIGMA_COLUMNS = ("sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
 OTHER_COLUMNS = ("sigma_T", "time_s", "scan")
+UNDIRECTED_COLUMN = "B_T"
+"""Column of a component of which nobody has said which it is."""
+
+DIRECTION, UNDIRECTED = "direction", "unknown"
+"""Attribute of such a map, and its value."""
+
 FOREIGN = ("A table with other columns, other separators or no header is converted by `halbach-fe "
            "import-map`, whose options say what its columns are; `infer` takes them too.")
 """Advice for a map that is not in halbach-fe's own columns."""
@@ -64,6 +72,39 @@ def field_map(
     if sigma is not None:
         data["sigma_T"] = (("point", "component"), np.array(sigma, float), {"units": "T"})
     return data
+
+
+def undirected(data: xr.Dataset) -> xr.Dataset:
+    """Return a map of Bz as one of a component of which nobody has said which it is."""
+    return data.assign_attrs({DIRECTION: UNDIRECTED})
+
+
+def is_undirected(data: xr.Dataset) -> bool:
+    """Tell whether a map does not say which component it holds."""
+    return data.attrs.get(DIRECTION) == UNDIRECTED
+
+
+def directed(data: xr.Dataset, component: str) -> xr.Dataset:
+    """Return a map of an unknown component as one of Bx, By or Bz, of ``x``, ``y`` or ``z``."""
+    found = data.copy(deep=True)
+    del found.attrs[DIRECTION]
+    column = COMPONENTS.index(component)
+    for name in ("B_T", "sigma_T"):
+        if name in data:
+            found[name][:] = np.nan
+            found[name][:, column] = data[name].values[:, COMPONENTS.index("z")]
+    return found
+
+
+def refuse_undirected(data: xr.Dataset) -> None:
+    """Raise MeasurementError for a map that does not say which component it holds."""
+    if is_undirected(data):
+        raise MeasurementError(must_be(
+            f"column {UNDIRECTED_COLUMN}", f"map {data.encoding.get('source', '')}".rstrip(),
+            f"named {', '.join(FIELD_COLUMNS[:2])} or {FIELD_COLUMNS[2]}",
+            "a component of which nobody has said which it is", "If you do not know it either, "
+            "halbach-fe register of this map alone tries all three and writes the map of the one "
+            "that it finds."))
 
 
 def readings_sha256(data: xr.Dataset) -> str:
@@ -145,14 +186,20 @@ def read_map(path: str | Path) -> xr.Dataset:
 def _write_csv(data: xr.Dataset, path: Path) -> None:
     columns: dict[str, NDArray[np.generic]] = {name: data[name].values
                                                for name in POSITION_COLUMNS}
-    columns |= {name: data["B_T"].values[:, i] for i, name in enumerate(FIELD_COLUMNS)}
-    if "sigma_T" in data:
+    if is_undirected(data):
+        columns[UNDIRECTED_COLUMN] = data["B_T"].values[:, COMPONENTS.index("z")]
+    else:
+        columns |= {name: data["B_T"].values[:, i] for i, name in enumerate(FIELD_COLUMNS)}
+    if "sigma_T" in data and is_undirected(data):
+        columns["sigma_T"] = data["sigma_T"].values[:, COMPONENTS.index("z")]
+    elif "sigma_T" in data:
         columns |= {name: data["sigma_T"].values[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
     columns |= {name: data[name].values for name in ("time_s", "scan") if name in data}
     write_csv(columns, data.attrs, path)
 
 
 def _write_vtu(data: xr.Dataset, path: Path) -> None:
+    refuse_undirected(data)  # the format has no attributes
     points = points_of(data)
     cells = [("vertex", np.arange(len(points))[:, None])]
     values = {name: data[name].values for name in ("B_T", "sigma_T", "time_s") if name in data}
@@ -244,7 +291,7 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
 def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     where = f"map {path}"
     attributes, header, rows = csv_table(raw, where, FOREIGN)
-    if not {*POSITION_COLUMNS, *FIELD_COLUMNS}.intersection(header):
+    if not {*POSITION_COLUMNS, *FIELD_COLUMNS, UNDIRECTED_COLUMN}.intersection(header):
         raise MeasurementError(must_be(
             "header", where, f"complete with {', '.join(POSITION_COLUMNS)}, and at least one of "
             f"{', '.join(FIELD_COLUMNS)}", ",".join(header), FOREIGN))
@@ -259,8 +306,14 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
                 table[name].append(_number(cell, name, number, where))
     points = np.column_stack([table[name] for name in POSITION_COLUMNS])
     empty = np.full(len(points), np.nan)
+    if UNDIRECTED_COLUMN in table:
+        table["Bz_T"] = table[UNDIRECTED_COLUMN]
     data = field_map(points, np.column_stack([table.get(n, empty) for n in FIELD_COLUMNS]),
                      attributes=attributes)
+    if UNDIRECTED_COLUMN in table:
+        data = undirected(data)
+    elif is_undirected(data):  # a comment does not undo what the header says
+        del data.attrs[DIRECTION]
     if "sigma_T" in table:
         data["sigma_T"] = (("point", "component"), np.repeat([table["sigma_T"]], 3, 0).T)
     elif any(name in table for name in SIGMA_COLUMNS):
@@ -274,10 +327,14 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
 
 
 def _check_header(header: list[str], where: str) -> None:
-    check_columns(header, (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS),
-                  where)
+    check_columns(header, (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS,
+                           UNDIRECTED_COLUMN), where)
     missing = [name for name in POSITION_COLUMNS if name not in header]
-    if missing or not any(name in header for name in FIELD_COLUMNS):
+    if UNDIRECTED_COLUMN in header and set(header) & {*FIELD_COLUMNS, *SIGMA_COLUMNS}:
+        raise MeasurementError(must_be(
+            "header", where, f"with {UNDIRECTED_COLUMN}, a component that is not known, or with "
+            f"{', '.join(FIELD_COLUMNS)}, not both", ",".join(header)))
+    if missing or not any(name in header for name in (*FIELD_COLUMNS, UNDIRECTED_COLUMN)):
         expected = missing[0] if missing else "at least one of Bx_T, By_T, Bz_T"
         raise MeasurementError(must_be("header", where, f"complete with {expected}",
                                        ",".join(header)))

@@ -23,7 +23,12 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.measurement.field_map import POSITION_COLUMNS, check_magnitudes, points_of
+from halbach_fe.measurement.field_map import (
+    POSITION_COLUMNS,
+    check_magnitudes,
+    points_of,
+    refuse_undirected,
+)
 from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, Axes
@@ -59,8 +64,10 @@ def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Datase
     Raises
     ------
     MeasurementError
-        If positions or flux densities are so large that they must be in another unit.
+        If positions or flux densities are so large that they must be in another unit, or nobody
+        has said which component the map holds.
     """
+    refuse_undirected(data)
     points = to_magnet_axes(instrument.position_axes, points_of(data)) * instrument.length_unit_m
     unit = instrument.flux_density_unit_T
     field = to_magnet_axes(instrument.field_axes, data["B_T"].values) * unit

@@ -26,7 +26,13 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.pace import Pace, Progress
-from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of
+from halbach_fe.measurement.doubted_terms import doubted_from
+from halbach_fe.measurement.field_map import (
+    check_magnitudes,
+    checked_map,
+    points_of,
+    refuse_undirected,
+)
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,
@@ -40,7 +46,7 @@ from halbach_fe.measurement.probe_in_field import (
     ProbeFit,
     ProbeModel,
     fit_probe,
-    noise_of,
+    scatter_of,
 )
 from halbach_fe.measurement.scan_lines import (
     HELD_OUT_EVERY,
@@ -96,10 +102,6 @@ WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
 
-PLAUSIBLE = 4.0
-"""Prior standard deviations beyond which no instrument is. Such a fit explains what is no error of
-an instrument."""
-
 DETERMINED = 0.5
 """A parameter is determined if its standard deviation is below this part of its prior one."""
 
@@ -142,6 +144,10 @@ that of a noise which is the same everywhere. Fits take more of the noise along 
 map: maps with such a noise had ratios of 1.3 to 1.7, maps whose field the fit cannot follow in the
 middle 2.9 to 7."""
 
+NO_STAGE = 0.2
+"""Noise of positions, in units of the spacing of the points, from which it is none: a stage whose
+readings are that far from where it says does not place them."""
+
 SCATTERED_M = 1e-6
 """Noise of positions from which it is stated. It makes residuals that differ between the parts."""
 
@@ -159,7 +165,7 @@ class InstrumentTerm:
     determined : bool
         Whether the map tells more about it than its prior.
     plausible : bool
-        Whether an instrument may have that value.
+        Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
     predictive : bool
         Whether scan lines that are left out are predicted better with it.
     """
@@ -240,6 +246,9 @@ class MapCheck:
     noise_T, position_noise_m : float
         Noise of the readings, and of their positions: the part of the residual that grows with the
         field's gradient.
+    position_noise_sd_m, position_noise_at_most : float and bool
+        Standard deviation of the latter, and whether it is an upper limit only, as what is left
+        grows faster with the gradient than positions explain.
     reach : Reach or None
         Where held-out lines are predicted; None if all are within `FAR_OFF` times the noise.
     structure : float
@@ -279,6 +288,8 @@ class MapCheck:
     residual_T: Floats
     unseen_T: Floats
     corrected_T: Floats
+    position_noise_sd_m: float = 0.0
+    position_noise_at_most: bool = False
 
     @property
     def suffices(self) -> bool:
@@ -310,6 +321,12 @@ class MapCheck:
                        for pick in (min, max))
         differs = most[2] > UNEVEN * least[2] and self.position_noise_m < SCATTERED_M
         return (least, most) if differs else None
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether readings scatter as if positions were farther off than those of any stage."""
+        return not self.position_noise_at_most and (
+            self.position_noise_m > NO_STAGE * self.spacing_m)
 
     @property
     def is_reoriented(self) -> bool:
@@ -369,6 +386,7 @@ def check_map(
     True
     """
     data = checked_map(data, "`data`")
+    refuse_undirected(data)
     check_magnitudes(data)
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
@@ -448,7 +466,7 @@ def check_map(
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
         model.noise_left(whole, chosen, fit.sigma**2 / fit.penalty), LEAST_LEFT))
-    noise, displaced = noise_of(charges.gradient(points[chosen], whole.amplitudes), left)
+    scatter = scatter_of(charges.gradient(points[chosen], whole.amplitudes), left)
     (as_given,) = fit_fields(charges, places, [readings])
     given = readings - charges.fields(places) @ as_given.amplitudes
     return MapCheck(
@@ -459,7 +477,8 @@ def check_map(
         floor_T=_rms(floor @ np.abs(matrix)),
         terms=_terms(whole, max(float(beyond.max()), 1.0), model.shares(whole)), broken=broken,
         windows=_windows(points[chosen], residual[chosen] @ np.abs(matrix)),
-        noise_T=noise, position_noise_m=displaced,
+        noise_T=scatter.noise_T, position_noise_m=scatter.position_m,
+        position_noise_sd_m=scatter.position_sd_m, position_noise_at_most=scatter.at_most,
         structure=_structure(points[chosen], residual[chosen]),
         reach=_reach(points[held_out], floor, points[chosen], float(np.sqrt(np.mean(left**2)))),
         redundancy=redundancy, excluded=~usable,
@@ -642,13 +661,15 @@ def _terms(fitted: ProbeFit, beyond: float, shares: Floats) -> tuple[InstrumentT
     value, found = fitted.instrument * fitted.prior_sd, []
     scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
 
+    limit = doubted_from(len(fitted.prior_sd))
+
     def add(name: str, unit: str, factor: float, weights: dict[int, float]) -> None:
         row = np.zeros(len(value))
         row[list(weights)] = factor * np.array(list(weights.values()))
         sd = beyond * float(np.sqrt(row @ scaled @ row))
         prior = float(np.linalg.norm(row * fitted.prior_sd))
         found.append(InstrumentTerm(name, unit, float(row @ value), sd, sd < DETERMINED * prior,
-                                    abs(float(row @ value)) <= PLAUSIBLE * prior, prior > 0))
+                                    abs(float(row @ value)) <= limit * prior, prior > 0))
 
     for sensor, along in product(range(3), repeat=2):
         add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",

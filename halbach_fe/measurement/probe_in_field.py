@@ -401,3 +401,65 @@ def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:
         return float(np.sqrt(squares.mean())), 0.0
     constant = float(squares[steepness <= flat].mean())
     return np.sqrt(constant), np.sqrt(max(squares.mean() - constant, 0.0) / steepness.mean())
+
+
+GROUPS_OF_STEEPNESS = 6
+"""Number of groups of readings, by the steepness of the field, whose scatter is compared."""
+
+NO_LINE = 4.0
+"""Standard deviations by which a group may be off a line of scatter over steepness: of six groups
+one is beyond by chance in one of 3 000 maps."""
+
+UPPER = 2.0
+"""Standard deviations above a scatter up to which its true value is taken to lie."""
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What residuals tell of the noise of readings and of positions.
+
+    Attributes
+    ----------
+    noise_T : float
+    position_m, position_sd_m : float
+        Noise of positions and its standard deviation; 0 if nothing tells it.
+    at_most : bool
+        Whether ``position_m`` is an upper limit, as more than positions is left.
+    """
+
+    noise_T: float
+    position_m: float
+    position_sd_m: float = 0.0
+    at_most: bool = False
+
+
+def scatter_of(gradient: Floats, residual: Floats) -> Scatter:
+    """Return the noise that residuals (n, 3) in T show, in a field of a gradient (n, 3, 3) in T/m.
+
+    Positions that scatter by s make a variance of ``s^2 |grad B_c|^2`` everywhere. What the charges
+    do not follow, near edges of magnets, grows faster. Then the group of readings in which the
+    least is left for each T/m tells what positions may be at most: everything else only adds.
+    """
+    noise, displaced = map(float, noise_of(gradient, residual))
+    if not displaced:
+        return Scatter(noise, 0.0)
+    steepness, squares = np.sum(gradient**2, axis=2).ravel(), residual.ravel()**2
+    groups = np.array_split(np.argsort(steepness), GROUPS_OF_STEEPNESS)
+    steep, mean = (np.array([values[group].mean() for group in groups])
+                   for values in (steepness, squares))
+    # a mean of n squares of normal numbers has a relative error of sqrt(2 / n)
+    sd = mean * np.sqrt(2 / np.array([len(group) for group in groups]))
+    design = np.column_stack([np.ones_like(steep), steep]) / sd[:, None]
+    (_, slope), *_ = np.linalg.lstsq(design, mean / sd, rcond=None)
+    constant = max(0.0, float(np.sum((mean - slope * steep) / sd**2) / np.sum(sd**-2.0)))
+    slope = float(np.sum((mean - constant) * steep / sd**2) / np.sum(steep**2 / sd**2))
+    off = np.abs(mean - constant - slope * steep) / sd
+    if slope <= 0 or off.max() > NO_LINE:
+        return Scatter(noise, float(np.sqrt(np.min((mean + UPPER * sd) / steep))), at_most=True)
+    slope_sd = float(np.linalg.inv(design.T @ design)[1, 1]**0.5 * max(1.0, np.sqrt(
+        np.sum(off**2) / (GROUPS_OF_STEEPNESS - 2))))
+    position = float(np.sqrt(slope))
+    flat = steepness <= np.quantile(steepness, 0.1)
+    least = UPPER * noise**2 * np.sqrt(2 / flat.sum())  # the error of what is subtracted from
+    alone = np.sqrt(max(noise**2 - slope * steepness[flat].mean(), least))
+    return Scatter(float(min(alone, noise)), position, slope_sd / (2 * position))

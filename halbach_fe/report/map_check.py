@@ -73,6 +73,8 @@ def answer(check: MapCheck) -> Answer:
         trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
                  f"correlation of {check.structure:.2f}. Something that this check does not know, "
                  "such as a probe that moves in its holder, is still in the map.")
+    elif check.is_displaced:
+        trust = "No, not as it stands: the field obeys, but readings are not where the map says."
     elif check.uneven is not None:
         trust = ("Yes, that it passes: no magnet is assumed, and the lines that were held out were "
                  "not fitted. No, as a measure of the noise: what is left is not noise alone.")
@@ -87,6 +89,10 @@ def answer(check: MapCheck) -> Answer:
     named = ("oriented_map.csv, which has the right axes and no broken rows" if better
              else "this map")
     said = f"{verdict(check)} {_noise(check, keys=True)}"
+    if check.is_displaced:
+        return Answer(question, said, trust, "Look for rows, axes and units of the positions that "
+                      "are not what the map says, and check it again.",
+                      "halbach-fe check MAP -o DIR", sound=False)
     if _on_a_stage(check):
         return Answer(
             question, said, trust, "Find where the map lies in the magnet, as its coordinates seem "
@@ -118,13 +124,36 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 "as where the field varies more between neighbouring readings than the fit "
                 "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
                 "repeatedly at one place.")
-    noise = f"The noise of a reading is {flux_density(check.noise_T, 2)}"
+    noise = ("The noise of a reading is "
+             f"{'at most ' if check.position_noise_at_most else ''}"
+             f"{flux_density(check.noise_T, 2)}")
     where = "put that into the study as sigma_T, unless you know better"
+    if check.is_displaced:
+        return (f"{noise}, and where the field is steep, readings are off as if their positions "
+                f"were {_length(check.position_noise_m)} off, at a spacing of "
+                f"{_length(check.spacing_m)}. That is no noise of positions: rows of the map are "
+                "at other places than it says (columns or lines exchanged, a stage that lost "
+                "steps, the unit of one axis), or the field has sources within the map. Do not put "
+                "it into the study.")
+    if check.position_noise_at_most and check.position_noise_m >= SCATTERED_M:
+        limit = _length(check.position_noise_m)
+        known = (" Put the noise into the study as sigma_T, and as position_sd_m what you know of "
+                 f"the stage, at most {limit}." if keys else "")
+        return (f"{noise}. Where the field is steep, more is left than noise and positions make, "
+                "as the fit does not follow the field there: positions are at most "
+                f"{limit} off.{known}")
     if check.position_noise_m >= SCATTERED_M:
         noise += (", and where the field is steep, readings scatter like positions that are "
-                  f"{check.position_noise_m * 1e6:.0f} µm off")
+                  f"{_length(check.position_noise_m, check.position_noise_sd_m)} off")
         where = "put these into the study as sigma_T and position_sd_m, unless you know better"
     return f"{noise}: {where}." if keys else f"{noise}."
+
+
+def _length(size: float, sd: float = 0.0) -> str:
+    """Return a length in m, and its standard deviation, in µm, or in mm from 1 mm on."""
+    unit, factor = ("mm", 1e3) if size >= 1e-3 else ("µm", 1e6)
+    text = with_error(factor * size, factor * sd) if sd else decimals(factor * size, 2)
+    return f"{text}\u00a0{unit}"
 
 
 def _range(low: float, high: float) -> str:

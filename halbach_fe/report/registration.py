@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
+from halbach_fe.diagnosis.summary import EMPTY_CELL
 from halbach_fe.geometry.equal_blocks import turned_onto
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import Registration
@@ -19,11 +20,19 @@ from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
     UNDECIDED_LOG_EVIDENCE,
     axes_of_map,
+    nearest_right_angles,
     odds,
     turn_from_axes,
 )
 from halbach_fe.measurement.campaign import Map
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.doubted_terms import doubts_in_words, factor_in_words, known_factor
+from halbach_fe.measurement.field_map import (
+    UNDIRECTED_COLUMN,
+    directed,
+    is_undirected,
+    points_of,
+    write_map,
+)
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points, turn_of
 from halbach_fe.measurement.instrument_terms import CROSSTALK
 from halbach_fe.report.answer import Answer
@@ -37,12 +46,16 @@ from halbach_fe.report.page import (
     write_page,
 )
 from halbach_fe.report.words import counted, decimals, flux_density, in_a_row, with_error
+from halbach_fe.report.words import probability as in_per_cent
 from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
 STUDY_FILE = "study.registered.toml"
+
+MAP_FILE = "registered_map.csv"
+"""The map with the component that was found, where the map itself does not say which it is."""
 
 NOTE = "found by halbach-fe register"
 
@@ -59,11 +72,20 @@ SAME_PLACE = 4.0
 
 AT_REST = "Yes, the map can be used in this pose."
 UNDECIDED = "Only if the map was measured in this pose, as the readings do not decide on it."
+DOUBTED = (
+    "No. The map is explained, but only by terms that are far from what was known before: so would "
+    "be many a map of something else.")
 NOT_AT_REST = (
     "No, do not use the map in this pose yet. The search for the best fit has not come to rest: it "
     "ended while place and turns still changed from step to step, so that the best pose may be "
     "farther away than the error bars say.")
 
+
+USE_ANY = (
+    " The field that infer finds at the places of the map is the same in all of them, so that any "
+    "may be used. Only the names of blocks are exchanged, which matters if you look for one block "
+    "or give measured blocks (--blocks): then find out by a mark on the magnet which pose is the "
+    "real one.")
 
 CERTAIN_SD = 3.0
 """Standard deviations up to which a pose or an error of a probe counts as zero: of some 25 such
@@ -94,30 +116,37 @@ def answer(
         best.middle_m, best.translation_sd_m, strict=True))
     said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
             f"magnet. On the map's stage the middle of the magnet is at {_magnet_on_stage(best)}.")
+    least_bad = f" for B{best.component}" if best.component else ""
     alike = sum(_fit_alike(best, each) or is_symmetric_to(best, each) for each in rivals(found))
     if alike:
         said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
                  "likely.")
     trust = [*_other_poses(found), _fit(best, before)]
-    sound = best.explains and best.at_rest
+    sound = is_sound(best)
     maps = "" if name else " --measurements MAP"
+    own = f" --measurements DIR/{MAP_FILE}" if best.component else maps
     if best.explains and not best.at_rest:
         said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
     if best.explains:
-        trust.insert(0, NOT_AT_REST if not best.at_rest else AT_REST if all(
-            is_symmetric_to(best, each) for each in rivals(found)) else UNDECIDED)
+        said = _component(found) + said
+        trust.insert(0, NOT_AT_REST if not best.at_rest else DOUBTED if best.doubts else
+                     AT_REST if all(is_symmetric_to(best, each) for each in rivals(found))
+                     else UNDECIDED)
     else:
-        said = ("This magnet does not explain the map. The least bad answer: "
+        said = (f"This magnet does not explain the map. The least bad answer{least_bad}: "
                 f"{said[0].lower()}{said[1:]}")
         trust.insert(0, (
             f"No. Even in the best pose and with updated blocks chi² is {decimals(best.chi2)} per "
             "reading, where about 1 is expected: the map is of another magnet, its noise is larger "
-            "than the study says, or the study lacks something."))
+            "than the study says, or the study lacks something. As no pose explains the map, none "
+            "has odds."))
+    trust[1:1] = _doubts(best)
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *(
             ("Update the blocks with the map in this pose.",
-             f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR") if sound else
+             f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR") if sound else
+            _after_doubts(best, maps) if _is_of_the_file(best) else
             ("Do not update the blocks in this pose. Measure lines beside this one, or the "
              "components of B that are missing, or narrow the search by what is known of the place "
              "(--across-m, --turn-rad), and register again.",
@@ -128,12 +157,65 @@ def answer(
              f"halbach-fe diagnose STUDY{maps} -o DIR")
             if _is_near(best, assumed or Instrument()) else
             ("Look for what the model lacks.",
-             f"halbach-fe diagnose DIR/{STUDY_FILE}{maps} -o DIR")), sound=sound,
+             f"halbach-fe diagnose DIR/{STUDY_FILE}{own} -o DIR")), sound=sound,
         changes_study=not _is_as_assumed(best, assumed or Instrument()))
 
 
+def is_sound(best: Registration) -> bool:
+    """Tell whether a pose may be used: it explains the map, with terms that are to be expected."""
+    return best.explains and best.at_rest and not best.doubts
+
+
+def _component(found: Sequence[Registration]) -> str:
+    """Say which component a map holds that does not say it itself; nothing about others."""
+    by_name: dict[str, float] = {}
+    for each, value in zip(found, odds(found), strict=True):
+        by_name[each.component] = by_name.get(each.component, 0.0) + float(value)
+    own = found[0].component
+    if not own:
+        return ""
+    others = [f"B{name} with {in_per_cent(value)}" for name, value in by_name.items()
+              if name != own and value > EQUALLY_GOOD]
+    return (f"The map is of B{own}, with a probability of {in_per_cent(by_name[own])} among Bx, By "
+            f"and Bz along its axes{' (or ' + in_a_row(others) + ')' if others else ''}. ")
+
+
+def _doubts(best: Registration) -> list[str]:
+    """Say what lies far from its prior, and what a common factor of the readings tells."""
+    if not best.doubts:
+        return []
+    return [each for each in (doubts_in_words(best.doubts), factor_in_words(best.factor)) if each]
+
+
+def _is_of_the_file(best: Registration) -> bool:
+    """Tell whether doubts are about what the file says of its numbers, not about the magnet."""
+    return bool(best.doubts) and (best.explains or bool(known_factor(best.factor))
+                                  or len(_measured(best)) == 1)
+
+
+def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
+    """Return the next step and its command after a fit with doubts."""
+    again = f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR"
+    if len(_measured(best)) == 1 and not best.component:
+        return (f"Is the component really B{_measured(best)[0]}, along the map's own axes? If that "
+                f"is not certain, name its column {UNDIRECTED_COLUMN} (import-map: --component "
+                "unknown), and register finds which one it is.", again)
+    if factor_in_words(best.factor):
+        return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
+                "instrument.flux_density_unit_T in the study), and register it again.", again)
+    return ("Look whether rows, axes, components and units of the map are what its columns say "
+            "(halbach-fe check does, for maps of a volume), and state in [instrument_sd] if less "
+            "is known of the probe. Then register it again.", again)
+
+
 def rivals(found: Sequence[Registration]) -> list[Registration]:
-    """Return the other poses between which and the first one the readings do not decide."""
+    """Return the other poses between which and the first one the readings do not decide.
+
+    If no pose explains the map, these are the poses that a symmetric magnet makes equal to the
+    first: evidence of fits that do not hold says nothing.
+    """
+    if not found[0].explains:
+        return [each for each in found[1:] if is_symmetric_to(found[0], each)]
     least = found[0].log_evidence - UNDECIDED_LOG_EVIDENCE
     return [each for each in found[1:] if each.log_evidence > least]
 
@@ -211,8 +293,10 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
     """Say which other poses are possible, and whether it matters which of them is used."""
     probability, said = stated_odds(found), []
     alike, unlike = [], []
+    if not found[0].explains:
+        alike = rivals(found)
     for each, value in zip(found[1:], probability[1:], strict=True):
-        if value > EQUALLY_GOOD:
+        if value > EQUALLY_GOOD and found[0].explains:
             if _fit_alike(found[0], each) or is_symmetric_to(found[0], each):
                 alike.append(each)
             else:
@@ -222,10 +306,7 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
         said.append(
             f"{others} {'predicts' if one else 'predict'} the same readings, because the nominal "
             "magnet is the same after the turn from one pose to the other: no reading can tell "
-            "them apart. The field that infer finds at the places of the map is the same in all "
-            "of them, so that any may be used. Only the names of blocks are exchanged, which "
-            "matters if you look for one block or give measured blocks (--blocks): then find out "
-            "by a mark on the magnet which pose is the real one.")
+            "them apart." + (USE_ANY if is_sound(found[0]) else ""))
     elif alike:
         said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
                     "how the map was measured which one is real.")
@@ -258,18 +339,19 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
     first, second = (_axes(each) for each in (one, other))
     turn = second @ first.T
     off = np.abs(other.middle_m - turn @ one.middle_m)
-    if (off > SAME_PLACE * np.hypot(np.abs(turn) @ one.translation_sd_m,
-                                    other.translation_sd_m)).any():
+    if one.component != other.component:
+        return False
+    # error bars are those of readings with as much noise as the fit leaves
+    wider = SAME_PLACE * np.sqrt(max(1.0, one.chi2))
+    if (off > wider * np.hypot(np.abs(turn) @ one.translation_sd_m,
+                               other.translation_sd_m)).any():
         return False
     return turned_onto(build_magnet(one.study), turn) is not None
 
 
 def _axes(one: Registration) -> np.ndarray:
     """Return the rotation by right angles (3, 3) that is nearest to the map's axes."""
-    matrix = np.zeros((3, 3))
-    for number, axis in enumerate(axes_of_map(one.instrument).values()):
-        matrix[COMPONENTS.index(axis[-1]), number] = -1.0 if axis.startswith("-") else 1.0
-    return matrix
+    return nearest_right_angles(one.instrument)
 
 
 def _fit(best: Registration, before: str) -> str:
@@ -291,7 +373,7 @@ def sentences(found: Sequence[Registration]) -> list[str]:
             "known before (the prior, or another map on the same stage) holds "
             f"{'it' if len(best.undetermined) == 1 else 'them'}, with the standard deviations of "
             "the table.")
-    if len(by_hypothesis(found)) > 1:
+    if len(by_hypothesis(found)) > 1 and best.explains:
         said.append("Odds of what is open: " + "; ".join(
             f"{name} {100 * value:.3g} %" for name, value in by_hypothesis(found).items()) + ".")
     return said + [f"{key} is {value:.5g} ± {sd:.1g}."
@@ -325,7 +407,9 @@ def pose_table(
     rows = []
     for number, (each, probability) in enumerate(zip(found, stated_odds(found), strict=True), 1):
         rows.append({
-            "pose": str(number), "odds": f"{100 * probability:.3g} %",
+            "pose": str(number),
+            "odds": f"{100 * probability:.3g} %" if found[0].explains else EMPTY_CELL,
+            **({"component": f"B{each.component}"} if each.component else {}),
             **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
             f"{before} off by": _rms_in_words(each.nominal_rms_T),
@@ -364,6 +448,13 @@ def probe_table(best: Registration) -> list[dict[str, str]]:
     return rows
 
 
+def doubt_table(best: Registration) -> list[dict[str, str]]:
+    """Return rows of text: terms that are farther from their priors than chance takes them."""
+    return [{"term": each.name, "changed by": each.size, "known before": each.known,
+             "that is": f"{decimals(each.distance, 2)} standard deviations"}
+            for each in best.doubts]
+
+
 def _measured(best: Registration) -> list[str]:
     """Return the components that the map has."""
     return [name for name, rms in zip(COMPONENTS, best.rms_T, strict=True) if not np.isnan(rms)]
@@ -375,7 +466,10 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         return [None if np.isnan(value) else float(value) for value in values]
 
     return {"poses": [{
-        "odds": float(probability), "at_rest": each.at_rest, "explains": each.explains,
+        "odds": float(probability) if found[0].explains else None,
+        "at_rest": each.at_rest, "explains": each.explains, "sound": is_sound(each),
+        "doubts": [one.plain() for one in each.doubts], "factor": each.factor,
+        **({"component": each.component} if each.component else {}),
         "undetermined": list(each.undetermined), "chi2": each.chi2,
         "held_out_chi2": None if np.isnan(each.held_out_chi2) else each.held_out_chi2,
         "axes": axes_of_map(each.instrument),
@@ -400,6 +494,9 @@ def write_registration(
     """Write study.registered.toml, registration.json, registration.html and its figure."""
     steps = [(found[0].study, NOTE)]
     write_edited(folder / STUDY_FILE, text, steps)
+    if is_undirected(data):
+        data = directed(data, found[0].component)
+        write_map(data, folder / MAP_FILE)
     _write_page(study, data, found, folder, provenance, NOMINAL)
 
 
@@ -442,7 +539,8 @@ def _write_page(
                provenance, answer=answer(found, before, name, assumed=study.instrument),
                found=sentences(found), rows=pose_table(found, before),
                places=place_table(found),
-               name=study.name, probe=probe_table(best), map=name)
+               name=study.name, probe=probe_table(best), map=name,
+               doubts=doubt_table(best), undirected=bool(best.component))
 
 
 def _where(best: Registration, data: xr.Dataset) -> Figure:

@@ -21,7 +21,7 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
-from halbach_fe.measurement.probe_in_field import ProbeModel
+from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
 from halbach_fe.measurement.suspect_rows import broken_rows
 from halbach_fe.report.map_check import (
     answer,
@@ -477,6 +477,60 @@ CLEAN = MapCheck(
     structure=0.0, redundancy=0.8, excluded=np.zeros(315, bool), residual_T=np.zeros((315, 3)),
     unseen_T=np.zeros((315, 3)), corrected_T=np.zeros((315, 3)))
 """What is known of a map without errors."""
+
+
+def test_noise_of_positions_has_a_bar_or_is_a_limit(generator):
+    """Residuals of 20 µm and 20 µT in gradients from 0.5 to 50 T/m; and the same with what charges
+    do not follow, which grows with the square of the gradient: 36 µm where 20 are true.
+    """
+    position, pulls, noises, limits, plain = 2e-5, [], [], [], []
+    for _ in range(60):
+        size = 50 * generator.uniform(0.1, 1.0, 400)**2
+        gradient = size[:, None, None] * generator.standard_normal((400, 3, 3)) / 3
+        left = np.einsum("ncj,nj->nc", gradient, position * generator.standard_normal((400, 3)))
+        left += NOISE_T * generator.standard_normal(left.shape)
+        found = scatter_of(gradient, left)
+        assert not found.at_most
+        pulls.append((found.position_m - position) / found.position_sd_m)
+        noises.append(found.noise_T)
+        steep = np.linalg.norm(gradient, axis=2)
+        spoiled = (left + 3 * position * steep**2 / steep.max()
+                           * generator.standard_normal(left.shape))
+        wrong = scatter_of(gradient, spoiled)
+        plain.append((noise_of(gradient, left)[0], noise_of(gradient, spoiled)[1]))
+        limits.append(wrong.position_m)
+        assert wrong.at_most
+    # 60 pulls of unit normal numbers: their rms is 1 ± 0.09, their mean 0 ± 0.13
+    assert 0.65 < np.sqrt(np.mean(np.square(pulls))) < 1.5
+    assert abs(np.mean(pulls)) < 0.6
+    assert np.median(noises) == pytest.approx(NOISE_T, rel=0.07)
+    # controls: positions counted as noise of readings, and the misfit as positions
+    noise, displaced = np.median(plain, axis=0)
+    assert noise > 1.08 * NOISE_T
+    assert displaced == pytest.approx(3.6e-5, rel=0.1)
+    # a limit is none in few maps only, and near enough to be of use
+    assert np.mean(np.array(limits) > position) > 0.9
+    assert np.median(limits) < 1.3 * position
+    # where the gradient is the same everywhere nothing tells positions
+    assert scatter_of(np.ones((400, 3, 3)), NOISE_T * np.ones((400, 3))).position_m == 0.0
+
+
+def test_what_is_advised_about_positions():
+    known = answer(replace(CLEAN, position_noise_m=2e-5, position_noise_sd_m=1e-6)).said
+    assert "positions that are 20.0\u00a0±\u00a01.0\u00a0µm off" in known
+    assert "as sigma_T and position_sd_m" in known
+    limit = answer(replace(CLEAN, position_noise_m=2.1e-5, position_noise_at_most=True)).said
+    assert "positions are at most 21\u00a0µm off" in limit
+    assert "at most 21\u00a0µm." in limit
+    # far more than a stage's: in mm, and no noise of positions
+    lost = answer(replace(CLEAN, position_noise_m=0.011294, position_noise_sd_m=1e-4))
+    assert "11.29\u00a0±\u00a00.10\u00a0mm off" in lost.said or "11\u00a0mm off" in lost.said
+    assert "no noise of positions" in lost.said
+    assert "Do not put it into the study" in lost.said
+    assert not lost.sound
+    assert lost.trust.startswith("No")
+    assert lost.command.startswith("halbach-fe check")
+    assert answer(CLEAN).sound
 
 
 def test_a_map_on_a_stage_is_registered_first():

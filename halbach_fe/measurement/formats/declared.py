@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 FORMATS = ("columns", "opera", "comsol", "openpmd")
 """Names of the formats of other programs that can be read."""
 
+UNKNOWN = "unknown"
+"""The component of a column B of which nobody knows which it is."""
+
 
 @dataclass(frozen=True)
 class DeclaredFormat:
@@ -22,7 +25,7 @@ class DeclaredFormat:
     columns : tuple of str
         Name of each column; ``-`` for a column to ignore.
     component : str
-        Component x, y or z of a column that is named just B.
+        Component x, y or z of a column that is named just B; ``unknown`` if nobody knows it.
     at : mapping of str to float, in m
         Constant coordinates, for which the file has no column.
     origin_m : tuple of float or None

@@ -14,9 +14,9 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map
+from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected
 from halbach_fe.measurement.formats import names, units
-from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.text import Line, comma_hint
 from halbach_fe.study.types import MAX_LENGTH_M
@@ -134,6 +134,8 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         data["time_s"] = ("point", si["t"][~blank], {"units": "s"})
     if table.comments:
         data.attrs["comments"] = table.comments
+    if declared.component == UNKNOWN:
+        data = undirected(data)
     lengths = {unit for name, unit in unit_of.items() if unit in units.LENGTHS}
     fields = {unit for name, unit in unit_of.items() if unit in units.FIELDS}
     ignored = tuple(column.text for index, column in enumerate(columns)
@@ -186,7 +188,7 @@ def _used(
         used[column.quantity] = index
     components = [name for name in names.FIELDS if name in used]
     if declared.component and used:
-        name = f"B{declared.component}"
+        name = f"B{'z' if declared.component == UNKNOWN else declared.component}"
         if "B" not in used or components:
             raise _contradiction(table, "header", ", ".join(components) or "no column B",
                                  f"--component {declared.component}")
@@ -219,7 +221,8 @@ def _missing(
     if absent:
         missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
     if "B" in used:
-        missing.append("which component B is (--component x, y or z)")
+        missing.append("which component B is (--component x, y or z; or unknown, if nobody knows: "
+                       "halbach-fe register then tries all three)")
     elif not set(names.FIELDS) & set(used):
         missing.append("which columns are Bx, By or Bz (--columns)")
     half = {"Br", "Bphi"} - set(used)

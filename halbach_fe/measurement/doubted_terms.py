@@ -1,0 +1,205 @@
+"""The law by which terms of a fit are doubted that lie many prior standard deviations away.
+
+`check`, `register` and `infer` fit terms of pose, instrument and blocks, each with a prior. A good
+chi-squared alone does not make their answer right: a wrong map is explained too, by terms that
+nothing real has. Such terms are named, and forbid a "Yes".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special as special
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import decimals
+from halbach_fe.geometry.magnet import Magnet
+
+CHANCE = 2e-3
+"""Probability that of all terms of a fit, if they are as their priors say, one is doubted. The
+limit is 4.0 prior standard deviations for the 27 terms of a map's instrument, and 5.1 for those and
+the 1 728 of 576 blocks."""
+
+FACTOR_OFF = 0.1
+"""Part by which readings must differ in size from the model for their unit to be suspected: blocks
+of another grade are a few per cent off."""
+
+NEAR_FACTOR = 0.05
+"""Part by which a factor may differ from that of a known error: blocks of another batch or
+temperature are a few per cent off."""
+
+FACTORS = {
+    1e-4: "as if numbers in T were taken for G", 1e-3: "as if numbers in T were taken for mT",
+    0.1: "as if numbers in mT were taken for G", 0.5: "half", 2.0: "twice", -1.0: "the opposite",
+    10.0: "as if numbers in G were taken for mT", 1e3: "as if numbers in mT were taken for T",
+    1e4: "as if numbers in G were taken for T"}
+"""Ratios of readings to fields that errors of a file make."""
+
+ALL_BLOCKS = "strength of all blocks together"
+"""Name of the median deviation of all blocks."""
+
+MOST_NAMED = 5
+"""Largest number of doubted terms that a sentence names."""
+
+UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "": ("%", 100.0)}
+"""Unit that people read, and its factor, by the SI unit of a term."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A number of a fit, and what was known of it before.
+
+    Attributes
+    ----------
+    name : str
+        What it is, in words: "gain of Bx".
+    unit : str
+        Its SI unit: m, rad, T, or nothing for parts of 1.
+    value : float
+        Its change from the mean of its prior.
+    prior_sd : float
+    """
+
+    name: str
+    unit: str
+    value: float
+    prior_sd: float
+
+    @property
+    def distance(self) -> float:
+        """How many prior standard deviations it lies away."""
+        return abs(self.value) / self.prior_sd if self.prior_sd else 0.0
+
+    @property
+    def size(self) -> str:
+        """Its change, for people."""
+        unit, factor = UNITS[self.unit]
+        sign = "\u2212" if self.value < 0 else "+"
+        return f"{sign}{decimals(factor * abs(self.value))}\u00a0{unit}"
+
+    @property
+    def known(self) -> str:
+        """What was known of it before, for people."""
+        unit, factor = UNITS[self.unit]
+        return f"±\u00a0{decimals(factor * self.prior_sd, 2)}\u00a0{unit}"
+
+    @property
+    def in_words(self) -> str:
+        """The term with its prior, for people."""
+        if self.name == ALL_BLOCKS:
+            return (f"the blocks would have to be {decimals(100 * abs(self.value))}\u00a0% "
+                    f"{'weaker' if self.value < 0 else 'stronger'} than they were ordered "
+                    f"({decimals(self.distance, 2)} standard deviations of a block, "
+                    f"{self.known})")
+        return (f"{self.name} by {self.size}, where {self.known} was known before "
+                f"({decimals(self.distance, 2)} standard deviations)")
+
+    def plain(self) -> dict[str, object]:
+        """Return it as plain data."""
+        return {"name": self.name, "unit": self.unit, "value": self.value,
+                "prior_sd": self.prior_sd, "prior_sds_away": self.distance}
+
+
+def doubted_from(count: int) -> float:
+    """Return the prior standard deviations from which one of so many terms is doubted."""
+    return float(-special.ndtri(CHANCE / 2 / max(count, 1)))
+
+
+def doubts(terms: Sequence[Term], others: int = 0) -> tuple[Term, ...]:
+    """Return the terms that are farther from their priors than chance takes them, farthest first.
+
+    ``others`` is the number of further terms of which these are the farthest.
+    """
+    limit = doubted_from(len(terms) + others)
+    return tuple(sorted((one for one in terms if one.distance > limit),
+                        key=lambda one: -one.distance))
+
+
+def doubts_in_words(found: Sequence[Term]) -> str:
+    """Say which terms are doubted; nothing if none is."""
+    if not found:
+        return ""
+    more = len(found) - MOST_NAMED
+    named = "; ".join(one.in_words for one in found[:MOST_NAMED])
+    return ("For that these would have to be changed far beyond what was known before: "
+            f"{named}{f'; and {more} more' if more > 0 else ''}.")
+
+
+def words_of(name: str) -> tuple[str, str]:
+    """Return the words and the SI unit of a term of `instrument_terms.NAMES`, or of a stage.
+
+    The name of a map, stage or probe may stand before it: ``fringe.gain_x``.
+    """
+    owner, _, term = name.rpartition(".")
+    kind, *axes = term.replace("stage_shift", "shift").split("_")
+    unit = axes.pop() if axes[-1] in UNITS else ""
+    first, last = axes[0], axes[-1]
+    said = {"translation": f"place along {first}", "rotation": f"turn about {first}",
+            "shift": f"place along {first} of the stage",
+            "crosstalk": f"turn of the B{first[0]} sensor towards {last[-1]}",
+            "gain": f"gain of B{first}", "offset": f"offset of B{first}",
+            "drift": f"drift of B{first}", "sensor": f"place of the B{first} sensor along {last}"}
+    return (said[kind] + (f" ({owner})" if owner else ""),
+            "rad" if kind == "crosstalk" else unit)
+
+
+def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Floats,
+                 ) -> tuple[Term, ...]:
+    """Return the doubts about what an update has done to the blocks.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    mean, prior_mean, prior_sd : ndarray, shape (m,), in A/m
+        Parameters of the magnet, of which the first are the magnetizations of its blocks.
+
+    Returns
+    -------
+    tuple of Term
+        The median of all blocks along their magnetizations in parts of 1 (a reversed block moves
+        the mean), compared with the standard deviation of one block; or the block that is farthest
+        from its prior.
+    """
+    count = len(magnet.blocks)
+    change, sd, nominal = (values[:magnet.dimension * count].reshape(count, -1) for values in (
+        mean - prior_mean, prior_sd, magnet.nominal_magnetization))
+    size = np.linalg.norm(nominal, axis=1)
+    there = (size > 0) & (sd > 0).any(axis=1)
+    if not there.any():
+        return ()
+    change, sd = change[there] / size[there, None], sd[there] / size[there, None]
+    axes = nominal[there] / size[there, None]
+    along = np.sum(axes * change, axis=1)
+    own = float(np.sqrt(np.mean(np.sum(axes**2 * sd**2, axis=1))))
+    common = Term(ALL_BLOCKS, "", float(np.median(along)), own)
+    if found := doubts([common], sd.size):
+        return found
+    away = np.abs(change) / np.where(sd > 0, sd, np.inf)
+    block, axis = np.unravel_index(int(np.argmax(away)), away.shape)
+    label = magnet.blocks[np.flatnonzero(there)[block]].name
+    return doubts([Term(f"magnetization of block {label} along {'xyz'[axis]}", "",
+                        float(change[block, axis]), float(sd[block, axis]))], sd.size)
+
+
+def factor_in_words(factor: float) -> str:
+    """Say that readings are a factor times the field of the model; nothing if they are not."""
+    if abs(factor - 1) < FACTOR_OFF:
+        return ""
+    known = f" ({words})" if (words := known_factor(factor)) else ""
+    return (f"The readings are {decimals(factor)} times the field of the magnet as it was ordered"
+            f"{known}: look at their unit, sign and factor in the file first, and at the remanence "
+            "in the study.")
+
+
+def known_factor(factor: float) -> str:
+    """Return what error of a file a factor is near to, in words; nothing if none."""
+    return next((words for value, words in FACTORS.items()
+                 if abs(factor / value - 1) < NEAR_FACTOR), "")
+
+
+def factor_of(readings: Floats, field: Floats) -> float:
+    """Return the factor by which a field (n,) is nearest to readings (n,); 1 where it is zero."""
+    power = float(field @ field)
+    return float(field @ readings) / power if power else 1.0
