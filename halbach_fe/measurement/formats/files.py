@@ -12,14 +12,23 @@ import xarray as xr
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
 from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import check_readings, write_map
-from halbach_fe.measurement.formats import bdsim, columns, comsol, geant4, openpmd, opera
+from halbach_fe.measurement.formats import (
+    bdsim,
+    columns,
+    comsol,
+    g4beamline,
+    geant4,
+    openpmd,
+    opera,
+)
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
-    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read), strict=True))
+    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read),
+    strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
@@ -89,6 +98,10 @@ def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
     lines = lines_of(raw, declared, where)
     if comsol.is_comsol(lines):
         return "comsol"
+    if g4beamline.is_g4beamline(lines):
+        return "g4beamline"
+    if bdsim.is_bdsim(lines):
+        return "bdsim"
     return "opera" if opera.is_opera(lines) else "columns"
 
 
