@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.errors import MeasurementError, must_be, printable
 from halbach_fe.measurement.field_map import (
     FIELD_COLUMNS,
     OTHER_COLUMNS,
@@ -80,8 +80,8 @@ def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
 
 def unused_lines(preface: Sequence[Line]) -> tuple[str, ...]:
     """Return sentences about lines that may change the meaning of the numbers below them."""
-    found = [f"Line {number} says '{''.join(filter(str.isprintable, line.strip()[:80]))}', of which "
-             "nothing was used: if it is a shift, state it by --origin-m, and what else it says "
+    found = [f"Line {number} says '{printable(line.strip(), 80)}', of which nothing was used: "
+             "if it is a shift, state it by --origin-m, and what else it says "
              "by other options or in the study."
              for number, line in preface if MEANING.search(line[:MAX_LINE])]
     return tuple(found[:MAX_REMARKS])

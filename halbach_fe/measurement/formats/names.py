@@ -34,6 +34,8 @@ NOISE_WORDS = frozenset((
 GLUED = re.compile(r"(?:sigma|σ|std|stdev|err|error|unc|noise|delta|d|u)(b|b[xyzr]|bphi)"
                    r"|(b|b[xyzr]|bphi)(?:sigma|std|stdev|err|error|unc|noise)")
 """Names that join such a word and a component without a space: dBx, sigmaBx, Bxerr."""
+OF_FIELD = re.compile(r"\((B\w{0,4})\)")
+"""The component in brackets in sigma(Bx)."""
 
 MAX_NAME = 60
 BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*")
@@ -64,7 +66,7 @@ def parse(text: str, stated: bool = False) -> ColumnName:
     text = text.strip().strip('"').strip()
     if len(text) > MAX_NAME:
         return ColumnName(f"{text[:MAX_NAME]}...")
-    base, unit = _split(re.sub(r"\((B\w{0,4})\)", r"_\1", text))  # sigma(Bx)
+    base, unit = _split(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
     key = _key(base)
     quantity = ALIASES.get(key) or _other_quantity(base, key, unit.strip()) or (
         key if stated and key in STATED else "")

@@ -14,8 +14,9 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.measurement import clock_times as times
 from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map
-from halbach_fe.measurement.formats import names, times, units
+from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.text import Line, comma_hint

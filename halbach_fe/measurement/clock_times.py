@@ -13,26 +13,27 @@ from halbach_fe.core.arrays import Floats
 DAY_S = 86_400.0
 LEAST_CLOCK = 10_000
 """Smallest number that is taken for a time of day, 1:00:00: counters of seconds begin below."""
-FEWEST = 2
-"""Smallest count of different times that may be times of day without saying so."""
 TIME_OF_DAY = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:[.,]\d{1,9})?))?")
 
 
 def look_like_clock(values: Floats) -> bool:
     """Return whether numbers may be times of day, HHMMSS, that are taken for seconds.
 
-    All are whole, of at least 5 digits, and hours, minutes and seconds of a day. Of counters of
-    seconds that pass through 100 s at least one number ends on more than 59.
+    All are whole, of at least 5 digits, and hours, minutes and seconds of a day, and they are of
+    more than one minute: within a minute both are the same. A counter of seconds that passes from
+    one hundred to the next in steps of up to 40 s has a number that ends on more than 59.
     """
     known = values[np.isfinite(values)]
     whole = known == np.floor(known)
-    if not whole.all() or len(np.unique(known)) < FEWEST or known.min() < LEAST_CLOCK:
+    if not whole.all() or not known.size or known.min() < LEAST_CLOCK:
         return False
-    return bool(((known < 240_000) & (known % 100 < 60) & (known // 100 % 100 < 60)).all())
+    minutes = known // 100
+    return len(np.unique(minutes)) > 1 and bool(
+        ((known < 240_000) & (known % 100 < 60) & (minutes % 100 < 60)).all())
 
 
 def from_clock(values: Floats) -> Floats | None:
-    """Return times (n,) in s after midnight of numbers HHMMSS; None if they are none."""
+    """Return times (n,) in s after the first one of numbers HHMMSS; None if they are none."""
     valid = (values >= 0) & (values < 240_000) & (values % 100 < 60) & (values // 100 % 100 < 60)
     if not valid.all():
         return None
@@ -40,9 +41,9 @@ def from_clock(values: Floats) -> Floats | None:
 
 
 def from_texts(cells: Sequence[str]) -> Floats | None:
-    """Return times (n,) in s of times of day or ISO stamps; None if a cell is neither.
+    """Return times (n,) in s after the first one of times of day or ISO stamps.
 
-    They count from the midnight before the first of them.
+    None stands for cells that are neither.
     """
     found = [TIME_OF_DAY.fullmatch(cell.strip()) for cell in cells]
     if all(found):
@@ -52,16 +53,15 @@ def from_texts(cells: Sequence[str]) -> Floats | None:
     try:
         stamps = [datetime.fromisoformat(cell.strip()) for cell in cells]
         first = min(stamps)
-        midnight = first.replace(hour=0, minute=0, second=0, microsecond=0)
-        return np.array([(stamp - midnight) / timedelta(seconds=1) for stamp in stamps])
+        return np.array([(stamp - first) / timedelta(seconds=1) for stamp in stamps])
     except (ValueError, TypeError, OverflowError):  # TypeError: only some have a time zone
         return None
 
 
 def _over_midnight(times: Floats) -> Floats:
-    """Add a day where times of day fall back by more than half a day, as midnight has passed.
+    """Return times of day as times after the first one.
 
-    Rows that are not in the order of time may also go back to the day before.
+    Midnight has passed where they fall back by more than half a day. Rows that are not in the order of time may also go back to the day before.
     """
     steps = np.diff(times, prepend=times[:1])
     days = np.zeros(len(times))
@@ -69,4 +69,5 @@ def _over_midnight(times: Floats) -> Floats:
     for row in np.flatnonzero(np.abs(steps) > DAY_S / 2):
         day = day + 1 if steps[row] < 0 else max(0, day - 1)
         days[row:] = day
-    return np.asarray(times + DAY_S * days)
+    times = times + DAY_S * days
+    return np.asarray(times - times.min())
