@@ -61,7 +61,8 @@ def from_texts(cells: Sequence[str]) -> Floats | None:
 def _over_midnight(times: Floats) -> Floats:
     """Return times of day as times after the first one.
 
-    Midnight has passed where they fall back by more than half a day. Rows that are not in the order of time may also go back to the day before.
+    Midnight has passed where they fall back by more than half a day. Rows that are not in the order
+    of time may also go back to the day before.
     """
     steps = np.diff(times, prepend=times[:1])
     days = np.zeros(len(times))

@@ -137,7 +137,8 @@ def test_hhmmss(tmp_path):
     with pytest.raises(MeasurementError, match="times of day HHMMSS"):
         timed(tmp_path, "hhmmss", (142355, 142399))
     # seconds that cannot be, or are not taken for, times of day
-    for seconds in ((142355, 142405, 142395), (142301, 142303, 142307), (1, 2, 3), (10000.5, 10001.5, 10002.5)):
+    for seconds in ((142355, 142405, 142395), (142301, 142303, 142307), (1, 2, 3),
+                    (10000.5, 10101.5, 10202.5)):
         found = timed(tmp_path, "time [s]", seconds).data["time_s"].values
         assert found.tolist() == list(seconds)
 
