@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
 
@@ -60,8 +62,9 @@ def test_it_is_what_the_correction_undoes(keys):
 STUDY = """
 name = "small"
 dimension = 2
-array = { rings = 1, blocks_per_ring = 8, inner_radius_m = 0.03, outer_radius_m = 0.05, \
-remanence_T = 1.3, recoil_permeability = 1.0, easy_axis = { kind = "halbach", order = 1 } }
+array = { blocks_per_ring = 8, inner_radius_m = 0.03, outer_radius_m = 0.05, \
+remanence_T = 1.3, recoil_permeability = 1.0, multipole_order = 1, rings = 1, \
+block = { shape = "sector" } }
 mesh = { block_size_m = 0.01 }
 [observation]
 quantity = "flux_density"
@@ -73,10 +76,14 @@ sigma_T = 1e-6
 """
 
 
+def parsed(text):
+    return parse_study(tomllib.loads(text))
+
+
 def test_a_map_is_written_in_its_units_and_axes():
     """Without errors of the probe, the converted map is that of a study without [instrument]."""
-    plain = simulate_campaign(parse_study(STUDY), 3)
-    stated = parse_study(STUDY + """
+    plain = simulate_campaign(parsed(STUDY), 3)
+    stated = parsed(STUDY + """
 [instrument]
 length_unit_m = 0.001
 flux_density_unit_T = 1e-4
@@ -96,8 +103,8 @@ field_axes = ["-y", "x", "z"]
 
 
 def test_gain_and_offset_are_in_the_readings():
-    plain = simulate_campaign(parse_study(STUDY), 3)
-    found = simulate_campaign(parse_study(
+    plain = simulate_campaign(parsed(STUDY), 3)
+    found = simulate_campaign(parsed(
         STUDY + "[instrument]\ngain = [0.01, 0.02, 0.0]\noffset_T = [1e-3, 0, 0]\n"), 3)
     expected = plain.without_noise[:, :2] * [1.01, 1.02] + [1e-3, 0]
     np.testing.assert_allclose(found.without_noise[:, :2], expected, atol=2e-12)
