@@ -288,9 +288,9 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
         exact = np.append(np.full(3, SAME_PLACE_M), np.full(both.sum(), SAME_DIGITS_T))
         copies = int(repeated(fewer, more, exact).sum())
         there = int(repeated(fewer[:, :3], more[:, :3], exact[:3]).sum())
-        read = field if fewer is sides[0] else values
+        of_fewer = field if fewer is sides[0] else values
         if shared > SHARED * len(fewer) or _no_chance(
-                copies, there, read[:, both], min(noise, sigma)):
+                copies, there, of_fewer[:, both], min(noise, sigma)):
             shared = max(shared, copies)
             raise MeasurementError(must_be(
                 f"`maps` '{one.name}' and '{other.name}'", "the campaign",

@@ -204,7 +204,7 @@ class FreeBlocks(StudyModel):
             wrong[members] = crossing(np.array([self.outline_m[n] for n in members]))
             self._refuse(wrong, "a prism, has an outline_m whose edges cross, or that has no "
                          "area")
-            sizes = np.ptp([self.outline_m[n] for n in members], axis=1)
+            sizes = np.ptp(np.array([self.outline_m[n] for n in members]), axis=1)
             wrong[members] = ((sizes < MIN_LENGTH_M) | (sizes > MAX_LENGTH_M)).any(axis=1)
             self._refuse(wrong, f"a prism, has an outline_m that is not from {MIN_LENGTH_M:g} to "
                          f"{MAX_LENGTH_M:g} m wide; is it in mm? Then write 0.01 for 10 mm")
