@@ -95,11 +95,10 @@ def test_a_field_along_z_in_two_dimensions_is_told(generator):
     del flat["array"]["free_blocks"]["size_z_m"]
     flat["observation"]["components"] = ["x", "y"]
     magnet = build_magnet(parse_study(flat))
-    points = GRID * [1, 1, 0]
-    points, where = np.unique(points, axis=0, return_index=True)
-    field = FIELD[where]
+    points, where = np.unique(GRID * [1, 1, 0], axis=0, return_index=True)
+    along, little = FIELD[where] + np.array([[0, 0, 0.3]]), FIELD[where] + np.array([[0, 0, 3e-3]])
     with pytest.warns(HalbachWarning, match=r"Bz up to 0\.3 T.* use a 3D study"):
-        read_campaign(magnet, maps_of(magnet.study, field_map(points, np.add(field, [0, 0, 0.3]))))
+        read_campaign(magnet, maps_of(magnet.study, field_map(points, along)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the Bz of a probe that is turned a little is no news
-        read_campaign(magnet, maps_of(magnet.study, field_map(points, np.add(field, [0, 0, 0.003]))))
+        read_campaign(magnet, maps_of(magnet.study, field_map(points, little)))
