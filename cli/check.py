@@ -18,16 +18,18 @@ from halbach_fe.cli import common
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    from halbach_fe.cli.format_options import add_map_format_arguments
+
     parser.add_argument("map", type=common.input_file, metavar="MAP",
-                        help="field map (CSV, HDF5 or VTU); see import-map for other formats")
+                        help="field map (CSV, HDF5 or VTU)")
     parser.add_argument("-o", "--output", type=common.path, metavar="DIR",
                         help="folder for the page and its files")
     common.add_json_argument(parser)
+    add_map_format_arguments(parser, "MAP")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Check the map, write the results, print a summary."""
-    from halbach_fe.measurement.field_map import read_map
     from halbach_fe.measurement.map_check import check_map
     from halbach_fe.report.map_check import (
         answer,
@@ -37,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
         write_map_check,
     )
 
-    data = read_map(arguments.map)
+    data = common.read_one(arguments, arguments.map)
     if arguments.output is not None:  # before the check, which may take a minute
         common.own_folder(arguments, "halbach-fe check")
     with common.progress_bar("checking") as show:

@@ -21,7 +21,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from halbach_fe.cli.guard import claim_buffers, guarded
 from halbach_fe.cli.streams import say as say
@@ -184,16 +184,19 @@ def own_folder(
     written until then name the files of the command line.
     """
     from halbach_fe.core.result_folder import result_folder
-    from halbach_fe.report.answer import known_inputs, known_paths
+    from halbach_fe.report.answer import MAP_OPTIONS, known_inputs, known_paths
 
     inputs = [value for value in (*vars(arguments).values(),
                                   *getattr(arguments, "listed_maps", {}).values())
               if isinstance(value, InputFile)]
-    named = {word: path for word, path in _given(arguments).items() if path in inputs}
+    # a map that needs options is not known by its path alone
+    named = {word: path for word, path in _given(arguments).items() if path in inputs
+             and not (word == "MAP" and _describes_a_format(arguments))}
     arguments.at_end.enter_context(result_folder(
         arguments.output, command, study, inputs, named, solving))
     arguments.at_end.enter_context(known_paths({
-        word: _from_here(path) for word, path in _paths_of(arguments).items()}))
+        word: path if word == MAP_OPTIONS else _from_here(path)
+        for word, path in _paths_of(arguments).items()}))
     arguments.at_end.enter_context(known_inputs(_described(arguments)))
 
 
@@ -325,15 +328,6 @@ def add_held_out_argument(parser: argparse.ArgumentParser) -> None:
                         "update the model")
 
 
-def measurements(
-    arguments: argparse.Namespace,
-) -> tuple[xr.Dataset, BlockTable | None, xr.Dataset | None]:
-    """Read the map, the block table and the held-out map; None stands for a file not given."""
-    from halbach_fe.measurement.field_map import read_map
-
-    return read_map(arguments.measurements), *blocks_and_held_out(arguments)
-
-
 def blocks_and_held_out(
     arguments: argparse.Namespace,
 ) -> tuple[BlockTable | None, xr.Dataset | None]:
@@ -381,7 +375,10 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     from halbach_fe.cli.format_options import declared_format
     from halbach_fe.measurement.formats.files import import_map
 
-    data = import_map(path, declared_format(arguments), arguments.format).data
+    imported = import_map(path, declared_format(arguments), arguments.format)
+    for remark in imported.imported.remarks:
+        say(remark)
+    data = imported.data
     data.encoding["source"] = str(path)
     return data
 
@@ -627,19 +624,26 @@ def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None 
         say(f"Report: {page}")
 
 
-def _paths_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+def _paths_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the paths that are known by the words for them in commands of an answer.
 
-    They are those of the command line. A posterior that is among them is of a map and blocks, which
-    the record of its folder names.
+    With the path of the map come the options with which it was read. The paths are those of the
+    command line. A posterior that is among them is of a map and blocks, which the record of its
+    folder names.
     """
     from halbach_fe.core.result_folder import named_inputs
+    from halbach_fe.report.answer import MAP_OPTIONS
 
     given = {word: path for word, path in _given(arguments).items() if path is not None}
     posterior = given.get("POSTERIOR")
     behind = named_inputs(posterior.parent) if posterior else {}
+    options = []
+    if "MAP" in given and _describes_a_format(arguments):
+        from halbach_fe.cli.format_options import format_words
+
+        options = format_words(arguments)
     return {**{word: path for word, path in behind.items() if word in ("MAP", "BLOCKS")}, **given,
-            "DIR": getattr(arguments, "output", None)}
+            "DIR": getattr(arguments, "output", None), MAP_OPTIONS: options}
 
 
 def _given(arguments: argparse.Namespace) -> dict[str, Path | None]:

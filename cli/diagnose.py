@@ -33,10 +33,13 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    from halbach_fe.cli.format_options import add_map_format_arguments
+
     common.add_study_arguments(parser, time_limit=False)
     common.add_dry_run_argument(parser)
     common.add_measurement_arguments(parser, several=True)
     common.add_held_out_argument(parser)
+    add_map_format_arguments(parser, "--measurements and --held-out")
     parser.add_argument("--time-limit", dest="diagnosis_limit", type=common.positive_number,
                         metavar="SECONDS",
                         help="time in s after which the search ends with what it has so far; the "

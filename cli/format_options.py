@@ -20,8 +20,9 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
                         help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
-                        "dx, dy, dz (moves of a stage from reading to reading), t (time), or - "
-                        "for a column that is ignored; a unit may follow, as in Bx[mT], t[s]")
+                         "dx, dy, dz (moves of a stage from reading to reading), t (time), scan, "
+                         "sigma or sigma_Bx ... (noise), or - for a column that is ignored; a unit "
+                         "may follow, as in Bx[mT], t[s], t[hhmmss]")
     parser.add_argument("--component", choices=(*AXES, UNKNOWN), default="",
                         help="component of the field in a column B; unknown, if nobody knows it, "
                         "for halbach-fe register to find")
@@ -34,6 +35,31 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
                         help="numbers have a decimal comma, as in 0,5")
     parser.add_argument("--encoding", default=DeclaredFormat.encoding,
                         help="encoding of a text file (default: UTF-8)")
+
+
+def add_map_format_arguments(parser: argparse.ArgumentParser, options: str) -> None:
+    """Add the same options to a verb that reads maps, those of ``options``."""
+    add_format_arguments(parser.add_argument_group(
+        "maps in other columns", f"of {options}, as halbach-fe import-map reads them, in the axes "
+        "of the magnet"))
+
+
+def format_words(arguments: argparse.Namespace) -> list[str]:
+    """Return the options that describe the format as words of a command line."""
+    found = [f"--{name.replace('_', '-')}={value}" for name in (
+        "format", "length_unit", "field_unit", "angle_unit", "component") if (
+            value := getattr(arguments, name, ""))]
+    if columns := getattr(arguments, "columns", ()):
+        found.append(f"--columns={','.join(columns)}")
+    if at := getattr(arguments, "at", {}):
+        found.append("--at=" + ",".join(f"{axis}={value!r}" for axis, value in at.items()))
+    if (origin := getattr(arguments, "origin_m", None)) is not None:
+        found.append("--origin-m=" + ",".join(map(repr, origin)))
+    if getattr(arguments, "decimal_comma", False):
+        found.append("--decimal-comma")
+    if (encoding := getattr(arguments, "encoding", "")) not in ("", DeclaredFormat.encoding):
+        found.append(f"--encoding={encoding}")
+    return found
 
 
 def declared_format(arguments: argparse.Namespace) -> DeclaredFormat:

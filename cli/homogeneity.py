@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    from halbach_fe.cli.format_options import add_map_format_arguments
+
     common.add_study_arguments(parser)
+    add_map_format_arguments(parser, "--measurements")
     parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     parser.add_argument("--measurements", type=common.input_file, metavar="MAP",
@@ -72,7 +75,6 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import homogeneity
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.measurement.field_map import read_map
     from halbach_fe.report.homogeneity import (
         answer,
         harmonic_rows,
@@ -87,7 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
     study = read_study(arguments.study)
     magnet, region = build_magnet(study), region_of(arguments)
     posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
-    data = read_map(arguments.measurements) if arguments.measurements else None
+    data = (common.read_one(arguments, arguments.measurements) if arguments.measurements
+            else None)
     with common.session(arguments, study) as session:
         found = homogeneity(magnet, session, region, posterior,
                             arguments.degrees or SHOWN_DEGREES, data)

@@ -1,9 +1,9 @@
 """Convert a measured map from another file format, to metres, tesla and halbach-fe's own columns.
 
 Reads tables of columns (separated by commas, semicolons, tabs or spaces, with or without a header),
-Opera's .table files, text files exported by COMSOL, and openPMD-beamphysics field meshes. Units,
-columns and constant coordinates that the file does not state must be given as options; nothing is
-guessed.
+Opera's .table files, text files exported by COMSOL, maps of G4beamline and BDSIM, and
+openPMD-beamphysics field meshes. Units, columns and constant coordinates that the file does not
+state must be given as options; nothing is guessed.
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_json(properties | {"map": str(arguments.output)})
     else:
         common.print_table([{"property": key, "value": text(value)}
-                            for key, value in properties.items()], f"Read as {imported.format}")
+                            for key, value in properties.items() if key != "remarks"],
+                           f"Read as {imported.format}")
+        for remark in imported.imported.remarks:
+            common.say(remark)
         common.say(f"Map: {arguments.output}")
     return 0
 
@@ -75,6 +78,8 @@ def summary(file: ImportedFile) -> dict[str, object]:
         "length_units": list(file.imported.length_units),
         "field_units": list(file.imported.field_units),
         "ignored_columns": list(file.imported.ignored),
+        "also_read": [name for name in ("sigma_T", "time_s", "scan") if name in file.data],
+        "remarks": list(file.imported.remarks),
         "points_without_reading": file.imported.dropped,
         "from_m": points.min(axis=0).tolist(), "to_m": points.max(axis=0).tolist(),
         "min_B_T": [float(np.nanmin(field[:, i])) for i in measured],

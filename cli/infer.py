@@ -19,15 +19,13 @@ from halbach_fe.core.errors import StudyError, must_be
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    from halbach_fe.cli.format_options import add_format_arguments
+    from halbach_fe.cli.format_options import add_map_format_arguments
 
     common.add_study_arguments(parser)
     common.add_dry_run_argument(parser)
     common.add_measurement_arguments(parser, several=True)
     common.add_held_out_argument(parser)
-    add_format_arguments(parser.add_argument_group(
-        "maps in other columns", "of --measurements and --held-out, as halbach-fe import-map "
-        "reads them, in the axes of the magnet"))
+    add_map_format_arguments(parser, "--measurements and --held-out")
     parser.add_argument("--samples", type=common.positive, metavar="N",
                         help="for iron with an H(B) curve: sample the non-linear posterior by four "
                         "Markov chains of N draws each, instead of linearizing")

@@ -36,7 +36,10 @@ MOST_ACROSS_M = 10.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    from halbach_fe.cli.format_options import add_map_format_arguments
+
     common.add_study_arguments(parser)
+    add_map_format_arguments(parser, "--measurements")
     parser.add_argument("--measurements", type=common.input_file, metavar="MAP",
                         help="measured field map (CSV or HDF5), unless the study lists maps")
     parser.add_argument("--fit", type=_open_key, action=_DifferentKeys, default=[],

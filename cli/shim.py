@@ -16,7 +16,10 @@ from halbach_fe.core.errors import StudyError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    from halbach_fe.cli.format_options import add_map_format_arguments
+
     common.add_study_arguments(parser)
+    add_map_format_arguments(parser, "--measurements")
     parser.add_argument("--measurements", type=common.input_file, required=True, metavar="MAP",
                         help="measured field map (CSV or HDF5)")
     parser.add_argument("--blocks", type=common.input_file, metavar="CSV",
@@ -66,7 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
     magnet = build_magnet(read_study(arguments.study))
     check_shimming(magnet.study)
     refuse_several_maps(magnet.study, "shim")
-    data, blocks, _ = common.measurements(arguments)
+    data = common.read_one(arguments, arguments.measurements)
+    blocks, _ = common.blocks_and_held_out(arguments)
     stock = read_blocks(arguments.stock) if arguments.stock else None
     # refuse before the solves, which may take long, what does not fit the study
     check_objective(magnet, common.reference(arguments), arguments.limit_units,

@@ -16,6 +16,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.instrument import in_si_and_magnet_axes
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -92,7 +93,11 @@ def run(arguments: argparse.Namespace) -> int:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
                                      arguments.hide_random, elements, progress, placed)
     written = write_campaign(campaign, arguments.output)
-    write_campaign_page(study, campaign.readings, campaign.held_out, campaign.blocks,
+    # the files are in the units and along the axes that the study states, the page is in m and T
+    readings, held_out = (None if data is None else in_si_and_magnet_axes(study.instrument, data)
+                          for data in (campaign.readings, campaign.held_out))
+    assert readings is not None
+    write_campaign_page(study, readings, held_out, campaign.blocks,
                         arguments.output, [common.digest(path) for path in written])
     summary = {
         "study": study.name, "points": campaign.readings.sizes["point"],
@@ -103,9 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         common.print_json(summary)
     else:
-        common.print_table(campaign_table(study, campaign.readings, campaign.held_out),
-                           "What was measured")
-        common.say_answer(arguments, answer(study, campaign.readings, campaign.held_out,
-                                            len(campaign.blocks)),
+        common.print_table(campaign_table(study, readings, held_out), "What was measured")
+        common.say_answer(arguments, answer(study, readings, held_out, len(campaign.blocks)),
                           arguments.output / "campaign.html")
     return 0

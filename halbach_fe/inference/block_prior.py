@@ -61,6 +61,16 @@ SAME_TEMPERATURE_K = 2.0
 """Largest difference of temperatures at which moments count as measured at the same one. It changes
 the moment of NdFeB, of -0.0012/K, by 0.24 %, no more than usual coils determine it."""
 
+ROOM_C, OTHER_TEMPERATURE_K = 20.0, 10.0
+"""Temperature in degrees Celsius at which data sheets state remanences, and the distance in K from
+it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
+
+NDFEB_PER_K = -0.0012
+"""Temperature coefficient of the remanence of NdFeB, for the size of the error that is told."""
+
+MANY_SD = 5.0
+"""Number of the study's standard deviations by which no mean of its own blocks is off by chance."""
+
 
 @dataclass(frozen=True)
 class TypeSamples:
@@ -104,12 +114,15 @@ class MeasuredPrior:
     placed : bool
         Whether the prior of a block is its own measurement, not the distribution of its type.
     types : tuple of TypeSamples
+    doubts : tuple of str
+        Sentences about why the table and the study may not be of the same blocks.
     """
 
     gaussian: Gaussian
     nominal: Floats
     placed: bool
     types: tuple[TypeSamples, ...]
+    doubts: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -139,7 +152,9 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     Warns
     -----
     HalbachWarning
-        If the prior is the distribution of the samples of a type that do not look normal.
+        If the prior is the distribution of the samples of a type that do not look normal, if the
+        blocks were measured at another temperature than that of the study, or if their mean is many
+        of the study's standard deviations from nominal.
     """
     size = magnet.dimension
     moves = mountings(magnet)
@@ -207,8 +222,49 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
             f"The measured blocks of type {', '.join(odd)} do not look normally distributed "
             f"(Anderson-Darling, p < {NOT_NORMAL:g} after Holm), but the prior assumes that they "
             "are: give ring and slot of every block.", HalbachWarning, stacklevel=2)
+    doubts = (*_temperature_doubts(magnet, table), *_mean_doubts(magnet, members))
+    for doubt in doubts:
+        warnings.warn(doubt, HalbachWarning, stacklevel=2)
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
-    return MeasuredPrior(gaussian, nominal, placed, types)
+    return MeasuredPrior(gaussian, nominal, placed, types, doubts)
+
+
+def _temperature_doubts(magnet: Magnet, table: BlockTable) -> list[str]:
+    """Return a sentence if the table's temperature is not that of the study and nothing corrects.
+
+    Tables whose temperatures differ from each other are refused elsewhere.
+    """
+    known = table.temperature[~np.isnan(table.temperature)]
+    if magnet.study.prior.temperature_coefficient_per_K is not None or not len(known):
+        return []
+    demagnetization = magnet.study.demagnetization
+    reference = ROOM_C if demagnetization is None else demagnetization.reference_temperature_C
+    away = float(np.median(known)) - reference
+    if abs(away) <= OTHER_TEMPERATURE_K:
+        return []
+    return [f"The blocks were measured at {np.median(known):g} °C, {abs(away):g} K from "
+            f"{reference:g} °C, and the study has no temperature coefficient: their moments count "
+            f"as they were read there, for NdFeB some {abs(100 * NDFEB_PER_K * away):.2g} % off. "
+            "Add temperature_coefficient_per_K and reference_temperature_C to [prior]."]
+
+
+def _mean_doubts(magnet: Magnet, members: dict[str, Floats]) -> list[str]:
+    """Return a sentence if the mean of all blocks is many of the study's deviations from nominal.
+
+    The mean of n independent blocks would be nearer by the root of n; but a table may be of blocks
+    of one batch, which share a deviation that the study did not state.
+    """
+    deviations = np.concatenate(list(members.values()))
+    settings = magnet.study.prior
+    mean = float(deviations[:, 0].mean())
+    sd = float(np.hypot(settings.magnitude_sd, settings.common_mode_sd))
+    if abs(mean) <= MANY_SD * sd:
+        return []
+    side = "stronger" if mean > 0 else "weaker"
+    return [f"The measured blocks are on average {100 * abs(mean):.2g} % {side} than the study "
+            f"says, {abs(mean) / sd:.0f} times the {100 * sd:.2g} % that its [prior] allows: are "
+            "remanence_T, the temperature and the unit of the moments right, and is it the table "
+            "of this magnet?"]
 
 
 def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:

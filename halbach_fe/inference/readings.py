@@ -29,6 +29,10 @@ from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
 
+OF_THE_PLANE = 0.05
+"""Largest Bz of a map of a 2D study relative to its other components: that of a probe that is
+turned by 3 degrees, far more than usual."""
+
 BY_CHANCE = 0.15
 """Share of a held-out map's readings that may equal those that update the model: more than readings
 at the same points do by chance."""
@@ -106,6 +110,18 @@ def _check_plane(heights: Floats, where: str) -> None:
             "Use a 3D study, or one circle of the map."))
 
 
+def _doubt_field_along_z(field: Floats, where: str) -> None:
+    """Warn if readings (n, 3) in T have a Bz, which no magnet of a 2D study makes."""
+    read = np.isfinite(field)
+    along, across = (np.abs(field[:, part][read[:, part]]).max(initial=0.0)
+                     for part in (slice(2, 3), slice(0, 2)))
+    if along > OF_THE_PLANE * across:
+        warnings.warn(
+            f"The {where} reads Bz up to {along:.3g} T, but a 2D study has no field along z: these "
+            "readings say nothing about its blocks. If the field is real, use a 3D study; if its "
+            "columns are exchanged, state instrument.field_axes.", HalbachWarning, stacklevel=2)
+
+
 def check_validation_map(readings: Readings, study: Study) -> None:
     """Refuse a held-out map of readings that update the model: it is no test of it.
 
@@ -162,6 +178,7 @@ def _read(
     observation = observe(study, points_of(data), measured, where)
     if magnet.dimension == 2:
         _check_plane(observation.points[:, 2], where)
+        _doubt_field_along_z(data["B_T"].values, where)
     inside = magnet.contains(observation.points)
     if inside.any():
         first = int(np.argmax(inside))

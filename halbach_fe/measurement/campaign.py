@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.stats import binom
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
@@ -42,6 +43,17 @@ of rounding. A component that was read again differs less in 8 % of all cases, a
 SHARED = 0.4
 """Share of a map's readings that another map may have too. Repeated readings are often equal if
 the device shows few digits: in 28 % of all cases if the last one counts as much as the noise."""
+
+SAME_DIGITS_T = 1e-12
+"""Difference up to which two readings are the same digit for digit: units were converted."""
+
+COARSE = 0.25
+"""Smallest step between readings, in units of their noise, from which a device shows so few digits
+that readings at a place repeat: then repetitions prove nothing."""
+
+FEWEST_COPIES, BY_CHANCE = 8, 1e-6
+"""Smallest count of rows that are copies of others, and the probability below which so many
+repetitions are no chance."""
 
 
 @dataclass(frozen=True)
@@ -150,12 +162,14 @@ def maps_of(
     data = check_maps(study, data)
     if isinstance(data, xr.Dataset):
         middle = _middle(study, data)
+        _refuse_copies(ONLY_MAP, data, study)
         found = [Map(ONLY_MAP, data, study, middle, middle, ONLY_MAP, ONLY_MAP, ONLY_MAP)]
     else:
         found = []
         for number, one in enumerate(study.maps):
             own = study.of_map(number)
             middle = _middle(own, data[one.name])
+            _refuse_copies(one.name, data[one.name], own)
             found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
                              one.stage or one.name, one.name, one.stage_shift_sd_m))
         _refuse_repeated(found)
@@ -163,6 +177,7 @@ def maps_of(
         validation_map = checked_map(validation_map, VALIDATION_MAP)
         own = study_for_validation_map(study.with_(maps=()), validation_map)
         first = found[0]
+        _refuse_copies(VALIDATION_MAP, validation_map, own)
         shared = not study.maps  # with the only map; among several it has an instrument of its own
         middle = _middle(own, validation_map)
         found.append(Map(
@@ -214,9 +229,50 @@ def repeated(rows: Floats, others: Floats, tolerance: Floats) -> NDArray[np.bool
     return np.isfinite(distance)
 
 
+def _refuse_copies(name: str, data: xr.Dataset, study: Study) -> None:
+    """Raise a MeasurementError if many rows of a map are others again, digit for digit.
+
+    Repeated readings at a place differ by their noise, unless the device shows few digits.
+    """
+    points, field, noise = _rows(data, study)
+    blank = np.nan_to_num(field, nan=NOT_READ_T)
+    order = np.lexsort(np.hstack([blank, points]).T)
+    here, read = points[order], blank[order]
+    # rows that are alike follow each other
+    again = (here[1:] == here[:-1]).all(axis=1)
+    copied = again & (np.abs(read[1:] - read[:-1]) <= SAME_DIGITS_T).all(axis=1)
+    count = int(copied.sum())
+    if count and _no_chance(count, int(again.sum()), field, noise):
+        row = int(max(order[np.flatnonzero(copied)[0]:][:2])) + 1
+        raise MeasurementError(must_be(
+            f"rows of `{name}`", f"study {study.name}", "readings of their own, as the same "
+            "readings must not count twice", f"{count} of {len(points)} rows that are another row "
+            f"again, digit for digit, such as row {row}", "Remove the copies; repeated "
+            "measurements differ by their noise."))
+
+
+def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
+    """Return whether ``copies`` of ``pairs`` of readings (n, 3) at a place are alike by no chance.
+
+    Two readings that are rounded to steps q have the same digits with the probability
+    ``q / (2 sqrt(pi) sigma)``, for q below the noise sigma.
+    """
+    if copies < FEWEST_COPIES or noise <= 0:
+        return False
+    alike = 1.0
+    for column in field.T:
+        values = np.unique(column[np.isfinite(column)])
+        steps = np.diff(values)
+        steps = steps[steps > SAME_DIGITS_T]
+        if len(values) and len(steps):
+            ratio = float(steps.min()) / noise
+            alike *= 1.0 if ratio > COARSE else ratio / (2 * np.sqrt(np.pi))
+    return bool(binom.sf(copies - 1, pairs, alike) < BY_CHANCE)
+
+
 def _refuse_repeated(maps: Sequence[Map]) -> None:
     """Raise a MeasurementError if many readings of a map are in another one too."""
-    rows = [_rows(one) for one in maps]
+    rows = [_rows(one.data, one.study) for one in maps]
     for (one, (points, field, noise)), (other, (places, values, sigma)) in combinations(
             zip(maps, rows, strict=True), 2):
         both = np.isfinite(field).any(axis=0) & np.isfinite(values).any(axis=0)
@@ -229,7 +285,13 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
             both.sum(), max(SAME_READING * min(noise, sigma), MIN_SIGMA_T)))
         fewer, more = sorted(sides, key=len)
         shared = int(repeated(fewer, more, tolerance).sum())
-        if shared > SHARED * len(fewer):
+        exact = np.append(np.full(3, SAME_PLACE_M), np.full(both.sum(), SAME_DIGITS_T))
+        copies = int(repeated(fewer, more, exact).sum())
+        there = int(repeated(fewer[:, :3], more[:, :3], exact[:3]).sum())
+        of_fewer = field if fewer is sides[0] else values
+        if shared > SHARED * len(fewer) or _no_chance(
+                copies, there, of_fewer[:, both], min(noise, sigma)):
+            shared = max(shared, copies)
             raise MeasurementError(must_be(
                 f"`maps` '{one.name}' and '{other.name}'", "the campaign",
                 "different maps, as the same readings must not count twice",
@@ -237,14 +299,14 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
                 "Remove one of them, or these rows of one."))
 
 
-def _rows(one: Map) -> tuple[Floats, Floats, float]:
+def _rows(data: xr.Dataset, study: Study) -> tuple[Floats, Floats, float]:
     """Return points (n, 3) in m, values (n, 3) in T and typical noise in T of a map.
 
     Both are in SI units and along the axes of the magnet. The noise is 0 if nothing states it.
     """
-    data = in_si_and_magnet_axes(one.study.instrument, one.data)
+    data = in_si_and_magnet_axes(study.instrument, data)
     field = np.asarray(data["B_T"].values, float)
-    noise = [region.sigma_T for region in one.study.noise.regions] if one.study.noise else []
+    noise = [region.sigma_T for region in study.noise.regions] if study.noise else []
     if "sigma_T" in data:
         noise = [float(np.median(data["sigma_T"].values[np.isfinite(field)]))]
     return points_of(data), field, min(noise, default=0.0)

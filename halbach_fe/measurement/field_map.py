@@ -30,6 +30,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
+from halbach_fe.measurement.clock_times import look_like_clock
 from halbach_fe.measurement.tables import (
     _check_printable,
     check_columns,
@@ -256,6 +257,7 @@ def _labelled(data: xr.Dataset, where: str) -> xr.Dataset:
     if "sigma_T" in data and data["sigma_T"].dims in ((), ("point",), ("component",)):
         data = data.assign(sigma_T=data["sigma_T"].broadcast_like(data["B_T"]).transpose(
             "point", "component"))
+    _check_names(data, where)
     by_point: tuple[str, ...] = ("point",)
     expected = dict.fromkeys((*POSITION_COLUMNS, "time_s", "scan"), by_point)
     expected |= {"B_T": ("point", "component"), "sigma_T": ("point", "component")}
@@ -272,6 +274,20 @@ def _labelled(data: xr.Dataset, where: str) -> xr.Dataset:
     return data
 
 
+def _check_names(data: xr.Dataset, where: str) -> None:
+    """Raise MeasurementError for units other than m, T and s, and for noise by another name."""
+    units = {"B_T": "T", "sigma_T": "T", "time_s": "s", **dict.fromkeys(POSITION_COLUMNS, "m")}
+    for name, unit in units.items():
+        stated = str(data[name].attrs.get("units", unit)) if name in data.variables else unit
+        if stated != unit:
+            raise MeasurementError(must_be(f"unit of `{name}`", where, unit, f"'{stated[:40]}'",
+                                           "Convert the numbers, and the attribute `units`."))
+    for name in map(str, data.variables):
+        if name not in units and name.lower().startswith(("sigma", "std", "err", "noise")):
+            raise MeasurementError(must_be("noise of the readings", where, "called `sigma_T`",
+                                           f"`{name[:40]}`", "Rename or remove it."))
+
+
 def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
     where = f"map {path}"
     try:
@@ -280,8 +296,11 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
             copy.flush()
             mesh = untrusted.read_mesh(Path(copy.name))
         data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
+        _check_names(xr.Dataset(dict.fromkeys(mesh.point_data, 0.0)), where)
         if "time_s" in mesh.point_data:
             data["time_s"] = ("point", mesh.point_data["time_s"])
+    except MeasurementError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
                                        f"'{error}'")) from None
@@ -346,7 +365,9 @@ def _check_header(header: list[str], where: str) -> None:
 def _number(cell: str, name: str, number: int, where: str) -> float:
     if not cell and (name in FIELD_COLUMNS or name in SIGMA_COLUMNS):
         return np.nan
-    return finite(cell, f"{name} in line {number}", where, "Leave a missing component empty.")
+    return finite(cell, f"{name} in line {number}", where,
+                  "Write seconds, or call the column time and convert the file by halbach-fe "
+                  "import-map." if name == "time_s" else "Leave a missing component empty.")
 
 
 def check_readings(data: xr.Dataset, path: Path | str) -> None:
@@ -371,6 +392,11 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
     if "time_s" in data and not np.isfinite(data["time_s"].values).all():
         raise MeasurementError(must_be("`time_s`", where, "finite numbers",
                                        "an infinite or missing value"))
+    if "time_s" in data and look_like_clock(data["time_s"].values.astype(float)):
+        first, last = data["time_s"].values[[0, -1]]
+        raise MeasurementError(must_be(
+            "`time_s`", where, "clearly in s", f"{first:.0f} to {last:.0f}, which may as well be "
+            "times of day, HHMMSS", "Write seconds; if they are, subtract the first of them."))
     if "scan" in data:
         _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)

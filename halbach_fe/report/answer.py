@@ -19,6 +19,9 @@ STANDS_FOR = {
     "DIR": "a new folder for the results"}
 """What a command's words stand for where the path is not known."""
 
+MAP_OPTIONS = "options of MAP"
+"""Key of the options, a list of words, without which a map in other columns cannot be read."""
+
 _NAMES: ContextVar[Mapping[str, object] | None] = ContextVar("names", default=None)
 
 
@@ -112,7 +115,9 @@ class Answer:
             path = paths.get(name)
             if path is None or (name == "DIR") != bool(slash):
                 return word
-            return shlex.quote(str(Path(str(path), rest)))
+            options = paths.get(MAP_OPTIONS) if name == "MAP" else None
+            return shlex.join([str(Path(str(path), rest)),
+                               *(options if isinstance(options, list) else [])])
 
         words = self.command.split(" ")
         if paths.get("BLOCKS") is not None and "--measurements" in words and not {

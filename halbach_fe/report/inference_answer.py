@@ -66,9 +66,10 @@ def _of_the_probe(result: InferenceResult) -> str:
     """Say that the error bars take the probe's calibration as exact, unless the study does not."""
     study = result.study
     known = [study.instrument_sd, *(one.instrument_sd or study.instrument_sd for one in study.maps)]
+    how = " ([instrument_sd] can say how well it is known)" if study.dimension == 3 else ""
     return "" if any(one.gain for one in known) else (
-        " The error bars take the calibration of the probe as exact ([instrument_sd] can say how "
-        "well it is known): if its gain is 0.1\u00a0% off, so is the field of the magnet.")
+        f" The error bars take the calibration of the probe as exact{how}: if its gain is "
+        "0.1\u00a0% off, so is the field of the magnet.")
 
 
 def _of_the_solver(result: InferenceResult) -> str:

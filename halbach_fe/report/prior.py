@@ -68,6 +68,7 @@ def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
         "rms_shift_A_per_m": float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))),
         "common_mode_sd": magnet.study.prior.common_mode_sd,
         "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
+        "doubts": list(prior.doubts),
         "not_normal": [samples.label for samples in prior.types if not samples.normal],
         "types": [
             {"type": samples.label, "n": len(samples.deviations),
@@ -160,12 +161,16 @@ def answer(prior: MeasuredPrior) -> Answer:
              f"distributed normally (Anderson-Darling test, p below {NOT_NORMAL} after Holm's "
              "correction)."
              + ("" if prior.placed else " The prior treats them as normal nevertheless."))
+    if prior.doubts:
+        trust = f"Not yet. {' '.join(prior.doubts)}"
     return Answer(
         "What do the measured blocks say about the magnet?", said, trust,
+        "Answer this first; then update the magnet with these blocks and a field map."
+        if prior.doubts else
         "Update the magnet with these blocks and a field map." if not odd or prior.placed else
         "Add ring and slot of every block to the table: then the distribution does not matter.",
         "halbach-fe infer STUDY --measurements MAP --blocks BLOCKS -o DIR",
-        prior.placed or not odd)
+        (prior.placed or not odd) and not prior.doubts)
 
 
 @own_style

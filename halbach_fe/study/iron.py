@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from halbach_fe.study import materials
 from halbach_fe.study.polygons import crossing
-from halbach_fe.study.types import Coordinate, Gap, Length, Line, StudyModel
+from halbach_fe.study.types import MAX_LENGTH_M, Coordinate, Gap, Length, Line, StudyModel
 
 
 class TableCurve(StudyModel):
@@ -161,6 +161,9 @@ class IronPrism(StudyModel):
     def _consistent(self) -> IronPrism:
         if crossing(np.array([self.outline_m]))[0]:
             raise ValueError("outline_m must have edges that do not cross, and some area")
+        if np.hypot(*np.array(self.outline_m).T).max() > MAX_LENGTH_M:
+            raise ValueError(f"outline_m must be within {MAX_LENGTH_M:g} m of the axis; is it in "
+                             "mm? Then write 0.01 for 10 mm")
         return self
 
 

@@ -29,8 +29,10 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.study.magnet import check_apart
 from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
+from halbach_fe.synthetic import stated_instrument
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet, magnetizations
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
@@ -48,6 +50,7 @@ from halbach_fe.synthetic.optional_packages import version_of
 from halbach_fe.synthetic.placed_blocks import in_places
 from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.reaction import by_elements, reaction_field
+from halbach_fe.synthetic.stated_instrument import columns
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 COIL_SD = 0.001
@@ -62,6 +65,8 @@ processors sum.
 
 SECONDS = 1.0
 """Time in s between two readings; the held-out points are measured after the map."""
+
+IDEAL = Instrument()
 
 LARGEST_CSV = 5e6 / 20
 """Count of numbers in a map, of some 20 characters each, from which it is written as HDF5."""
@@ -146,11 +151,6 @@ def simulate_campaign(
         raise StudyError(must_be(
             "`maps`", f"study {study.name}", "left out of a simulated measurement, which is of one "
             "map", f"a list of {len(study.maps)}"))
-    if stated := study.instrument.model_dump(exclude_defaults=True):
-        raise StudyError(must_be(
-            "`instrument`", f"study {study.name}", "left out of a simulated measurement, whose map "
-            "is at the study's points in m and T", f"{', '.join(sorted(stated))}",
-            "Leave [instrument] out. What the mapper does wrong is told by --hide."))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]))
     blocks, coil, noise, effects, faults = _streams(seed)
@@ -168,7 +168,7 @@ def simulate_campaign(
     check_apart(study.external, nominal_places, study.name)
     offsets = real_places(study, nominal_places, noise) - nominal_places
     recorded, readings = measured(
-        magnet, instrument, points, others, elements, faults, progress, offsets)
+        magnet, instrument, points, others, elements, faults, progress, offsets, study.instrument)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "effects": [effect.plain() for effect in hidden],
@@ -177,6 +177,8 @@ def simulate_campaign(
                        "rms_T": np.sqrt(np.mean(readings**2, axis=0)).round(DIGITS).tolist()},
         "blocks": magnetizations(mounted),
     }
+    if stated := study.instrument.model_dump(mode="json", exclude_defaults=True):
+        truth["stated_instrument"] = stated
     if magnet.bodies != mounted.bodies:
         truth["blocks_with_effects"] = magnetizations(magnet)
     seal = {"source": "synthetic", "study": study.name, "halbach_fe": version_of("halbach-fe"),
@@ -207,15 +209,20 @@ def _streams(seed: int) -> list[np.random.Generator]:
 def measured(
     magnet: TrueMagnet, instrument: FaultyInstrument, points: Floats, others: Floats,
     elements: Elements | None, generator: np.random.Generator, progress: Progress,
-    offsets: Floats | None = None,
+    offsets: Floats | None = None, stated: Instrument = IDEAL,
 ) -> tuple[Floats, Floats]:
     """Return the recorded points and readings without noise, both (n, 3).
 
     The ``points`` of the map come first, the held-out points ``others`` last. ``offsets`` (n, 3) in
-    m displace the probe from each of them.
+    m displace the probe from each of them. The ``stated`` instrument, which the study describes,
+    has these faults too; its units and axes are not those of the result.
     """
     nominal = np.vstack([points, others])
+    maps = [part for part in (points, others) if len(part)]
     places = instrument.places(nominal, generator)
+    if stated != IDEAL:
+        places = places + np.concatenate(
+            [stated_instrument.places(stated, part) - part for part in maps], axis=1)
     if offsets is not None:
         places = places + offsets  # the same for all sensors
     # the three sensors are usually in one place, whose field is then computed once
@@ -223,9 +230,21 @@ def measured(
     check_air(magnet, distinct)
     fields = true_field(magnet, distinct, elements, progress)[inverse].reshape(places.shape)
     time = np.arange(len(nominal)) / max(1, len(points) - 1)
+    if stated != IDEAL:
+        fields = _as_stated(stated, fields, [len(part) for part in maps])
     recorded, readings = instrument.record(
         nominal, instrument.readings(fields, time, generator))
     return recorded, readings.round(DIGITS)
+
+
+def _as_stated(stated: Instrument, fields: Floats, counts: Sequence[int]) -> Floats:
+    """Return fields (3, n, 3) in T that an ideal probe shows as the stated one shows ``fields``.
+
+    The readings of maps of so many points each follow each other.
+    """
+    shown = np.vstack([stated_instrument.values(stated, part, np.linspace(0.0, 1.0, part.shape[1]))
+                       for part in np.split(fields, np.cumsum(counts)[:-1], axis=1)])
+    return np.broadcast_to(shown, fields.shape)
 
 
 def true_field(
@@ -335,7 +354,13 @@ def _map(
     # coefficients is not
     known = None if study.observation.quantity == "flux_density" else sigma
     shown = np.where([name in observed_components(study) for name in COMPONENTS], readings, np.nan)
-    return field_map(points, shown.round(DIGITS), known, seal)
+    file = study.instrument  # states the units and axes of the map
+    if known is not None:
+        known = np.abs(columns(file.field_axes, known, file.flux_density_unit_T))
+    places = columns(file.position_axes, points, file.length_unit_m)
+    return field_map(
+        places if file.length_unit_m == 1 else places.round(DIGITS),
+        columns(file.field_axes, shown, file.flux_density_unit_T).round(DIGITS), known, seal)
 
 
 def truth_text(truth: dict[str, object]) -> str:

@@ -22,7 +22,7 @@ from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.prior import write_prior
+from halbach_fe.report.prior import answer, write_prior
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.solver.ring_harmonics_2d import (
     SectorMagnetization,
@@ -156,7 +156,8 @@ def test_conversion_of_a_lone_block(short_dipole, along, across, error):
     study = short_dipole(array__first_block_angle_deg=0.0, array__rings=1,
                          array__first_magnetization_angle_deg=0.0,
                          array__recoil_permeability=along,
-                         array__recoil_permeability_across=across)
+                         array__recoil_permeability_across=across,
+                         prior__magnitude_sd=0.1)  # else it tells that the truth is 14 % weaker
     remanence = np.array([1.06, 0.03, 0.02])
     permeability = (along, across, across)
     with ngsolve.TaskManager():
@@ -186,11 +187,40 @@ def test_rotation_from_block_axes(vacuum_dipole, generator):
 
     next_slot = table_of(study, slots, truth, rings,
                          moment=VOLUME * in_block_axes(study, np.add(slots, 1), truth))
-    wrong = prior_from_blocks(build_magnet(study), next_slot).gaussian.mean
+    with pytest.warns(HalbachWarning, match="on average 7.7 % weaker"):
+        wrong = prior_from_blocks(build_magnet(study), next_slot).gaussian.mean
     assert np.abs(wrong - truth.ravel()).max() > 0.3 * np.abs(truth).max()
     with pytest.raises(MeasurementError, match="own axes as mounted"):
         prior_from_blocks(build_magnet(study),
                           table_of(study, slots, truth, rings, moment=VOLUME * truth))
+
+
+def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, tmp_path):
+    """All blocks 30 % stronger, or all at 80 degrees, is no table to be taken without a word."""
+    study = vacuum_dipole()
+    magnet = build_magnet(study)
+    slots, rings, truth = blocks_and_truth(study, generator)
+    count = len(slots)
+
+    def prior(vectors, sure=study, **changes):
+        return prior_from_blocks(build_magnet(sure), table_of(study, slots, vectors, rings,
+                                                              **changes))
+
+    assert prior(truth, temperature=np.full(count, 25.0)).doubts == ()
+    with pytest.warns(HalbachWarning, match="measured at 80 °C, 60 K from 20 °C"):
+        found = prior(truth, temperature=np.full(count, 80.0))
+    write_prior(magnet, found, tmp_path)
+    assert "7.2 % off" in json.loads((tmp_path / "prior.json").read_text())["doubts"][0]
+    assert "Not yet. The blocks were measured" in answer(found).trust
+    assert not answer(found).sound
+    stated = vacuum_dipole(prior__temperature_coefficient_per_K=-0.0012,
+                           prior__reference_temperature_C=20.0)
+    assert prior((1 - 0.0012 * 60) * truth, stated,
+                 temperature=np.full(count, 80.0)).doubts == ()
+    with pytest.warns(HalbachWarning, match=r"on average (29|3\d) % stronger"):
+        assert len(prior(1.3 * truth).doubts) == 1
+    assert prior(1.03 * truth).doubts == ()
+    assert prior(1.3 * truth, vacuum_dipole(prior__common_mode_sd=0.2)).doubts == ()
 
 
 def test_moments_are_kept(vacuum_dipole, generator):

@@ -80,7 +80,9 @@ def test_columns_of_text(tmp_path):
     body = [f"s{n};12:30:{n:02d};{line}" for n, line in enumerate(rows(";").splitlines())]
     found = imported(tmp_path, header + "\n".join(body))
     assert same(found)
-    assert found.imported.ignored == ("scan", "time")
+    assert found.imported.ignored == ()
+    assert found.data["scan"].values.tolist() == [f"s{n}" for n in range(24)]
+    assert found.data["time_s"].values.tolist() == list(range(24))
     spoilt = [*body[:7], body[7].rpartition(";")[0] + ";OVERLOAD", *body[8:]]
     assert "Bz in line 10 of map" in said(tmp_path, header + "\n".join(spoilt))
     lost = ["s;12:30;" + ";".join(["OVERLOAD"] * 5 + ["7"]), *body]

@@ -7,9 +7,16 @@ two names are recognized. A line of units may follow the header.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
-from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.errors import MeasurementError, must_be, printable
+from halbach_fe.measurement.field_map import (
+    FIELD_COLUMNS,
+    OTHER_COLUMNS,
+    POSITION_COLUMNS,
+    SIGMA_COLUMNS,
+)
 from halbach_fe.measurement.formats import names
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
@@ -29,6 +36,14 @@ from halbach_fe.measurement.formats.text import (
 
 RECOGNIZED = 2
 """Smallest number of recognized names in a header. Fewer may be words of a sentence."""
+OWN_COLUMNS = frozenset((*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS))
+ATTRIBUTE = re.compile(r"#\s*([^:\s][^:]{0,99}?)\s*:\s*(.*)")
+MEANING = re.compile(
+    r"(?i)\b(?:symmetr\w*|mirror\w*|flip\w*|extend[xyz]?|quadrant|octant|half|scal(?:e|ed|ing)|"
+    r"factor|norm[be]?|normali[sz]\w*|offsets?|multipl\w*|cent(?:er|re)|origin)\b")
+"""Words of a line above the table that may change the meaning of its numbers."""
+MAX_LINE, MAX_REMARKS = 200, 5
+"""Number of characters of such a line that are searched, and of such lines that are told."""
 
 
 def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
@@ -50,7 +65,26 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     values, texts = rows_of(lines[start:], count, delimiter, declared, where)
     _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
     columns = _header(lines[:start], count, delimiter, where)
-    return ForeignTable(columns, values, where, comments=comments_of(lines[:start]), texts=texts)
+    own = {column.text for column in columns} <= OWN_COLUMNS
+    return ForeignTable(
+        columns, values, where, comments="" if own else comments_of(lines[:start]), texts=texts,
+        attributes=attributes_of(lines[:start]) if own else {},
+        remarks=() if own else unused_lines(lines[:start]))
+
+
+def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
+    """Return the attributes ``# key: value`` of a map in halbach-fe's own columns."""
+    found = (ATTRIBUTE.fullmatch(line.strip()) for _, line in preface)
+    return {part[1]: part[2].strip() for part in found if part and part[0].isprintable()}
+
+
+def unused_lines(preface: Sequence[Line]) -> tuple[str, ...]:
+    """Return sentences about lines that may change the meaning of the numbers below them."""
+    found = [f"Line {number} says '{printable(line.strip(), 80)}', of which nothing was used: "
+             "if it is a shift, state it by --origin-m, and what else it says "
+             "by other options or in the study."
+             for number, line in preface if MEANING.search(line[:MAX_LINE])]
+    return tuple(found[:MAX_REMARKS])
 
 
 def _first_numbers(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-FORMATS = ("columns", "opera", "comsol", "openpmd")
+FORMATS = ("columns", "opera", "comsol", "openpmd", "g4beamline", "bdsim")
 """Names of the formats of other programs that can be read."""
 
 UNKNOWN = "unknown"

@@ -11,15 +11,24 @@ import xarray as xr
 
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
 from halbach_fe.core.files import atomic, file_bytes
-from halbach_fe.measurement.field_map import check_readings, write_map
-from halbach_fe.measurement.formats import bdsim, columns, comsol, geant4, openpmd, opera
+from halbach_fe.measurement.field_map import POSITION_COLUMNS, check_readings, read_map, write_map
+from halbach_fe.measurement.formats import (
+    bdsim,
+    columns,
+    comsol,
+    g4beamline,
+    geant4,
+    openpmd,
+    opera,
+)
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
-    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read), strict=True))
+    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read),
+    strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
@@ -70,6 +79,8 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     """
     where = f"map {path}"
     raw = file_bytes(path, where)
+    if not name and (own := _own(path, raw, declared)) is not None:
+        return own
     name = name or format_of(raw, declared, where)
     if declared.decimal_comma and name in ("opera", "openpmd"):
         raise MeasurementError(must_be("format", where, "one in which numbers may have a decimal "
@@ -82,6 +93,31 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     return ImportedFile(found, name)
 
 
+def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedFile | None:
+    """Return a map in halbach-fe's own HDF5 or VTU, moved to the stated origin; None for others.
+
+    Raises
+    ------
+    MeasurementError
+        If it cannot be read, or the user states what the file says otherwise.
+    """
+    if path.suffix != ".vtu" and not (raw.startswith(openpmd.SIGNATURE) and openpmd.is_map(raw)):
+        return None
+    data = read_map(path)
+    stated = replace(declared, origin_m=None, encoding=DeclaredFormat.encoding,
+                     length_unit="" if declared.length_unit == "m" else declared.length_unit,
+                     field_unit="" if declared.field_unit == "T" else declared.field_unit)
+    if stated != DeclaredFormat():
+        raise MeasurementError(must_be(
+            "options of the format", f"map {path}", "left out, since the map is halbach-fe's own, "
+            "in m and T and with named columns", "given", "Only --origin-m can be stated."))
+    if declared.origin_m is not None:
+        data = data.assign_coords({
+            name: data[name] + shift for name, shift in zip(POSITION_COLUMNS, declared.origin_m,
+                                                            strict=True)})
+    return ImportedFile(ImportedMap(data, ("m",), ("T",), (), 0, False), "halbach-fe")
+
+
 def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
     """Return the name in `READERS` of the format of a file, recognized by its first lines."""
     if raw.startswith(openpmd.SIGNATURE):
@@ -89,6 +125,10 @@ def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
     lines = lines_of(raw, declared, where)
     if comsol.is_comsol(lines):
         return "comsol"
+    if g4beamline.is_g4beamline(lines):
+        return "g4beamline"
+    if bdsim.is_bdsim(lines):
+        return "bdsim"
     return "opera" if opera.is_opera(lines) else "columns"
 
 

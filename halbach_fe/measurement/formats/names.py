@@ -5,21 +5,37 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from halbach_fe.measurement.formats.units import states_no_unit, unit_symbol
+from halbach_fe.measurement.formats.units import CLOCK, TIMES, states_no_unit, unit_symbol
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
 KNOWN = (*POSITIONS, *FIELDS, "B")
 """Quantities of columns; B is a single component, or the magnitude beside its components."""
 MOVES = ("dx", "dy", "dz")
-STATED = (*MOVES, "t")
-"""Quantities that only the user can state: moves of a stage from reading to reading, and the time.
-"""
+NOISE = ("sigma", *(f"sigma_{name}" for name in FIELDS))
+"""Standard deviations: of all components of a reading, or of one."""
+OTHERS = ("t", "scan", *NOISE)
+"""What a reading has beside its position and field: time, name of the scan, noise."""
+STATED = (*MOVES, *OTHERS)
+"""Quantities that only the user can state, the moves of a stage from reading to reading, and those
+that are recognized, but for which the user may state another."""
 
 ALIASES = {name.lower(): name for name in KNOWN} | {
     "xpos": "x", "ypos": "y", "zpos": "z", "posx": "x", "posy": "y", "posz": "z",
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
     "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"}
+
+TIME_NAMES = frozenset(("t", "time", "times", "timestamp", "timeofday", "clock", "datetime",
+                        "elapsed", "elapsedtime"))
+"""Names of columns of times, without spaces and in lower case."""
+NOISE_WORDS = frozenset((
+    "sigma", "σ", "sd", "std", "stdev", "stddev", "err", "error", "unc", "uncertainty", "noise"))
+"""Words in the name of a column that say that it is a standard deviation."""
+GLUED = re.compile(r"(?:sigma|σ|std|stdev|err|error|unc|noise|delta|d|u)(b|b[xyzr]|bphi)"
+                   r"|(b|b[xyzr]|bphi)(?:sigma|std|stdev|err|error|unc|noise)")
+"""Names that join such a word and a component without a space: dBx, sigmaBx, Bxerr."""
+OF_FIELD = re.compile(r"\((B\w{0,4})\)")
+"""The component in brackets in sigma(Bx)."""
 
 MAX_NAME = 60
 BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*")
@@ -35,7 +51,7 @@ class ColumnName:
     text : str
         Name as the file spells it.
     quantity : str
-        One of `KNOWN` and `STATED`; empty if the name is not recognized.
+        One of `KNOWN`, `OTHERS` and, if stated, `MOVES`; empty if the name is not recognized.
     unit : str
         Text of the unit as the file spells it; may be empty.
     """
@@ -50,10 +66,52 @@ def parse(text: str, stated: bool = False) -> ColumnName:
     text = text.strip().strip('"').strip()
     if len(text) > MAX_NAME:
         return ColumnName(f"{text[:MAX_NAME]}...")
-    base, unit = _split(text)
-    key = re.sub(r"[\s_]", "", PREFIX.sub("", base.lower(), count=1))
-    more = key if stated and key in STATED else ""
-    return ColumnName(text, ALIASES.get(key, more), unit.strip())
+    base, unit = _split(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
+    key = _key(base)
+    quantity = ALIASES.get(key) or _other_quantity(base, key, unit.strip()) or (
+        key if stated and key in STATED else "")
+    return ColumnName(text, quantity, unit.strip())
+
+
+def _key(base: str) -> str:
+    """Return a name without spaces, in lower case, and without the physics of mf.Bx."""
+    return re.sub(r"[\s_]", "", PREFIX.sub("", base.lower(), count=1))
+
+
+def _other_quantity(base: str, key: str, unit: str) -> str:
+    """Return which of `OTHERS` a name is, or an empty string; a time must have its unit."""
+    if key == "scan":
+        return "scan"
+    if key in TIME_NAMES:
+        return "t" if unit in TIMES or CLOCK.fullmatch(unit) else ""
+    if key == "hhmmss":
+        return "t"
+    of = noise_of(base, key)
+    return "" if of is None or of in POSITIONS else f"sigma_{of}".removesuffix("_B")
+
+
+def noise_of(base: str, key: str) -> str | None:
+    """Return the quantity whose standard deviation a name is; None if it is none.
+
+    It is B if the name does not say which component.
+    """
+    if glued := GLUED.fullmatch(key):
+        return ALIASES[glued[1] or glued[2]]
+    words = re.split(r"[\s_]+", base.lower().strip())
+    rest = [word for word in words if word not in NOISE_WORDS]
+    if len(rest) == len(words):
+        return None
+    return ALIASES.get(_key(_split("_".join(rest))[0])) if rest else "B"
+
+
+def is_clock(column: ColumnName) -> bool:
+    """Return whether the name of a column says that it holds times of day as numbers."""
+    return _key(column.text) == "hhmmss"
+
+
+def is_time(column: ColumnName) -> bool:
+    """Return whether the name of a column is that of a time, with or without a unit."""
+    return _key(_split(column.text)[0]) in TIME_NAMES
 
 
 def _split(text: str) -> tuple[str, str]:
@@ -62,7 +120,8 @@ def _split(text: str) -> tuple[str, str]:
         return found[1], found[2]
     for mark in ("/", "_", ","):
         base, _, unit = text.rpartition(mark)
-        if base and unit_symbol(unit):
+        if base and (unit_symbol(unit) or (
+                _key(base) in TIME_NAMES and (unit in TIMES or CLOCK.fullmatch(unit)))):
             return base, unit
     return text, ""
 

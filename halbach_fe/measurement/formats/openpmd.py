@@ -55,6 +55,15 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
                                        f"'{(str(error).splitlines() or [''])[0][:200]}'")) from None
 
 
+def is_map(raw: bytes) -> bool:
+    """Return whether an HDF5 file holds a map of halbach-fe, which is no file of openPMD."""
+    try:
+        with untrusted.open_hdf5(io.BytesIO(raw)) as file:
+            return "B_T" in file and "externalFieldPath" not in file.attrs
+    except Exception:  # a damaged file makes h5py raise exceptions of any type
+        return False
+
+
 def content(grid: Grid) -> bytes:
     """Return the content of a file with the field of a grid, anchored at the magnet's centre."""
     buffer = io.BytesIO()

@@ -14,16 +14,17 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.measurement import clock_times as times
 from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.text import Line, comma_hint
-from halbach_fe.study.types import MAX_LENGTH_M
+from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
            "field": "--field-unit T, mT, uT, G or kG", "angle": "--angle-unit deg or rad",
-           "time": "--columns ...t[s], t[min] or t[h]"}
+           "time": "--columns ...t[s], t[min], t[h] or t[hhmmss]"}
 MAX_NUMBER = 1e30
 """Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
 would overflow."""
@@ -52,8 +53,12 @@ class ForeignTable:
         The point from which the file measures positions; empty if it is the magnet's centre.
     comments : str
         Comments of the file, on a single line.
-    texts : mapping of int to (int, str)
-        For each column that is not all numbers: line number and text of the first other cell.
+    texts : mapping of int to mapping of int to (int, str)
+        For each column that is not all numbers: line number and text of the other cells by row.
+    attributes : mapping of str to str
+        Attributes of a map in halbach-fe's own columns.
+    remarks : tuple of str
+        Sentences for the user about what the file says of its numbers.
     """
 
     columns: tuple[ColumnName, ...]
@@ -63,7 +68,9 @@ class ForeignTable:
     field_unit: str = ""
     anchor: str = ""
     comments: str = ""
-    texts: dict[int, Line] = field(default_factory=dict)
+    texts: dict[int, dict[int, Line]] = field(default_factory=dict)
+    attributes: dict[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,8 @@ class ImportedMap:
         Number of points without any measured component, which are not in the map.
     cylindrical : bool
         Whether the file has Br and Bphi, so that Bx and By are computed.
+    remarks : tuple of str
+        Sentences for the user about what the file says of its numbers, and what was done with it.
     """
 
     data: xr.Dataset
@@ -90,6 +99,7 @@ class ImportedMap:
     ignored: tuple[str, ...]
     dropped: int
     cylindrical: bool
+    remarks: tuple[str, ...] = ()
 
 
 def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
@@ -101,26 +111,17 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         If information is missing (the message lists all of it), if file and user contradict each
         other, or if the values are too large for a map of a permanent magnet.
     """
-    columns = _columns(table, declared)
+    columns = _with_times(_columns(table, declared), table)
     used = _used(columns, table, declared)
     missing = _missing(used, columns, table, declared)
     unit_of: dict[str, str] = {}
     for kind in KINDS:
-        unit_of |= _units(kind, used, table, declared, missing)
+        unit_of |= _units(kind, used, columns, table, declared, missing)
     if missing:
         raise MeasurementError(must_be(
             "content", table.where, "complete", f"a file that does not say {'; '.join(missing)}",
             "Give the options; nothing is guessed from the size of the numbers."))
-    for name, column in used.items():
-        if column in table.texts:
-            line, cell = table.texts[column]
-            raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
-                                           f"'{cell[:40]}'", comma_hint(cell) or (
-                    "Where nothing was read, write nan." if name.startswith("B") else "")))
-        if (np.abs(table.values[:, column]) > MAX_NUMBER).any():
-            raise MeasurementError(must_be(name, table.where, f"below {MAX_NUMBER:g}", "more"))
-    si = {name: units.in_si(table.values[:, column], unit_of[name])
-          for name, column in used.items()}
+    si = _in_si(used, unit_of, table)
     count = len(table.values)
     si |= {name: np.full(count, value) for name, value in declared.at.items()}
     # a stage that reports its moves starts at the file's origin
@@ -128,20 +129,186 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     points, flux_density = _cartesian(si, table.where)
     if declared.origin_m is not None:
         points = points + declared.origin_m
-    blank = np.isnan(flux_density).all(axis=1)
-    data = _checked(points[~blank], flux_density[~blank], table.where)
-    if "t" in si:
-        data["time_s"] = ("point", si["t"][~blank], {"units": "s"})
+    read = ~np.isnan(flux_density).all(axis=1)
+    data = _checked(points[read], flux_density[read], table.where)
+    noise = _noise(si, used, table, columns)
+    if noise is not None:
+        _check_noise(noise, flux_density, used, columns, table.where)
+        data["sigma_T"] = (("point", "component"), noise[read], {"units": "T"})
+    if "t" in used:
+        seconds = _seconds(used["t"], unit_of["t"], table, columns)
+        data["time_s"] = ("point", seconds[read], {"units": "s"})
+    if "scan" in used:
+        data["scan"] = ("point", np.array(_words(used["scan"], table))[read])
     if table.comments:
         data.attrs["comments"] = table.comments
+    data.attrs |= table.attributes
     if declared.component == UNKNOWN:
         data = undirected(data)
     lengths = {unit for name, unit in unit_of.items() if unit in units.LENGTHS}
     fields = {unit for name, unit in unit_of.items() if unit in units.FIELDS}
     ignored = tuple(column.text for index, column in enumerate(columns)
                     if index not in used.values() and column.text)
+    remarks = (*table.remarks, *_remarks(columns, used, unit_of, table, declared))
     return ImportedMap(data, tuple(sorted(lengths)), tuple(sorted(fields)), ignored,
-                       int(blank.sum()), "Br" in si)
+                       int((~read).sum()), "Br" in si, remarks)
+
+
+def _in_si(used: dict[str, int], unit_of: dict[str, str], table: ForeignTable) -> dict[str, Floats]:
+    """Return all columns that have a unit of `KINDS`, but times, in SI units."""
+    si = {}
+    for name, column in used.items():
+        if name in ("t", "scan"):
+            continue
+        if column in table.texts:
+            line, cell = min(table.texts[column].values())
+            raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
+                                           f"'{cell[:40]}'", comma_hint(cell) or (
+                    "Where nothing was read, write nan." if name.startswith("B") else "")))
+        if (np.abs(table.values[:, column]) > MAX_NUMBER).any():
+            raise MeasurementError(must_be(name, table.where, f"below {MAX_NUMBER:g}", "more"))
+        si[name] = units.in_si(table.values[:, column], unit_of[name])
+    return si
+
+
+def _noise(
+    si: dict[str, Floats], used: dict[str, int], table: ForeignTable, columns: Sequence[ColumnName]
+) -> Floats | None:
+    """Return the standard deviation (n, 3) in T of each reading; None if no column states it.
+
+    It is NaN where none is stated. That of Bx and By of a probe that reads Br and Bphi follows from
+    theirs; it is not stored that Bx and By are then correlated.
+    """
+    of = {name: si[name] for name in names.NOISE if name in si}
+    if not of:
+        return None
+    if "sigma" in of:
+        if len(of) > 1:
+            raise MeasurementError(must_be(
+                "header", table.where, "with one standard deviation for all components, or one "
+                "for each", ", ".join(f"'{columns[used[name]].text}'" for name in of),
+                "Choose with --columns; - ignores a column."))
+        return np.repeat(of["sigma"][:, None], 3, axis=1)
+    empty = np.full(len(table.values), np.nan)
+    if {"sigma_Br", "sigma_Bphi"} & set(of):
+        radial, around = of.get("sigma_Br", empty), of.get("sigma_Bphi", empty)
+        angle = si["phi"] if "phi" in si else np.arctan2(si["y"], si["x"])
+        cos2, sin2 = np.cos(angle)**2, np.sin(angle)**2
+        across = (np.sqrt(cos2 * radial**2 + sin2 * around**2),
+                  np.sqrt(sin2 * radial**2 + cos2 * around**2))
+        return np.column_stack([*across, of.get("sigma_Bz", empty)])
+    return np.column_stack([of.get(f"sigma_B{name}", empty) for name in COMPONENTS])
+
+
+def _check_noise(
+    noise: Floats, flux_density: Floats, used: dict[str, int], columns: Sequence[ColumnName],
+    where: str
+) -> None:
+    """Raise MeasurementError if a reading has no standard deviation, or an absurd one."""
+    stated = ", ".join(f"'{columns[used[name]].text}'" for name in names.NOISE if name in used)
+    of_readings = ~np.isnan(flux_density)
+    good = (noise >= MIN_SIGMA_T) & (noise <= MAX_SIGMA_T)
+    bad = of_readings & ~good
+    if bad.any():
+        row, component = np.argwhere(bad)[0]
+        value = noise[row, component]
+        raise MeasurementError(must_be(
+            f"standard deviation of B{COMPONENTS[component]} in reading {row + 1}", where,
+            f"from {MIN_SIGMA_T:g} to {MAX_SIGMA_T:g} T (from {stated})",
+            "none" if np.isnan(value) else f"{value:g} T",
+            "If the column is no standard deviation, leave it out: - in its place in --columns."))
+
+
+def _seconds(
+    column: int, unit: str, table: ForeignTable, columns: Sequence[ColumnName]
+) -> Floats:
+    """Return the times (n,) in s of a column of numbers, times of day or ISO stamps."""
+    name, values = columns[column].text or "t", table.values[:, column]
+    if column in table.texts:
+        cells = table.texts[column]
+        found = None if len(cells) < len(values) else times.from_texts(
+            [cells[row][1] for row in range(len(values))])
+        if found is None:
+            line, cell = min(cells.values())
+            raise MeasurementError(must_be(
+                f"time '{name}' in line {line}", table.where, "like all others a number, a time "
+                "of day HH:MM:SS, or a stamp 2024-05-31T14:23:59", f"'{cell[:40]}'",
+                "Correct it, or ignore the column: - in --columns."))
+        return found
+    bad = ~(np.abs(values) <= MAX_NUMBER)
+    if bad.any():
+        raise MeasurementError(must_be(
+            f"time '{name}' of reading {int(np.argmax(bad)) + 1}", table.where,
+            f"a number below {MAX_NUMBER:g}", "none" if np.isnan(values[bad][0]) else "more",
+            "Correct it, or ignore the column: - in --columns."))
+    if units.CLOCK.fullmatch(unit):
+        found = times.from_clock(values)
+        if found is None:
+            raise MeasurementError(must_be(f"time '{name}'", table.where, "times of day HHMMSS",
+                                           "a number that is none"))
+        return found
+    if unit == "s" and times.look_like_clock(values):
+        raise MeasurementError(must_be(
+            f"time '{name}'", table.where, "clearly in s", f"{values[0]:.0f} to {values[-1]:.0f}, "
+            "which may as well be times of day, HHMMSS",
+            "If they are, state t[hhmmss] in --columns; if not, subtract the first of them."))
+    return units.in_si(values, unit)
+
+
+def _words(column: int, table: ForeignTable) -> list[str]:
+    """Return the cells of a column as text; numbers are written anew."""
+    cells = table.texts.get(column, {})
+    return [cells[row][1] if row in cells else "" if np.isnan(value) else f"{value:.15g}"
+            for row, value in enumerate(table.values[:, column])]
+
+
+def _remarks(
+    columns: Sequence[ColumnName], used: dict[str, int], unit_of: dict[str, str],
+    table: ForeignTable, declared: DeclaredFormat
+) -> list[str]:
+    """Return sentences about columns that were recognized though the user did not state them."""
+    said = []
+    noise = [name for name in names.NOISE if name in used]
+    own = any(column.text in ("sigma_T", "sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
+              for column in columns)
+    if noise and not declared.columns and not own:
+        shown = " and ".join(f"'{columns[used[name]].text}' (in {unit_of[name]})" for name in noise)
+        said.append(
+            f"{shown} {'was' if len(noise) == 1 else 'were'} read as the standard deviation of "
+            + ("all components" if noise == ["sigma"] else "the components in the names")
+            + ", which takes the place of the study's noise; if that is wrong, ignore "
+            f"{'it' if len(noise) == 1 else 'them'} by - in --columns.")
+    if {"sigma_Br", "sigma_Bphi"} & set(noise):
+        said.append("The standard deviations of Br and Bphi were turned into those of Bx and By, "
+                    "as if errors of Bx and By were independent.")
+    for index, column in enumerate(columns):
+        if index in used.values() or not column.text or (
+                declared.columns and declared.columns[index].strip() == "-"):
+            continue
+        if names.is_time(column):
+            looks = times.look_like_clock(table.values[:, index])
+            said.append(f"The times in '{column.text}' are not used, as their unit is not stated"
+                        f"{' (they look like HHMMSS)' if looks else ''}: state "
+                        "t[s], t[min], t[h] or t[hhmmss] in its place in --columns.")
+        elif names.noise_of(column.text, column.text.lower()) in names.POSITIONS:
+            said.append(f"The uncertainty of positions in '{column.text}' is not used: "
+                        "state noise.position_sd_m in the study.")
+    return said
+
+
+def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[ColumnName, ...]:
+    """Return the columns, of which one of times of day or stamps is a time without a unit.
+
+    It is the first of them, if no other column is the time.
+    """
+    if any(column.quantity == "t" for column in columns):
+        return tuple(columns)
+    for index, column in enumerate(columns):
+        cells = table.texts.get(index, {})
+        if names.is_time(column) and len(cells) == len(table.values) and times.from_texts(
+                [cell for _, cell in cells.values()]) is not None:
+            return (*columns[:index], replace(column, quantity="t"), *columns[index + 1:])
+    return tuple(columns)
 
 
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
@@ -159,7 +326,7 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
             raise MeasurementError(must_be(
                 "--columns", table.where,
                 f"made of {', '.join((*names.KNOWN, *names.STATED))} and -", f"'{text}'"))
-        if text != "-" and column.quantity not in ("", stated.quantity) and not (
+        if text != "-" and column.quantity not in ("", *names.OTHERS, stated.quantity) and not (
                 column.quantity == "B" and stated.quantity in names.FIELDS):
             raise _contradiction(table, f"column '{column.text}'", column.quantity,
                                  f"--columns {stated.quantity}")
@@ -241,19 +408,20 @@ def _by_option(absent: Sequence[str]) -> str:
 
 
 def _units(
-    kind: str, used: dict[str, int], table: ForeignTable, declared: DeclaredFormat,
-    missing: list[str]
+    kind: str, used: dict[str, int], columns: Sequence[ColumnName], table: ForeignTable,
+    declared: DeclaredFormat, missing: list[str]
 ) -> dict[str, str]:
     """Return the unit of each column of a kind, one of `KINDS`.
 
     Columns without a unit are added to the descriptions in ``missing``.
     """
-    found, unknown = {}, []
+    found: dict[str, str] = {}
+    unknown = []
     option = {"length": declared.length_unit, "field": declared.field_unit,
               "angle": declared.angle_unit, "time": ""}[kind]
     common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
-    columns = _columns(table, declared)
-    own = [name for name in used if _kind(name) == kind]
+    own = sorted((name for name in used if _kind(name) == kind),
+                 key=lambda name: name in names.NOISE)
     if option and not own and not missing:
         raise _contradiction(table, "header", f"no column of this kind ({kind})",
                              f"--{kind}-unit {option}")
@@ -261,14 +429,22 @@ def _units(
         text = columns[used[name]].unit
         if units.states_no_unit(text):
             text = common
+        if kind == "time":
+            written = used[name] in table.texts or units.CLOCK.fullmatch(text) or (
+                names.is_clock(columns[used[name]]))
+            if written:  # as times of day or stamps, whatever unit the header names
+                found[name] = "hhmmss"
+                continue
         unit = text if kind == "time" and text in units.TIMES else units.unit_symbol(text)
         if not units.states_no_unit(text) and unit not in KINDS[kind]:
             raise MeasurementError(must_be(
                 f"unit of {name}", table.where, f"one of {', '.join(KINDS[kind])}", f"'{text}'"))
-        if unit and option and unit != option:
+        if unit and option and unit != option and name not in names.NOISE:
             raise _contradiction(table, f"unit of {name}", unit, f"--{kind}-unit {option}")
-        if unit or option:
-            found[name] = unit or option
+        of = found.get(name.removeprefix("sigma_")) or next(
+            (found[other] for other in names.FIELDS if other in found), "")
+        if unit or (of and name in names.NOISE) or option:  # noise is in the unit of its reading
+            found[name] = unit or (of if name in names.NOISE else "") or option
         else:
             unknown.append(name)
     if unknown:
@@ -278,8 +454,8 @@ def _units(
 
 def _kind(name: str) -> str:
     """Return the kind of unit of a quantity, one of `KINDS`."""
-    if name in ("phi", "t"):
-        return "angle" if name == "phi" else "time"
+    if name in ("phi", "t", "scan"):
+        return {"phi": "angle", "t": "time", "scan": ""}[name]
     return "length" if name in (*names.POSITIONS, *names.MOVES) else "field"
 
 

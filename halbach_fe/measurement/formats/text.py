@@ -115,7 +115,7 @@ def _number_or_none(cell: str, decimal_comma: bool) -> float | None:
 
 def rows_of(
     lines: Sequence[Line], columns: int, delimiter: str | None, declared: DeclaredFormat, where: str
-) -> tuple[Floats, dict[int, Line]]:
+) -> tuple[Floats, dict[int, dict[int, Line]]]:
     """Return the numbers in the rows of a table; comments among the rows are skipped.
 
     Parameters
@@ -133,9 +133,9 @@ def rows_of(
     -------
     values : ndarray, shape (rows, columns)
         NaN for empty cells and other text.
-    texts : dict of int to Line
+    texts : dict of int to dict of int to Line
         For each column that contains other text (a time, the name of a scan), the line number and
-        the cell where it occurs first. These columns cannot be used as coordinates or components.
+        the cell by row. These columns cannot be used as coordinates or components.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def rows_of(
         If a row has another number of cells, or there are no rows.
     """
     rows: list[list[float]] = []
-    texts: dict[int, Line] = {}
+    texts: dict[int, dict[int, Line]] = {}
     for position, line in lines:
         if is_comment(line):
             continue
@@ -154,7 +154,7 @@ def rows_of(
         row = [_number_or_none(cell, declared.decimal_comma) for cell in cells]
         for column, value in enumerate(row):
             if value is None:
-                texts.setdefault(column, (position, cells[column]))
+                texts.setdefault(column, {})[len(rows)] = (position, cells[column])
         rows.append([np.nan if value is None else value for value in row])
     if not rows:
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))

@@ -19,7 +19,9 @@ LENGTHS = {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000),
 FIELDS = {"T": Fraction(1), "mT": Fraction(1, 1000), "uT": Fraction(1, 1_000_000),
           "G": Fraction(1, 10_000), "kG": Fraction(1, 10)}
 ANGLES = ("deg", "rad")
-TIMES = {"s": Fraction(1), "min": Fraction(60), "h": Fraction(3600)}
+TIMES = {"s": Fraction(1), "min": Fraction(60), "h": Fraction(3600), "ms": Fraction(1, 1000)}
+CLOCK = re.compile(r"(?i)hh:?mm:?ss")
+"""The unit of times of day that are written as numbers: 142359 is 14:23:59."""
 
 # Spellings in lower case; upper and lower case are equivalent. T and G are in EXACT instead, since
 # mT is not MT, and t and g are tonne and gram.

@@ -1,0 +1,104 @@
+"""Readings count once: copies are refused, repeated measurements are not."""
+
+from __future__ import annotations
+
+import tomllib
+import warnings
+
+import numpy as np
+import pytest
+
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.readings import read_campaign
+from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.study.reader import parse_study
+
+SIGMA = 1e-5
+STUDY = f"""
+name = "small"
+dimension = 3
+array = {{ free_blocks = {{ name = ["a"], shape = ["cuboid"], x_m = [0.1], y_m = [0.0], \
+z_m = [0.0], \
+size_x_m = [0.02], size_y_m = [0.02], size_z_m = [0.02], remanence_T = [1.3] }}, \
+recoil_permeability = 1.0 }}
+mesh = {{ block_size_m = 0.02, bore_size_m = 0.03 }}
+observation = {{ quantity = "flux_density", positions = {{ kind = "points", \
+points_m = [[0, 0, 0]] }} }}
+[[noise.regions]]
+name = "all"
+sigma_T = {SIGMA}
+"""
+GRID = np.stack(np.meshgrid(*[np.linspace(-0.02, 0.02, 8)] * 2, np.linspace(-0.03, 0.03, 10),
+                            indexing="ij"), axis=-1).reshape(-1, 3)
+FIELD = np.column_stack([0.1 + 2 * GRID[:, 1], 2 * GRID[:, 0], 0 * GRID[:, 0]])
+
+
+def study(*names):
+    maps = "".join(f'[[maps]]\nname = "{name}"\nfile = "{name}.csv"\n' for name in names)
+    return parse_study(tomllib.loads(STUDY + maps))
+
+
+def read(generator, digits=9, sigma=SIGMA, field=FIELD):
+    return np.round(field + sigma * generator.standard_normal(field.shape), digits)
+
+
+def twice(first, second, points=GRID):
+    """A map of all points, and again at later times."""
+    return field_map(np.vstack([points, points]), np.vstack([first, second])).assign(
+        time_s=("point", np.arange(2.0 * len(points))))
+
+
+def test_rows_that_come_again_with_other_times(generator):
+    first = read(generator)
+    maps_of(study(), twice(first, read(generator)))  # measured again
+    with pytest.raises(MeasurementError, match="640 of 1280 rows that are another row again"):
+        maps_of(study(), twice(first, first))
+    some = read(generator)
+    some[:200] = first[:200]
+    with pytest.raises(MeasurementError, match="200 of 1280"):
+        maps_of(study(), twice(first, some))
+    single = np.where([True, False, False], first, np.nan)
+    with pytest.raises(MeasurementError, match="digit for digit"):
+        maps_of(study(), twice(single, single))
+
+
+@pytest.mark.parametrize("digits", [4, 5])
+@pytest.mark.parametrize("noise", [SIGMA, SIGMA / 10])
+def test_few_digits_repeat_by_chance(generator, digits, noise):
+    """Steps of 10 and 1 noises of a uniform field: all rows may be alike, and are measured."""
+    uniform = np.broadcast_to([0.1, 0.0, 0.02], GRID.shape)
+    first, second = (read(generator, digits, noise, uniform) for _ in range(2))
+    assert (first == second).all(axis=1).mean() > 0.01
+    maps_of(study(), twice(first, second))
+
+
+def test_a_part_of_a_map_in_another_one(generator):
+    """200 of 640 rows are less than the share at which rounded copies are refused."""
+    first, second = read(generator), read(generator)
+    data = {"one": field_map(GRID, first), "two": field_map(GRID, second)}
+    maps_of(study("one", "two"), data)
+    second[:200] = first[:200]
+    copied = {**data, "two": field_map(GRID, second)}
+    with pytest.raises(MeasurementError, match="200 of 640 rows"):
+        maps_of(study("one", "two"), copied)
+    second[8:200] += 1e-6
+    second[7] += 1e-6
+    maps_of(study("one", "two"), {**data, "two": field_map(GRID, second)})
+
+
+def test_a_field_along_z_in_two_dimensions_is_told(generator):
+    """A 2D study has no Bz: 0.3 T of it were left out without a word."""
+    flat = tomllib.loads(STUDY)
+    flat["dimension"] = 2
+    del flat["array"]["free_blocks"]["size_z_m"]
+    flat["observation"]["components"] = ["x", "y"]
+    magnet = build_magnet(parse_study(flat))
+    points, where = np.unique(GRID * [1, 1, 0], axis=0, return_index=True)
+    along, little = FIELD[where] + np.array([[0, 0, 0.3]]), FIELD[where] + np.array([[0, 0, 3e-3]])
+    with pytest.warns(HalbachWarning, match=r"Bz up to 0\.3 T.* use a 3D study"):
+        read_campaign(magnet, maps_of(magnet.study, field_map(points, along)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the Bz of a probe that is turned a little is no news
+        read_campaign(magnet, maps_of(magnet.study, field_map(points, little)))
