@@ -21,6 +21,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.inference.result import HELD_OUT
 from halbach_fe.measurement.campaign import maps_of
+from halbach_fe.measurement.field_map import refuse_total_field
 from halbach_fe.measurement.harmonic_field import UNIFORM, fit_readings, solid_harmonic_fields
 from halbach_fe.response.homogeneity import DRAWS, Homogeneity, HomogeneityModel, sphere_points
 
@@ -72,7 +73,10 @@ def map_homogeneity(
     MeasurementError
         If the map does not fit the study, or the region reaches beyond it.
     """
-    readings = read_campaign(magnet, maps_of(magnet.study, data))
+    maps = maps_of(magnet.study, data)
+    for one in maps:
+        refuse_total_field(one.data, "a fit of the field by itself")
+    readings = read_campaign(magnet, maps)
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
     free = _free_radius(magnet, np.array(model.region.centre_m))

@@ -15,7 +15,14 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.measurement.field_map import checked_map, points_of, read_map
+from halbach_fe.measurement.field_map import (
+    TOTAL_COLUMN,
+    TOTAL_SIGMA_COLUMN,
+    checked_map,
+    is_total_field,
+    points_of,
+    read_map,
+)
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
 from halbach_fe.study.maps import InstrumentSd
@@ -238,15 +245,20 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
 
 
 def _rows(one: Map) -> tuple[Floats, Floats, float]:
-    """Return points (n, 3) in m, values (n, 3) in T and typical noise in T of a map.
+    """Return points (n, 3) in m, values (n, 4) in T and typical noise in T of a map.
 
-    Both are in SI units and along the axes of the magnet. The noise is 0 if nothing states it.
+    Both are in SI units and along the axes of the magnet; the last value is |B| of a map of |B|
+    alone. The noise is 0 if nothing states it.
     """
     data = in_si_and_magnet_axes(one.study.instrument, one.data)
-    field = np.asarray(data["B_T"].values, float)
+    alone = is_total_field(data)
+    total = data[TOTAL_COLUMN].values if alone else np.full(data.sizes["point"], np.nan)
+    field = np.column_stack([data["B_T"].values, total])
     noise = [region.sigma_T for region in one.study.noise.regions] if one.study.noise else []
-    if "sigma_T" in data:
-        noise = [float(np.median(data["sigma_T"].values[np.isfinite(field)]))]
+    if alone and TOTAL_SIGMA_COLUMN in data:
+        noise = [float(np.median(data[TOTAL_SIGMA_COLUMN].values[np.isfinite(total)]))]
+    elif "sigma_T" in data:
+        noise = [float(np.median(data["sigma_T"].values[np.isfinite(field[:, :3])]))]
     return points_of(data), field, min(noise, default=0.0)
 
 

@@ -9,7 +9,9 @@ from halbach_fe.measurement.formats.units import states_no_unit, unit_symbol
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
-KNOWN = (*POSITIONS, *FIELDS, "B")
+TOTAL = "Babs"
+"""The magnitude |B|, as a quantity of its own."""
+KNOWN = (*POSITIONS, *FIELDS, "B", TOTAL)
 """Quantities of columns; B is a single component, or the magnitude beside its components."""
 MOVES = ("dx", "dy", "dz")
 STATED = (*MOVES, "t")
@@ -19,6 +21,8 @@ STATED = (*MOVES, "t")
 ALIASES = {name.lower(): name for name in KNOWN} | {
     "xpos": "x", "ypos": "y", "zpos": "z", "posx": "x", "posy": "y", "posz": "z",
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
+    "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
+    "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
     "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"}
 
 MAX_NAME = 60

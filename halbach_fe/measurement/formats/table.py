@@ -14,7 +14,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map
+from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, with_total_field
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
@@ -128,8 +128,11 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     points, flux_density = _cartesian(si, table.where)
     if declared.origin_m is not None:
         points = points + declared.origin_m
-    blank = np.isnan(flux_density).all(axis=1)
-    data = _checked(points[~blank], flux_density[~blank], table.where)
+    total = si.get(names.TOTAL, np.full(count, np.nan))
+    blank = np.isnan(flux_density).all(axis=1) & np.isnan(total)
+    data = _checked(points[~blank], flux_density[~blank], total[~blank], table.where)
+    if names.TOTAL in si:
+        data = with_total_field(data, total[~blank])
     if "t" in si:
         data["time_s"] = ("point", si["t"][~blank], {"units": "s"})
     if table.comments:
@@ -186,13 +189,19 @@ def _used(
         used[column.quantity] = index
     components = [name for name in names.FIELDS if name in used]
     if declared.component and used:
-        name = f"B{declared.component}"
+        name = f"B{declared.component}"  # Bx, or Babs
         if "B" not in used or components:
             raise _contradiction(table, "header", ", ".join(components) or "no column B",
                                  f"--component {declared.component}")
         used[name] = used.pop("B")
-    elif components:
-        used.pop("B", None)  # beside its components, B is the magnitude
+    elif components and "B" in used:  # beside its components, B is the magnitude
+        column = used.pop("B")
+        if len(components) == 3:
+            used.setdefault(names.TOTAL, column)
+    if components and names.TOTAL in used and not (
+            units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit
+            or table.field_unit):
+        del used[names.TOTAL]  # it is not needed
     for name in declared.at:
         if name in used:
             raise _contradiction(table, "header", f"a column {name}",
@@ -219,9 +228,9 @@ def _missing(
     if absent:
         missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
     if "B" in used:
-        missing.append("which component B is (--component x, y or z)")
-    elif not set(names.FIELDS) & set(used):
-        missing.append("which columns are Bx, By or Bz (--columns)")
+        missing.append("which component B is (--component x, y or z, or abs for |B|)")
+    elif not {*names.FIELDS, names.TOTAL} & set(used):
+        missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns)")
     half = {"Br", "Bphi"} - set(used)
     if len(half) == 1:
         missing.append(f"{half.pop()}, without which the other is no Bx or By (--columns)")
@@ -314,11 +323,18 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
                                     si["Br"] * sin + si["Bphi"] * cos, si.get("Bz", empty)])
 
 
-def _checked(points: Floats, flux_density: Floats, where: str) -> xr.Dataset:
-    """Return the map; raise MeasurementError if its values are too large for a permanent magnet."""
+def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) -> xr.Dataset:
+    """Return the map without |B| ``total`` (n,) in T.
+
+    Raises
+    ------
+    MeasurementError
+        If values are too large for a permanent magnet.
+    """
     if not len(points):
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
-    largest, farthest = float(np.nanmax(np.abs(flux_density))), float(np.abs(points).max())
+    largest = float(np.nanmax(np.abs(np.column_stack([flux_density, total]))))
+    farthest = float(np.abs(points).max())
     if not largest <= MAX_FIELD_T:
         raise MeasurementError(must_be("flux densities", where, f"below {MAX_FIELD_T:g} T",
                                        f"{largest:g} T", "Is the unit right?"))
