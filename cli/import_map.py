@@ -16,12 +16,7 @@ from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.calibration import HEADER, read_calibration
-from halbach_fe.measurement.field_map import (
-    TOTAL_COLUMN,
-    points_of,
-    refuse_total_field,
-    write_map,
-)
+from halbach_fe.measurement.field_map import TOTAL_COLUMN, points_of, refuse_total_field, write_map
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
 from halbach_fe.study.types import COMPONENTS
 

@@ -26,11 +26,7 @@ from halbach_fe.inference.overlap import overlaps
 from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
 from halbach_fe.inference.result import InferenceResult, InstrumentTerms, MapPose, Prediction
 from halbach_fe.inference.same_magnet import distribution_of
-from halbach_fe.inference.total_field import (
-    Magnitudes,
-    bent,
-    warn_of_weak_fields,
-)
+from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_weak_fields
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.instrument import turn_of
@@ -211,7 +207,7 @@ def infer(
             uncertain, noises, error, rounds, place = False, {}, None, 0, None
             estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
     else:
-        what = ("terms of the instruments" if len(open_terms) else "directions of |B|")
+        what = "terms of the instruments" if len(open_terms) else "directions of |B|"
         warnings.warn(
             f"The {what} of study {magnet.name} have not come to rest after {ROUNDS} updates: "
             f"{'their' if len(open_terms) else 'the'} error bars may be too small.",

@@ -113,8 +113,8 @@ def warn_of_weak_fields(readings: Readings, magnitudes: Magnitudes) -> None:
         x, y, z = (1e3 * readings.observation.positions[least]).tolist()
         warnings.warn(
             f"|B| is weak for what is left unknown of the field across it at {len(weak)} of "
-            f"{int(readings.total.sum())} readings of |B|, such as {1e3 * readings.values[least]:.3g}"
-            f" mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm, which count with more noise: components of B "
+            f"{int(readings.total.sum())} readings of |B|, such as "
+            f"{1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm, which count with more noise: components of B "
             "there would say more.", HalbachWarning, stacklevel=3)
 
 

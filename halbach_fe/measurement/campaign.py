@@ -166,6 +166,7 @@ def maps_of(
             found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
                              one.stage or one.name, one.name, one.stage_shift_sd_m))
         _refuse_repeated(found)
+        _refuse_mixed_probes(found)
     if validation_map is not None:
         validation_map = checked_map(validation_map, VALIDATION_MAP)
         own = study_for_validation_map(study.with_(maps=()), validation_map)
@@ -242,6 +243,16 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
                 "different maps, as the same readings must not count twice",
                 f"the same readings in {shared} of {len(fewer)} rows",
                 "Remove one of them, or these rows of one."))
+
+
+def _refuse_mixed_probes(maps: Sequence[Map]) -> None:
+    """Raise a StudyError if a map of |B| shares its probe with one of components."""
+    for one, other in combinations(maps, 2):
+        if one.probe == other.probe and is_total_field(one.data) != is_total_field(other.data):
+            raise StudyError(must_be(
+                f"`maps.probe` of '{one.name}' and '{other.name}'", "the campaign",
+                "different, as one map is of |B| and the other of components", f"'{one.probe}'",
+                "Leave `probe` out for one of them."))
 
 
 def _rows(one: Map) -> tuple[Floats, Floats, float]:

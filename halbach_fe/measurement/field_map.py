@@ -75,7 +75,7 @@ def total_field_map(
     points: Floats, magnitude: Floats, sigma: Floats | None = None,
     attributes: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
-    """Return a map of |B| (n,) in T alone at points (n, 3) in m, optionally with sigma (n,) in T."""
+    """Return a map of |B| (n,) in T alone at points (n, 3) in m, and its noise sigma (n,) in T."""
     data = field_map(points, np.full(points.shape, np.nan), attributes=attributes)
     return with_total_field(data, magnitude, sigma)
 
@@ -396,7 +396,7 @@ def _without_total(
     if wrong.any():
         row = int(np.argmax(wrong))
         raise MeasurementError(must_be(
-            f"{TOTAL_COLUMN} of reading {row + 1}", where, "a magnitude, so that it is not negative",
+            f"{TOTAL_COLUMN} of reading {row + 1}", where, "a magnitude, never negative",
             f"{total[row]:g}", "If the column is a component, name it Bx_T, By_T or Bz_T."))
     if TOTAL_SIGMA_COLUMN in data:
         sigma = data[TOTAL_SIGMA_COLUMN].values[~np.isnan(total)]
@@ -410,8 +410,8 @@ def _without_total(
         row = int(np.argmax(blank & ~np.isnan(total)))
         raise MeasurementError(must_be(
             f"reading {row + 1}", where, "with a component of B, as other rows of it have",
-            f"{TOTAL_COLUMN} alone", "Put the rows of |B| into a map of their own; a study can list "
-            "both."))
+            f"{TOTAL_COLUMN} alone", "Put the rows of |B| into a map of their own; a study can "
+            "list both."))
     return blank & np.isnan(total)
 
 

@@ -50,7 +50,8 @@ def noise_regions(
     for number, window in reversed(list(enumerate(noise.regions))):
         low = -np.inf if window.z_min_m is None else window.z_min_m
         high = np.inf if window.z_max_m is None else window.z_max_m
-        region[(z >= low) & (z <= high) & np.isin(components, [*whole, *window.components])] = number
+        region[(z >= low) & (z <= high)
+               & np.isin(components, [*whole, *window.components])] = number
     if (region < 0).any():
         first = int(np.argmin(region))
         which = f", component {components[first]}," if components[first] else ""

@@ -49,7 +49,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
-        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}",
+        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
+        f"{_of_the_sign(result)}",
         f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
         f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
         f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
@@ -63,6 +64,13 @@ def _of_the_probe(result: InferenceResult) -> str:
     return "" if any(one.gain for one in known) else (
         " The error bars take the calibration of the probe as exact ([instrument_sd] can say how "
         "well it is known): if its gain is 0.1\u00a0% off, so is the field of the magnet.")
+
+
+def _of_the_sign(result: InferenceResult) -> str:
+    """Say that |B| does not tell the sign of the field, if it is all that was read."""
+    return "" if not result.observation.of_total_field.all() else (
+        " All readings are |B|, which is the same if the field is reversed everywhere: the sign is "
+        "that of the study.")
 
 
 def _largest_field(result: InferenceResult) -> str:

@@ -228,7 +228,8 @@ def _missing(
     if absent:
         missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
     if "B" in used:
-        missing.append("which component B is (--component x, y or z, or abs for |B|)")
+        missing.append("which component B is (--component x, y or z), or whether it is |B| "
+                       "(--component abs)")
     elif not {*names.FIELDS, names.TOTAL} & set(used):
         missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns)")
     half = {"Br", "Bphi"} - set(used)
