@@ -198,6 +198,8 @@ class Registration:
         Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
         They serve to register another map of the same magnet: what permeable blocks answer to a
         change of others is left out.
+    total : bool
+        Whether the map is of |B|, which then stands in place of x in the residuals.
     """
 
     study: Study
@@ -216,6 +218,7 @@ class Registration:
     at_rest: bool
     probe: ProbePrior
     blocks: Gaussian = dataclasses.field(repr=False)
+    total: bool = False
 
     @property
     def instrument(self) -> Instrument:

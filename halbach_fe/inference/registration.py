@@ -98,7 +98,8 @@ def register(
             for keys in (open_keys, *alternatives)]
     fit = fits[0]
     say("searching the pose among rotations by right angles and shifts along the axis")
-    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0])
+    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0],
+                          fit.total)
     starts = [each for each in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), each)]
     starts = starts[:most]
     if prior.stage is not None and starts:

@@ -114,8 +114,8 @@ def warn_of_weak_fields(readings: Readings, magnitudes: Magnitudes) -> None:
         warnings.warn(
             f"|B| is weak for what is left unknown of the field across it at {len(weak)} of "
             f"{int(readings.total.sum())} readings of |B|, such as "
-            f"{1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm, which count with more noise: components of B "
-            "there would say more.", HalbachWarning, stacklevel=3)
+            f"{1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm, which count "
+            "with more noise: components of B there would say more.", HalbachWarning, stacklevel=3)
 
 
 def _predicted(model: Response, found: Gaussian) -> tuple[Floats, Floats]:

@@ -256,7 +256,8 @@ def check_total_field(instrument: Instrument) -> None:
         if len(set(found)) > 1:
             raise MeasurementError(must_be(
                 f"`instrument.{name}`", "a map of |B|",
-                "three equal entries, as |B| has one sensor", str(list(found)), "State the number of the probe three times."))
+                "three equal entries, as |B| has one sensor", str(list(found)),
+                "State the number of the probe three times."))
     for name in ("crosstalk", "planar_hall_per_T"):
         found = getattr(instrument, name)
         if any(found.values() if isinstance(found, dict) else found):

@@ -16,9 +16,11 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.readings import read_campaign
+from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map, total_field_map
 from halbach_fe.report.inference_answer import answer
+from halbach_fe.report.registration import sentences
 from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
@@ -193,3 +195,30 @@ def test_components_and_magnitude_update_together(generator, session):
     shared = study_of(2, maps=[one | {"probe": "same"} for one in maps])
     with pytest.raises(StudyError, match=r"one map is of \|B\|"):
         infer(build_magnet(shared), {"hall": hall, "nmr": total_map(2, 1, generator)}, session)
+
+
+def test_a_map_of_the_magnitude_is_registered(generator, session):
+    """Pose, gain and offset by |B| alone, from no first guess; the sign stays open, and is said."""
+    turn, shift = Rotation.from_rotvec([0.01, -0.02, 0.015]), np.array([1e-3, -2e-3, 5e-3])
+    places = turn.apply(POINTS) + shift
+    size = 1.002 * np.linalg.norm(truth(1, 1)[0].getB(places), axis=1) + 3e-4
+    data = total_field_map(POINTS, size + NOISE_T * generator.standard_normal(len(size)))
+    found = register(build_magnet(study_of(1)), data, session, most=2)
+    best = found[0]
+    assert best.explains
+    middle = turn.apply((POINTS.max(axis=0) + POINTS.min(axis=0)) / 2) + shift
+    assert np.abs((best.middle_m - middle) / best.translation_sd_m).max() < 4
+    left = (Rotation.from_rotvec(best.instrument.rotation_rad) * turn.inv()).as_rotvec()
+    assert np.abs(left / best.rotation_sd_rad).max() < 4
+    gain, offset = best.instrument.gain, best.instrument.offset_T
+    assert len(set(gain)) == len(set(offset)) == 1
+    assert abs(gain[0] - 2e-3) < 4 * best.probe.gain
+    assert abs(offset[0] - 3e-4) < 4 * best.probe.offset_T
+    assert not best.instrument.crosstalk or not any(best.instrument.crosstalk.values())
+    assert "if the field is reversed everywhere" in sentences(found)[0]
+
+
+def test_a_map_of_another_magnet_is_not_registered(generator, session):
+    """Negative control: |B| of a quadrupole in a dipole."""
+    with pytest.raises(MeasurementError, match=r"of its field unexplained"):
+        register(build_magnet(study_of(1)), total_map(2, 1, generator), session, most=1)
