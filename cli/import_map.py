@@ -14,6 +14,7 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.calibration import HEADER, read_calibration
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, points_of, refuse_total_field, write_map
@@ -66,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 def summary(file: ImportedFile) -> dict[str, object]:
     """Return the properties of the imported map as plain data, for the user to check."""
     points, field = points_of(file.data), file.data["B_T"].values
-    columns = {name: field[:, i] for i, name in enumerate(COMPONENTS)}
+    columns: dict[str, Floats] = {name: field[:, i] for i, name in enumerate(COMPONENTS)}
     if TOTAL_COLUMN in file.data:
         columns["abs"] = file.data[TOTAL_COLUMN].values
     columns = {name: values for name, values in columns.items() if not np.isnan(values).all()}

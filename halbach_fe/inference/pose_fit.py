@@ -34,8 +34,8 @@ from halbach_fe.inference.pose_space import (
     right_angles,
     share_of,
 )
-from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.inference.readings import unit_vectors
+from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,

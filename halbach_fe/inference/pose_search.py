@@ -56,8 +56,9 @@ MOST_POSES = 4
 """Largest number of poses that are fitted with the magnet's own model."""
 
 MOST_OF_A_LINE = 8
-"""The same of a map on a line, or of |B|, which is the same in twice as many poses. A component that is even in x, y and z, as in an ideal dipole, is
-the same on four lines in two directions."""
+"""The same of a map on a line, and of one of |B|, which is the same in twice as many poses. On a
+line a component that is even in x, y and z, as in an ideal dipole, is the same on four lines in two
+directions."""
 
 NARROW = 0.02
 """Width up to which a map lies on a line, in units of the bore's radius."""

@@ -34,6 +34,7 @@ class Shown:
     total: bool = False
 
     def __call__(self, places: Floats) -> Floats:
+        """Return B (n, 3) in T at places (n, 3) in m."""
         return self.field(places)
 
     def along(self, field: Floats, matrix: Floats) -> Floats:

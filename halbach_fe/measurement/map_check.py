@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.pace import Pace, Progress
-from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of
+from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of, refuse_total_field
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,
@@ -48,7 +48,7 @@ from halbach_fe.measurement.scan_lines import (
     point_spacing,
     scan_lines,
 )
-from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows, spikes
+from halbach_fe.measurement.suspect_rows import broken_rows, contradicted_rows, rough_rows, spikes
 from halbach_fe.study.types import COMPONENTS
 
 SMALLEST_FIELD_T = 1e-12
@@ -256,6 +256,8 @@ class MapCheck:
     corrected_T : ndarray, shape (n, 3)
         What a probe without errors would have read: Bx, By and Bz at the points of the map, by the
         instrument that the lines show which are not held out.
+    contradicted : tuple of int
+        Numbers of the rows whose column of |B| is not that of their components, from 1.
     """
 
     readings: int
@@ -279,6 +281,7 @@ class MapCheck:
     residual_T: Floats
     unseen_T: Floats
     corrected_T: Floats
+    contradicted: tuple[int, ...] = ()
 
     @property
     def suffices(self) -> bool:
@@ -369,6 +372,7 @@ def check_map(
     True
     """
     data = checked_map(data, "`data`")
+    refuse_total_field(data, "Maxwell's check")
     check_magnitudes(data)
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
@@ -463,7 +467,8 @@ def check_map(
         structure=_structure(points[chosen], residual[chosen]),
         reach=_reach(points[held_out], floor, points[chosen], float(np.sqrt(np.mean(left**2)))),
         redundancy=redundancy, excluded=~usable,
-        residual_T=residual @ matrix, unseen_T=unseen @ matrix, corrected_T=model.ideal(train))
+        residual_T=residual @ matrix, unseen_T=unseen @ matrix, corrected_T=model.ideal(train),
+        contradicted=contradicted_rows(data))
 
 
 def _begin(pace: Pace, step: int, what: str) -> None:

@@ -195,9 +195,9 @@ def _used(
                                  f"--component {declared.component}")
         used[name] = used.pop("B")
     elif components and "B" in used:  # beside its components, B is the magnitude
-        column = used.pop("B")
+        magnitude = used.pop("B")
         if len(components) == 3:
-            used.setdefault(names.TOTAL, column)
+            used.setdefault(names.TOTAL, magnitude)
     if components and names.TOTAL in used and not (
             units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit
             or table.field_unit):
