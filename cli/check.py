@@ -13,7 +13,6 @@ places and noise are checked, and the folder has check.json alone.
 from __future__ import annotations
 
 import argparse
-
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common

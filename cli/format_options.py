@@ -21,7 +21,8 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
                         help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
                         "Babs (|B|), dx, dy, dz (moves of a stage from reading to reading), t "
-                        "(time), or - for a column that is ignored; a unit may follow, as in Bx[mT], t[s]")
+                        "(time), or - for a column that is ignored; a unit may follow, as in "
+                        "Bx[mT], t[s]")
     parser.add_argument("--component", choices=(*AXES, "abs"), default="",
                         help="component of the field in a column B; abs if it is |B|, as of an NMR "
                         "teslameter")

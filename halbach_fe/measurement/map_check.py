@@ -26,7 +26,12 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.pace import Pace, Progress
-from halbach_fe.measurement.field_map import check_magnitudes, checked_map, points_of, refuse_total_field
+from halbach_fe.measurement.field_map import (
+    check_magnitudes,
+    checked_map,
+    points_of,
+    refuse_total_field,
+)
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,

@@ -113,9 +113,9 @@ def total_answer(check: TotalCheck) -> Answer:
     found = f"{rows} of {check.points} rows are" if rows else f"None of {check.points} rows is"
     return Answer(
         "Are the readings of |B| sound?", f"{found} zero, repeated or a spike. {noise}",
-        "Only as far as that goes: Maxwell's equations are those of the components, so that they do "
-        "not test |B| here. Nor does |B| show the sign of the field, axes, gain or offset of the "
-        "probe; a model of the magnet does, but for the sign.",
+        "Only as far as that goes: Maxwell's equations are those of the components, so that they "
+        "do not test |B| here. Nor does |B| show the sign of the field, axes, gain or offset of "
+        "the probe; a model of the magnet does, but for the sign.",
         "Register the map, if you do not know where it lies, or update the magnet with it.",
         "halbach-fe register STUDY --measurements MAP -o DIR")
 

@@ -203,12 +203,16 @@ def test_a_map_of_the_magnitude_is_registered(generator, session):
     places = turn.apply(POINTS) + shift
     size = 1.002 * np.linalg.norm(truth(1, 1)[0].getB(places), axis=1) + 3e-4
     data = total_field_map(POINTS, size + NOISE_T * generator.standard_normal(len(size)))
-    found = register(build_magnet(study_of(1)), data, session, most=2)
+    found = register(build_magnet(study_of(1)), data, session, most=1)
     best = found[0]
     assert best.explains
     middle = turn.apply((POINTS.max(axis=0) + POINTS.min(axis=0)) / 2) + shift
-    assert np.abs((best.middle_m - middle) / best.translation_sd_m).max() < 4
-    left = (Rotation.from_rotvec(best.instrument.rotation_rad) * turn.inv()).as_rotvec()
+    own = Rotation.from_rotvec(best.instrument.rotation_rad)
+    # half turns leave |B| of the nominal dipole as it is
+    half = min((Rotation.from_rotvec(np.pi * axis) for axis in np.vstack([np.eye(3), np.zeros(3)])),
+               key=lambda each: (own * (each * turn).inv()).magnitude())
+    assert np.abs((best.middle_m - half.apply(middle)) / best.translation_sd_m).max() < 4
+    left = (own * (half * turn).inv()).as_rotvec()
     assert np.abs(left / best.rotation_sd_rad).max() < 4
     gain, offset = best.instrument.gain, best.instrument.offset_T
     assert len(set(gain)) == len(set(offset)) == 1
@@ -218,7 +222,12 @@ def test_a_map_of_the_magnitude_is_registered(generator, session):
     assert "if the field is reversed everywhere" in sentences(found)[0]
 
 
-def test_a_map_of_another_magnet_is_not_registered(generator, session):
+def test_a_map_of_another_magnet_is_not_explained(generator, session):
     """Negative control: |B| of a quadrupole in a dipole."""
-    with pytest.raises(MeasurementError, match=r"of its field unexplained"):
-        register(build_magnet(study_of(1)), total_map(2, 1, generator), session, most=1)
+    data = total_map(2, 1, generator, POINTS[::4])
+    try:
+        found = register(build_magnet(study_of(1, inference={})), data, session, most=1)
+    except MeasurementError as error:
+        assert "of its field unexplained" in str(error)
+    else:
+        assert not found[0].explains
