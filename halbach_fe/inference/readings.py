@@ -95,10 +95,7 @@ class Readings:
         """Matrix from `vectors` to the readings."""
         width = np.where(self.total, 3, 1)
         values = np.ones(int(width.sum()))
-        rows, columns = (entries := self.observation.analysis[self.total].tocoo()).coords
-        along = np.zeros((int(self.total.sum()), 3))
-        along[rows, columns % 3] = entries.data
-        values[np.repeat(self.total, width)] = along.ravel()
+        values[np.repeat(self.total, width)] = self.observation.directions.ravel()
         return sparse.csr_array((values, np.arange(len(values)), np.append(0, np.cumsum(width))),
                                 shape=(len(width), len(values)))
 

@@ -78,6 +78,15 @@ class Observation:
         return np.array([label == TOTAL_LABEL for label in self.labels])
 
     @property
+    def directions(self) -> Floats:
+        """Unit vectors (k, 3) of the field along which the readings of |B| are linear."""
+        entries = self.analysis[self.of_total_field].tocoo()
+        rows, columns = entries.coords
+        found = np.zeros((entries.shape[0], len(COMPONENTS)))
+        found[rows, columns % len(COMPONENTS)] = entries.data
+        return found
+
+    @property
     def map_rows(self) -> Ints:
         """Number (readings,) of the map's point of each reading, of a circle that of the first."""
         return np.asarray(self.analysis.indices[self.analysis.indptr[:-1]] // len(COMPONENTS))
