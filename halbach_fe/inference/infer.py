@@ -26,7 +26,7 @@ from halbach_fe.inference.overlap import overlaps
 from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
 from halbach_fe.inference.result import InferenceResult, InstrumentTerms, MapPose, Prediction
 from halbach_fe.inference.same_magnet import distribution_of
-from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_weak_fields
+from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.instrument import turn_of
@@ -212,7 +212,7 @@ def infer(
             f"The {what} of study {magnet.name} have not come to rest after {ROUNDS} updates: "
             f"{'their' if len(open_terms) else 'the'} error bars may be too small.",
             HalbachWarning, stacklevel=2)
-    warn_of_weak_fields(readings, magnitudes)
+    warn_of_bent_readings(readings, magnitudes)
     if update.discarded_information > LEFT_OUT:
         warnings.warn(
             f"Study {magnet.name} has so many parameters and readings that some combinations of "

@@ -29,7 +29,7 @@ units of the noise."""
 TINY_T = 1e-12
 """Field below which no direction is known."""
 
-WEAK = 0.3
+BENT = 0.3
 """Bend of a reading, in units of its noise, from which it is named."""
 
 
@@ -103,19 +103,20 @@ def bent(readings: Readings, vectors: Response, model: Response, found: Gaussian
     return Magnitudes().updated(readings, vectors, model, found).turned
 
 
-def warn_of_weak_fields(readings: Readings, magnitudes: Magnitudes) -> None:
-    """Warn of readings of |B| where it is weak for what is not known of the field across it."""
+def warn_of_bent_readings(readings: Readings, magnitudes: Magnitudes) -> None:
+    """Warn of readings of |B| that what is not known of the field across it bends noticeably."""
     if not len(magnitudes.bend):
         return
-    weak = np.flatnonzero(magnitudes.bend > WEAK * readings.noise.sd)
-    if len(weak):
-        least = weak[np.argmin(readings.values[weak])]
+    bent_ones = np.flatnonzero(magnitudes.bend > BENT * readings.noise.sd)
+    if len(bent_ones):
+        least = bent_ones[np.argmin(readings.values[bent_ones])]
         x, y, z = (1e3 * readings.observation.positions[least]).tolist()
         warnings.warn(
-            f"|B| is weak for what is left unknown of the field across it at {len(weak)} of "
-            f"{int(readings.total.sum())} readings of |B|, such as "
-            f"{1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm, which count "
-            "with more noise: components of B there would say more.", HalbachWarning, stacklevel=3)
+            f"What is left unknown across the field bends {len(bent_ones)} of "
+            f"{int(readings.total.sum())} readings of |B| by more than {BENT:g} of their noise, such "
+            f"as {1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm. They count "
+            "with more noise: components of B at some points would tell.", HalbachWarning,
+            stacklevel=3)
 
 
 def _predicted(model: Response, found: Gaussian) -> tuple[Floats, Floats]:

@@ -215,7 +215,8 @@ def colours_in_words(result: InferenceResult) -> str:
 def _residual_vectors(result: InferenceResult) -> tuple[Floats, Floats] | None:
     """Return points (n, 3) in m and what the posterior lacks there, B (n, 3) in T.
 
-    Components that were not read are zero; of |B| it is along the field. None if the readings are Fourier coefficients.
+    Components that were not read are zero; of |B| it is along the field. None if the readings are
+    Fourier coefficients.
     """
     observation = result.observation
     if not all(observation.components):

@@ -17,14 +17,20 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.readings import read_campaign
 from halbach_fe.inference.registration import register
+from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import field_map, total_field_map
+from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
+from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.registration import sentences
 from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.response.matrix import StoredMatrix
+from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
+from tests.inference.test_infer import iron_campaign
 from tests.support.cuboids import DOCUMENT
+from tests.support.pages import page
 
 NOISE_T = 1e-5
 AXIS = np.linspace(-0.05, 0.05, 6) + 1e-3
@@ -157,7 +163,7 @@ def test_a_field_that_vanishes_is_said(generator, session):
     """On the axis of a quadrupole |B| is below what is left unknown across it."""
     points = np.column_stack([np.zeros((9, 2)), np.linspace(-0.08, 0.08, 9)])
     few = np.vstack([points, [[0.03, 0.01, 0.0]]])
-    with pytest.warns(HalbachWarning, match=r"\|B\| is weak .* at 9 of 10 readings"):
+    with pytest.warns(HalbachWarning, match=r"across the field bends 9 of 10 readings"):
         infer(build_magnet(study_of(2, inference={})), total_map(2, 1, generator, few), session)
 
 
@@ -179,6 +185,57 @@ def test_what_needs_components_says_so(generator, session):
             "kind": "circles", "radius_m": 0.05, "angles": 12}}, inference={})
     with pytest.raises(MeasurementError, match=r"a map of \|B\| alone"):
         infer(build_magnet(fourier), data, session)
+
+
+def test_the_pages_of_an_update_by_the_magnitude(generator, session, tmp_path):
+    """Page, table of predictions and view are written, and say |B|."""
+    update = infer(build_magnet(study_of(2)), total_map(2, 1, generator), session)
+    write_inference(update, tmp_path)
+    write_inference_report(update, tmp_path)
+    assert "|B|" in page(tmp_path / "report.html")
+    table = (tmp_path / "prediction.csv").read_text().splitlines()
+    assert len(table) == 1 + len(POINTS)
+    assert {row.split(",")[0] for row in table[1:]} == {"|B|"}
+
+
+def test_a_matrix_on_the_disk_gives_the_same(generator, session, tmp_path, monkeypatch):
+    """The response of |B| is projected in parts if it does not fit into memory."""
+    magnet, data = build_magnet(study_of(2)), total_map(2, 1, generator)
+    whole = infer(magnet, data, session)
+    monkeypatch.setattr("halbach_fe.response.matrix.LOADED_BYTES", 1000)
+    other = infer(magnet, data, Session.open(tmp_path / "on-disk"))
+    assert isinstance(other.response.matrix, StoredMatrix)
+    np.testing.assert_allclose(other.posterior.mean, whole.posterior.mean, rtol=1e-9)
+
+
+def test_positions_make_noise_by_the_gradient_of_the_magnitude(generator, session):
+    """Against differences of |B| of the true magnet by magpylib."""
+    study = study_of(2, noise={"regions": [{"name": "all", "sigma_T": NOISE_T}],
+                               "position_sd_m": 1e-4})
+    update = infer(build_magnet(study), total_map(2, 1, generator), session)
+    step = 1e-5 * np.eye(3)
+    size = [np.linalg.norm(truth(2, 1)[0].getB(POINTS + each), axis=1)
+            for each in (*step, *-step)]
+    gradient = (np.array(size[:3]) - size[3:]) / 2e-5
+    expected = np.hypot(NOISE_T, 1e-4 * np.linalg.norm(gradient, axis=0))
+    # the gradient of the updated magnet in vacuum is that of the true one to a part in 1e3
+    np.testing.assert_allclose(update.noise.sd, expected, rtol=0.01)
+
+
+def test_permeable_blocks_and_iron(dipole, generator, session):
+    """In 2D with iron, where the direction is that of the solved field; truth in closed form."""
+    study, data, true = iron_campaign(dipole, generator)
+    components = np.nan_to_num(data["B_T"].values)
+    total = total_field_map(points_of(data), np.linalg.norm(components, axis=1))
+    # in a plane |B| stays as it is if all magnetizations turn by the same angle
+    with pytest.warns(HalbachWarning, match=r"across the field bends 120 of 120 readings"):
+        update = infer(build_magnet(study), total, session)
+    score = (update.posterior.mean - true) / update.posterior.sd
+    # 32 values: the rms of a standard normal is 1 +- 0.13; 4 sigma
+    assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.5)
+    assert not update.disagreement
+    after, before = (np.abs(each.mean - true) for each in (update.posterior, update.prior))
+    assert np.median(after) < 0.7 * np.median(before)
 
 
 def test_components_and_magnitude_update_together(generator, session):
