@@ -113,9 +113,9 @@ def warn_of_bent_readings(readings: Readings, magnitudes: Magnitudes) -> None:
         x, y, z = (1e3 * readings.observation.positions[least]).tolist()
         warnings.warn(
             f"What is left unknown across the field bends {len(bent_ones)} of "
-            f"{int(readings.total.sum())} readings of |B| by more than {BENT:g} of their noise, "
-            f"such as {1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm. They "
-            "count with more noise: components of B at some points would tell.", HalbachWarning,
+            f"{int(readings.total.sum())} readings of |B| by over {BENT:g} of their noise, "
+            f"such as {1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm. "
+            "They count with more noise: components of B at some points would tell.", HalbachWarning,
             stacklevel=3)
 
 
