@@ -115,8 +115,8 @@ def warn_of_bent_readings(readings: Readings, magnitudes: Magnitudes) -> None:
             f"What is left unknown across the field bends {len(bent_ones)} of "
             f"{int(readings.total.sum())} readings of |B| by over {BENT:g} of their noise, "
             f"such as {1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm. "
-            "They count with more noise: components of B at some points would tell.", HalbachWarning,
-            stacklevel=3)
+            "They count with more noise: components of B at some points would tell.",
+            HalbachWarning, stacklevel=3)
 
 
 def _predicted(model: Response, found: Gaussian) -> tuple[Floats, Floats]:
