@@ -6,14 +6,19 @@ where the sensors are, how the probe is turned, which rows are broken, and which
 model of a magnet can explain the map any better. With an output folder, also writes check.json,
 check.csv (the residual of every reading), check.html and its figures, oriented_map.csv, the
 map without broken rows and with its components along the right axes, and corrected_map.csv, what a
-probe without errors would have read.
+probe without errors would have read. Of a map of |B| alone only rows that are broken, repeated
+places and noise are checked, and the folder has check.json alone.
 """
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Check the map, write the results, print a summary."""
+    from halbach_fe.measurement.field_map import is_total_field
     from halbach_fe.measurement.map_check import check_map
     from halbach_fe.report.map_check import (
         answer,
@@ -42,6 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     data = common.read_one(arguments, arguments.map)
     if arguments.output is not None:  # before the check, which may take a minute
         common.own_folder(arguments, "halbach-fe check")
+    if is_total_field(data):
+        return _check_total(arguments, data)
     with common.progress_bar("checking") as show:
         check = check_map(data, (lambda _: None) if arguments.json else common.say, show)
     if arguments.output is not None:
@@ -55,4 +63,22 @@ def run(arguments: argparse.Namespace) -> int:
     common.print_table(instrument_table(check), "The instrument, by the map alone")
     common.say_answer(arguments, answer(check),
                       None if arguments.output is None else arguments.output / "check.html")
+    return 0
+
+
+def _check_total(arguments: argparse.Namespace, data: xr.Dataset) -> int:
+    """Check a map of |B| alone, which has no page."""
+    from halbach_fe.measurement.total_check import check_total
+    from halbach_fe.report.map_check import total_answer, total_sentences, write_total_check
+
+    check = check_total(data)
+    if arguments.output is not None:
+        write_total_check(data, check, arguments.output)
+    if arguments.json:
+        common.print_json(check.plain())
+        return 0
+    for sentence in total_sentences(check):
+        common.say(sentence)
+    common.say_answer(arguments, total_answer(check),
+                      None if arguments.output is None else arguments.output / "check.json")
     return 0

@@ -20,12 +20,12 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
                         help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
-                         "dx, dy, dz (moves of a stage from reading to reading), t (time), scan, "
-                         "sigma or sigma_Bx ... (noise), or - for a column that is ignored; a unit "
-                         "may follow, as in Bx[mT], t[s], t[hhmmss]")
-    parser.add_argument("--component", choices=(*AXES, UNKNOWN), default="",
-                        help="component of the field in a column B; unknown, if nobody knows it, "
-                        "for halbach-fe register to find")
+                         "Babs (|B|), dx, dy, dz (moves of a stage from reading to reading), t "
+                         "(time), scan, sigma or sigma_Bx ... (noise), or - for a column that is "
+                         "ignored; a unit may follow, as in Bx[mT], t[s], t[hhmmss]")
+    parser.add_argument("--component", choices=(*AXES, "abs", UNKNOWN), default="",
+                        help="component of the field in a column B; abs if it is |B|, as of an NMR "
+                        "teslameter; unknown, if nobody knows it, for halbach-fe register to find")
     parser.add_argument("--at", type=coordinates, default={}, metavar="AXIS=M,...",
                         help="constant coordinates in m that the file does not contain, for "
                         "example x=0,y=0")

@@ -14,10 +14,18 @@ import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.cli.format_options import add_format_arguments, declared_format
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.measurement.calibration import HEADER, read_calibration
-from halbach_fe.measurement.field_map import UNDIRECTED, is_undirected, points_of, write_map
+from halbach_fe.measurement.field_map import (
+    TOTAL_COLUMN,
+    UNDIRECTED,
+    is_undirected,
+    points_of,
+    refuse_total_field,
+    write_map,
+)
 from halbach_fe.measurement.formats.files import ImportedFile, import_map
 from halbach_fe.study.types import COMPONENTS
 
@@ -44,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     imported = import_map(arguments.file, declared_format(arguments), arguments.format)
     corrections = {}
     if arguments.calibration:
+        refuse_total_field(imported.data, "--calibration")
         if imported.imported.cylindrical:
             raise MeasurementError(must_be(
                 "--calibration", arguments.file.name, "beside Bx, By and Bz as the sensors read "
@@ -70,11 +79,13 @@ def run(arguments: argparse.Namespace) -> int:
 def summary(file: ImportedFile) -> dict[str, object]:
     """Return the properties of the imported map as plain data, for the user to check."""
     points, field = points_of(file.data), file.data["B_T"].values
-    measured = [i for i in range(3) if not np.isnan(field[:, i]).all()]
+    columns: dict[str, Floats] = {name: field[:, i] for i, name in enumerate(COMPONENTS)}
+    if TOTAL_COLUMN in file.data:
+        columns["abs"] = file.data[TOTAL_COLUMN].values
+    columns = {name: values for name, values in columns.items() if not np.isnan(values).all()}
     return {
         "format": file.format, "readings": len(points),
-        "components": [UNDIRECTED] if is_undirected(file.data) else [
-            COMPONENTS[i] for i in measured],
+        "components": [UNDIRECTED] if is_undirected(file.data) else list(columns),
         "length_units": list(file.imported.length_units),
         "field_units": list(file.imported.field_units),
         "ignored_columns": list(file.imported.ignored),
@@ -82,8 +93,8 @@ def summary(file: ImportedFile) -> dict[str, object]:
         "remarks": list(file.imported.remarks),
         "points_without_reading": file.imported.dropped,
         "from_m": points.min(axis=0).tolist(), "to_m": points.max(axis=0).tolist(),
-        "min_B_T": [float(np.nanmin(field[:, i])) for i in measured],
-        "max_B_T": [float(np.nanmax(field[:, i])) for i in measured]}
+        "min_B_T": [float(np.nanmin(values)) for values in columns.values()],
+        "max_B_T": [float(np.nanmax(values)) for values in columns.values()]}
 
 
 def text(value: object) -> str:

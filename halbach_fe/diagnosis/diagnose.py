@@ -75,7 +75,7 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import Data, check_maps
+from halbach_fe.measurement.campaign import Data, check_maps, refuse_total_fields
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 
@@ -133,6 +133,7 @@ def diagnose(
         If a map or the blocks do not fit the study.
     """
     data = check_maps(study, data)
+    refuse_total_fields(data, validation_map)
     with session.with_cache() as cached:
         return _diagnose(study, data, cached, blocks,
                          catalogue() if effects is None else effects, validation_map, say, solver,

@@ -26,6 +26,7 @@ from halbach_fe.inference.overlap import overlaps
 from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
 from halbach_fe.inference.result import InferenceResult, InstrumentTerms, MapPose, Prediction
 from halbach_fe.inference.same_magnet import distribution_of
+from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.instrument import turn_of
@@ -92,7 +93,8 @@ def infer(
         Another map, which is predicted but does not update the model; see
         `halbach_fe.measurement.observation.study_for_validation_map`.
     say : callable, optional
-        Takes a line of text about each update, if terms of instruments are estimated.
+        Takes a line of text about each update, if there are several: if terms of instruments are
+        estimated, or |B| was read.
     similar : Magnet, optional
         A slightly different magnet that was solved for before, see
         `halbach_fe.response.matrix.response_matrix`. It saves most of the time.
@@ -141,21 +143,24 @@ def infer(
     uncertain = any(one.study.noise is not None and any(one.study.noise.position_sd_m or ())
                     for one in maps)
     estimated: tuple[MagnetBlock, ...] | None = None
+    magnitudes = Magnitudes()
     rounds = 0
     while rounds < ROUNDS:
         rounds += 1
-        readings = read_campaign(magnet, maps, noises, estimated)
+        readings = read_campaign(magnet, maps, noises, estimated, magnitudes.directions)
         if solved is None:
             check_validation_map(readings, magnet.study)
         training = readings.training
         if solved is None or (at is not None
                               and solved.neglected(at, maps, readings) > NEGLECTED):
             solved = _Solved(
-                _response(magnet, readings.observation, session, similar), maps,
-                np.zeros(0) if at is None else readings_of_field(at.nominal, maps, readings))
-            model = solved.response
+                _response(magnet, readings.vectors, session, similar), maps,
+                np.zeros(0) if at is None else readings_of_field(
+                    at.nominal, maps, readings.vectors))
+            vectors = solved.response
         elif at is not None:
-            model = solved.moved(at, maps, readings)
+            vectors = solved.moved(at, maps, readings)
+        model = readings.projected(vectors, session.folder)
         varying = len(model.parameters) - len(magnet.parameter_names)
         magnet_prior = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
                                  else study_prior(magnet, varying))
@@ -167,7 +172,9 @@ def infer(
         residual = readings.values - model.offset
         # one noise for all updates: what they find is compared by its probability
         error = model.error if error is None else error
-        errors = readings.noise.with_independent_errors(error)
+        magnitudes = magnitudes.about(readings, vectors, model, whole_prior)
+        noise = magnitudes.with_bend(readings.noise)
+        errors = noise.with_independent_errors(error)
         update = linear_gaussian.update(
             matrix, residual[training], errors.subset(training), whole_prior,
             np.flatnonzero(training))
@@ -188,16 +195,24 @@ def infer(
             say(f"update {rounds}, of at most {ROUNDS}: the terms of the instruments change by up "
                 f"to {largest:.2g} standard deviations" + (
                     f", of which {100 * share:.0f} % are taken" if share < 1 else ""))
-        at_rest = share == 1.0 and bool((np.abs(open_terms.counted @ change) <= AT_REST * sd).all())
+        before, magnitudes = magnitudes, magnitudes.updated(readings, vectors, model, whole)
+        if not magnitudes.is_near(before, noise.sd):
+            place = None  # about other directions the evidence is another one
+        at_rest = share == 1.0 and bool((
+            np.abs(open_terms.counted @ change) <= AT_REST * sd).all()) and magnitudes.is_near(
+                before, noise.sd)
         if at_rest and not uncertain:
             break
         if at_rest:  # again, with the noise that positions make in this magnet's gradient
             uncertain, noises, error, rounds, place = False, {}, None, 0, None
             estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
     else:
+        what = "terms of the instruments" if len(open_terms) else "directions of |B|"
         warnings.warn(
-            f"The terms of the instruments of study {magnet.name} have not come to rest after "
-            f"{ROUNDS} updates: their error bars may be too small.", HalbachWarning, stacklevel=2)
+            f"The {what} of study {magnet.name} have not come to rest after {ROUNDS} updates: "
+            f"{'their' if len(open_terms) else 'the'} error bars may be too small.",
+            HalbachWarning, stacklevel=2)
+    warn_of_bent_readings(readings, magnitudes)
     if update.discarded_information > LEFT_OUT:
         warnings.warn(
             f"Study {magnet.name} has so many parameters and readings that some combinations of "
@@ -212,11 +227,13 @@ def infer(
                              errors.sd)
     return InferenceResult(
         magnet=magnet.with_study(with_instruments(magnet.study, maps)),
-        observation=readings.observation, readings=readings.values, noise=readings.noise,
+        observation=readings.observation, readings=readings.values, noise=noise,
         parts=readings.parts, regions=readings.regions, maps=readings.maps, response=model,
         prior=magnet_prior, posterior=posterior,
-        prediction_prior=_predict(matrix, model.offset, whole_prior),
-        prediction_posterior=_predict(matrix, model.offset, whole),
+        prediction_prior=_predict(
+            matrix, model.offset + bent(readings, vectors, model, whole_prior), whole_prior),
+        prediction_posterior=_predict(
+            matrix, model.offset + bent(readings, vectors, model, whole), whole),
         prior_conflict=update.prior_conflict, parameters_learnt=update.parameters_learnt,
         log_evidence=update.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
@@ -312,10 +329,9 @@ def _log_density_at_zero(distribution: Gaussian, count: int) -> float:
 
 @dataclass(frozen=True)
 class _Solved:
-    """The response of maps whose instruments had certain terms.
+    """The response of `Readings.vectors` of maps whose instruments had certain terms.
 
-    ``nominal`` (readings,) in T is what they read of the nominal magnet; it is empty if all terms
-    are known.
+    ``nominal`` in T is what they read of the nominal magnet; it is empty if all terms are known.
     """
 
     response: Response
@@ -331,26 +347,28 @@ class _Solved:
         most what the last one has changed. No combination of the unknowns is wrong by more standard
         deviations than the norm of the error in units of the noise.
         """
-        before = readings_of_field(estimate.own, self.maps, readings)
+        vectors = readings.vectors
+        before = readings_of_field(estimate.own, self.maps, vectors)
         if not before.any():
             return 0.0
         missing = np.asarray(self.response.matrix @ estimate.deviations) - before
         part = np.linalg.norm(missing) / np.linalg.norm(before)
-        moved = readings_of_field(estimate.own, maps, readings) - before
+        moved = readings_of_field(estimate.own, maps, vectors) - before
         step = partial(estimate.of_deviations.field, estimate.step)
-        unmoved = readings_of_field(step, maps, readings) - readings_of_field(
-            step, self.maps, readings)
-        noise = readings.noise.sd
-        return float(part * np.linalg.norm(moved / noise) + np.linalg.norm(unmoved / noise))
+        unmoved = readings_of_field(step, maps, vectors) - readings_of_field(
+            step, self.maps, vectors)
+        noise, seen = readings.noise.sd, readings.projection
+        return float(part * np.linalg.norm(seen @ moved / noise)
+                     + np.linalg.norm(seen @ unmoved / noise))
 
     def moved(self, estimate: _Estimate, maps: Sequence[Map], readings: Readings) -> Response:
-        """Return the response after small changes of the terms.
+        """Return the response of `Readings.vectors` after small changes of the terms.
 
         Its matrix is the same. Its offset contains what the changes do to the readings of the
         magnet as it is estimated.
         """
-        change = (readings_of_field(estimate.field, maps, readings) - self.nominal
-                  - readings_of_field(estimate.own, self.maps, readings))
+        change = (readings_of_field(estimate.field, maps, readings.vectors) - self.nominal
+                  - readings_of_field(estimate.own, self.maps, readings.vectors))
         return replace(self.response, offset=self.response.offset + change)
 
 

@@ -18,7 +18,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.inference.readings import Readings
 from halbach_fe.measurement.campaign import ONLY_MAP, Map, with_pivots
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     map_time,
@@ -39,6 +39,7 @@ from halbach_fe.measurement.instrument_terms import (
     seen,
     with_terms,
 )
+from halbach_fe.measurement.observation import Observation
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.linear_gaussian import Rows
 from halbach_fe.study.types import COMPONENTS
@@ -77,6 +78,8 @@ class OpenTerms:
             terms = [f"{owner}.{name}" for owner, name in zip(owners, NAMES, strict=True)]
             shifts = [f"{one.name}.stage_shift_{axis}_m" for axis in COMPONENTS]
             sd = np.append(prior_sd(one.study.instrument_sd), one.shift_sd_m)
+            if is_total_field(one.data):
+                terms, sd = _of_total_field(terms, sd)
             for name, value in zip(terms + shifts, sd.tolist(), strict=True):
                 if value > 0:
                     known.setdefault(name, value)
@@ -159,12 +162,32 @@ class OpenTerms:
             at_sensors, gradient = field_at_sensors(field, sensor_positions(instrument, points))
             changes = by_terms(instrument, points, one.pivot_m, map_time(data), at_sensors,
                                gradient)
+            if is_total_field(one.data):  # along the field, whose three parts are one number
+                along = readings.directions[one.name][:, :, None] / 3
+                changes[:, :, OFFSETS] = along
+                changes[:, :, DRIFTS] = along * map_time(data)[:, None, None]
             found.append(changes.reshape(3 * len(points), -1) @ self._effect(number, one))
         return readings.observation.read(np.concatenate(found).T.reshape(len(self), -1, 3)).T
 
 
+def _of_total_field(terms: list[str], sd: Floats) -> tuple[list[str], Floats]:
+    """Return names and standard deviations of the terms of a probe of |B|.
+
+    Its gain, offset and drift are one number each, and it has neither axes nor several sensors.
+    """
+    found, sd = terms.copy(), sd.copy()
+    for number, name in enumerate(NAMES):
+        kind = name.split("_", 1)[0]
+        if kind in ("gain", "offset", "drift"):
+            unit = "" if kind == "gain" else "_T"
+            found[number] = terms[number].removesuffix(name) + kind + unit
+        elif kind in ("crosstalk", "sensor"):
+            sd[number] = 0.0
+    return found, sd
+
+
 def readings_of_field(
-    field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
+    field: Callable[[Floats], Floats], maps: Sequence[Map], observation: Observation
 ) -> Floats:
     """Return the readings (n,) in T of a field, without offset and drift.
 
@@ -177,7 +200,7 @@ def readings_of_field(
         sensors = sensor_positions(instrument, points)
         found.append(seen(sensor_matrix(instrument),
                           field(sensors.reshape(-1, 3)).reshape(sensors.shape)))
-    return readings.observation.read(np.concatenate(found))
+    return observation.read(np.concatenate(found))
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.pose_space import Field, misfit_of, right_angles, same_pose
-from halbach_fe.solver.separate_blocks import field_in_vacuum
+from halbach_fe.inference.pose_space import Shown, misfit_of, right_angles, same_pose
 
 RADII, ANGLES = (0.0, 0.35, 0.7), 8
 """Distances of the lines from the axis, in units of the bore's radius, and angles beside it. The
@@ -62,7 +61,7 @@ def along_the_axis(matrix: Floats, direction: Floats) -> bool:
 
 
 def poses_along(
-    magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_],
+    magnet: Magnet, vacuum: Shown, points: Floats, readings: Floats, training: NDArray[np.bool_],
     direction: Floats, across_m: float, pace: Pace,
 ) -> list[tuple[float, Floats]]:
     """Return poses (6,) of a line along the magnet with their misfits in T, the best first.
@@ -83,7 +82,6 @@ def poses_along(
     rows = np.flatnonzero(training.any(axis=1))
     rows = rows[np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).astype(int)]
     points, used, seen = points[rows], np.where(training, readings, 0.0)[rows], training[rows]
-    vacuum = field_in_vacuum(magnet.blocks)
     starts = _transverse_starts(magnet, across_m)
     table = _Table.of(magnet, vacuum, starts, float(np.ptp(points @ direction)))
     candidates = []
@@ -95,7 +93,7 @@ def poses_along(
             for shift in table.shifts:
                 field = table.field(line, turned[:, 2] + shift)
                 if field is not None:
-                    candidates.append((misfit_of(field @ matrix, used, seen)[0],
+                    candidates.append((misfit_of(vacuum.along(field, matrix), used, seen)[0],
                                        np.append(start, shift), matrix))
     candidates.sort(key=lambda each: each[0])
     chosen: list[tuple[Floats, Floats]] = []
@@ -123,7 +121,7 @@ class _Table:
         self._z, self._fields, self._free, self.shifts = z, fields, free, shifts
 
     @classmethod
-    def of(cls, magnet: Magnet, vacuum: Field, starts: Floats, length: float) -> _Table:
+    def of(cls, magnet: Magnet, vacuum: Shown, starts: Floats, length: float) -> _Table:
         reach = magnet.half_length + length
         step = STEP * magnet.bore_radius
         shifts = step * np.arange(-np.ceil(reach / step), np.ceil(reach / step) + 1)
@@ -163,7 +161,7 @@ def _transverse_starts(magnet: Magnet, across_m: float) -> Floats:
 
 
 def _improved(
-    magnet: Magnet, vacuum: Field, place: Floats, matrix: Floats, points: Floats, used: Floats,
+    magnet: Magnet, vacuum: Shown, place: Floats, matrix: Floats, points: Floats, used: Floats,
     seen: NDArray[np.bool_], across_m: float,
 ) -> tuple[float | None, Floats]:
     """Return misfit and pose (6,) after least squares over place and scale; None in no air."""
@@ -179,7 +177,7 @@ def _improved(
         parameters, key = scaled * scales, scaled.tobytes()
         if key not in known:
             known[key] = vacuum(places(parameters))
-        field = known[key] @ matrix
+        field = vacuum.along(known[key], matrix)
         _, factor = misfit_of(field, used, seen)
         left = (used - factor * field)[seen] / size
         weight = 0.01 * np.sqrt(seen.sum())  # one sd of the prior is as bad as 1 % of the field
@@ -205,5 +203,6 @@ def _improved(
     pose = np.concatenate([parameters[:3], Rotation.from_matrix(matrix).as_rotvec()])
     if magnet.contains(places(parameters)).any():
         return None, pose
-    return misfit_of(vacuum(places(parameters)) @ matrix, used, seen)[0], pose
+    return misfit_of(
+        vacuum.along(vacuum(places(parameters)), matrix), used, seen)[0], pose
 

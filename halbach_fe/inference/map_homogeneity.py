@@ -31,6 +31,7 @@ from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.readings import Readings, read_campaign
 from halbach_fe.inference.result import HELD_OUT
 from halbach_fe.measurement.campaign import Map, maps_of
+from halbach_fe.measurement.field_map import refuse_total_field
 from halbach_fe.measurement.harmonic_field import (
     UNIFORM,
     HarmonicFit,
@@ -102,6 +103,8 @@ def map_homogeneity(
         If the map does not fit the study, or the region reaches beyond it.
     """
     maps = maps_of(magnet.study, data)
+    for one in maps:
+        refuse_total_field(one.data, "a fit of the field by itself")
     readings = read_campaign(magnet, maps)
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT

@@ -35,6 +35,7 @@ from halbach_fe.inference.pose_space import (
     right_angles,
     share_of,
 )
+from halbach_fe.inference.readings import unit_vectors
 from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.doubted_terms import (
     UNITS,
@@ -44,12 +45,13 @@ from halbach_fe.measurement.doubted_terms import (
     factor_of,
     words_of,
 )
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     remove_nonlinear_part,
     sensor_matrix,
     sensor_positions,
+    total_without_nonlinear_part,
 )
 from halbach_fe.measurement.instrument_terms import (
     DIFFERENCE_M,
@@ -62,7 +64,12 @@ from halbach_fe.measurement.instrument_terms import (
     seen,
     with_terms,
 )
-from halbach_fe.measurement.observation import excluded_components, held_out_readings, observe
+from halbach_fe.measurement.observation import (
+    excluded_components,
+    held_out_readings,
+    observe,
+    observe_total,
+)
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.deviation_field import Deviations
@@ -111,6 +118,9 @@ HALVINGS = 5
 PROBE = STEADY.stop - POSE.stop
 """Number of parameters of the probe: crosstalk, gains, offsets, and places of the sensors."""
 
+GAINS = slice(6, 9)
+"""Gains among the parameters of the probe."""
+
 OFFSETS = slice(9, 12)
 """Offsets among the parameters of the probe."""
 
@@ -138,6 +148,9 @@ class PoseFit:
         The study's instrument without its pose.
     prior : Gaussian
         Of all parameters of the blocks.
+    total : bool
+        Whether the map is of |B|, which stands in place of Bx. The probe then has one gain and one
+        offset, which are those of x, and no other terms.
     pose_sd : ndarray, shape (6,)
         Prior standard deviations of the pose in m and rad.
     on_known_stage : bool
@@ -165,6 +178,7 @@ class PoseFit:
     on_known_stage: bool
     deviations: Deviations
     prior: Gaussian
+    total: bool = False
     derivatives: dict[str, Floats] = dataclasses.field(default_factory=dict, repr=False)
     solved: dict[bytes, Field] = dataclasses.field(default_factory=dict, repr=False)
     built: dict[bytes, Magnet] = dataclasses.field(default_factory=dict, repr=False)
@@ -180,15 +194,25 @@ class PoseFit:
         _check_open_keys(magnet, open_keys)
         base = study.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
         data = in_si_and_magnet_axes(base, data)
-        points = points_of(data)
-        readings = remove_nonlinear_part(base, data)
-        measured = np.isfinite(readings) & ~excluded_components(study, len(points))
-        observation = observe(study.with_(instrument=base), points, measured)
+        points, total = points_of(data), is_total_field(data)
+        excluded = excluded_components(study, len(points))
+        if total:
+            readings = np.full(points.shape, np.nan)
+            readings[:, 0] = total_without_nonlinear_part(base, data)
+            measured = np.isfinite(readings) & ~excluded.any(axis=1, keepdims=True)
+            observation = observe_total(
+                study.with_(instrument=base), points, measured[:, 0],
+                np.tile([1.0, 0.0, 0.0], (len(points), 1)))
+        else:
+            readings = remove_nonlinear_part(base, data)
+            measured = np.isfinite(readings) & ~excluded
+            observation = observe(study.with_(instrument=base), points, measured)
         if study.observation.quantity != "flux_density":
             raise MeasurementError(must_be(
                 "observation", f"study {study.name}", "of flux_density, to register a map",
                 study.observation.quantity))
-        entries = observation.analysis.indices  # one component of one point each
+        # one component of one point each
+        entries = 3 * observation.map_rows if total else observation.analysis.indices
         apart = held_out_readings(study, observation)
         held_out, training = (np.zeros(measured.size, bool) for _ in range(2))
         held_out[entries[apart]], training[entries[~apart]] = True, True
@@ -206,7 +230,7 @@ class PoseFit:
         return cls(magnet, points, np.nan_to_num(readings), training.reshape(-1, 3),
                    held_out.reshape(-1, 3), sigma.reshape(-1, 3), np.broadcast_to(position, 3),
                    session, probe, base, open_keys, pose.sd(magnet), pose.stage is not None,
-                   deviations, blocks)
+                   deviations, blocks, total)
 
     @property
     def smallest_sigma(self) -> float:
@@ -230,7 +254,26 @@ class PoseFit:
         base = self._base(values)
         middle = self._origin(base)
         return with_terms(base, middle, np.concatenate([
-            pose[:3] - middle, pose[3:], values[:PROBE], np.zeros(3)]))
+            pose[:3] - middle, pose[3:], self._of_probe(values[:PROBE]), np.zeros(3)]))
+
+    def _of_probe(self, values: Floats) -> Floats:
+        """Return the terms (21,) of the probe: of one of |B| those of x stand for all."""
+        if not self.total:
+            return values
+        found = np.zeros(PROBE)
+        found[GAINS], found[OFFSETS] = values[GAINS.start], values[OFFSETS.start]
+        return found
+
+    def _shown(self, values: Floats, along: Floats) -> Floats:
+        """Return what the map shows of changes (n, 3, ...) of what three sensors would show.
+
+        Of a map of |B| it is the part along the field, whose directions (n, 3) are ``along``.
+        """
+        if not self.total:
+            return values
+        found = np.zeros(values.shape)
+        found[:, 0] = np.einsum("nc,nc...->n...", along, values)
+        return found
 
     def _origin(self, base: Instrument) -> Floats:
         """Return the middle (3,) in m of the map, in the scale of an instrument without pose."""
@@ -336,8 +379,8 @@ class PoseFit:
             _mean_square(updated / state.sigma, self.held_out),
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
-            log_evidence, at_rest, _probe_sd(sd[6:6 + PROBE]), blocks,
-            self._doubts(scaled, blocks), self._factor(pose, values))
+            log_evidence, at_rest, _probe_sd(self._of_probe(sd[6:6 + PROBE])), blocks,
+            self._doubts(scaled, blocks), self._factor(pose, values), total=self.total)
 
     def _doubts(self, scaled: Floats, blocks: Gaussian) -> tuple[Term, ...]:
         """Return the terms that a fit has taken far from their priors.
@@ -500,28 +543,45 @@ class PoseFit:
         middle, count = sensors.mean(axis=1), len(self.points)
         matrix = sensor_matrix(instrument)
         here, gradient = field_at_sensors(self._field(values), sensors)
-        residual = self.readings - seen(matrix, here) - near.shift @ matrix.T - values[OFFSETS]
+        nominal = seen(matrix, here) + near.shift @ matrix.T
         at_mean = gradient.mean(axis=1)
-        sigma = np.sqrt(self.sigma**2 + np.sum((np.einsum(
-            "ij,njk->nik", matrix, at_mean) * self.position_sd)**2, axis=2))
-        by_block = np.einsum("ij,njk->nik", matrix, near.fields)
+        of_blocks = np.einsum("ij,njk->nik", matrix, near.fields)
+
+        def about(along: Floats) -> tuple[Floats, Floats, Floats]:
+            """Return residual, derivatives by blocks and noise about directions of the field."""
+            moved = self._shown(np.einsum("ij,njk->nik", matrix, at_mean), along)
+            return (self.readings - self._shown(nominal, along) - values[OFFSETS],
+                    self._shown(of_blocks, along),
+                    np.sqrt(self.sigma**2 + np.sum((moved * self.position_sd)**2, axis=2)))
+
+        along = unit_vectors(nominal)
+        residual, by_block, sigma = about(along)
         # the derivatives are those in the field of the blocks that explain the readings here best
         own = field_at_sensors(partial(
             self.deviations.field, self._most_probable(near, residual, by_block, sigma)), sensors)
         here, gradient = here + own[0], gradient + own[1]
-        columns = list(np.moveaxis(by_terms(
+        if self.total:
+            along = unit_vectors(seen(matrix, here))
+            residual, by_block, sigma = about(along)
+        by_term = self._shown(by_terms(
             instrument, self.points, self._origin(self._base(values)), np.zeros(count), here,
-            gradient, STEADY), -1, 0))
+            gradient, STEADY), along)
+        if self.total:
+            by_gain = by_term[..., 6:][..., GAINS].sum(axis=-1)
+            by_term[..., 6:] = 0.0
+            by_term[..., 6 + GAINS.start], by_term[:, 0, 6 + OFFSETS.start] = by_gain, 1.0
+        columns = list(np.moveaxis(by_term, -1, 0))
         magnets = iter(self._by_open_keys(values, middle))
         for number, each in enumerate(self.open, start=PROBE):
             if not each.of_instrument:
-                columns.append(next(magnets) @ matrix.T)
+                columns.append(self._shown(next(magnets) @ matrix.T, along))
                 continue
             step = SMALL * np.eye(len(values))[number]
             other = self.instrument(pose, values + step)
             moved = sensor_positions(other, self.points) - sensors
             there = here + np.einsum("nsck,nsk->nsc", gradient, moved)
-            columns.append((seen(sensor_matrix(other), there) - seen(matrix, here)) / SMALL)
+            columns.append(self._shown(
+                (seen(sensor_matrix(other), there) - seen(matrix, here)) / SMALL, along))
         return _State(residual, np.stack(columns, axis=-1), by_block, sigma,
                       np.concatenate([self.pose_sd, self.prior_sd()]),
                       self.smallest_sigma / (DEVIATION * float(np.sqrt(np.mean(np.sum(

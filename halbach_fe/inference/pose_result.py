@@ -213,6 +213,8 @@ class Registration:
         How many times the readings are what a probe without errors reads of the nominal magnet.
     component : str
         Which component the readings were taken for, where the map does not say it; else empty.
+    total : bool
+        Whether the map is of |B|, which then stands in place of x in the residuals.
     """
 
     study: Study
@@ -234,6 +236,7 @@ class Registration:
     doubts: tuple[Term, ...] = ()
     factor: float = 1.0
     component: str = ""
+    total: bool = False
 
     @property
     def instrument(self) -> Instrument:

@@ -18,7 +18,7 @@ from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.line_search import along_the_axis, line_of, poses_along
 from halbach_fe.inference.pose_space import (
-    Field,
+    Shown,
     misfit_of,
     moved_by,
     right_angles,
@@ -57,8 +57,9 @@ MOST_POSES = 4
 """Largest number of poses that are fitted with the magnet's own model."""
 
 MOST_OF_A_LINE = 8
-"""The same of a map on a line. A component that is even in x, y and z, as in an ideal dipole, is
-the same on four lines in two directions."""
+"""The same of a map on a line, and of one of |B|, which is the same in twice as many poses. On a
+line a component that is even in x, y and z, as in an ideal dipole, is the same on four lines in two
+directions."""
 
 NARROW = 0.02
 """Width up to which a map lies on a line, in units of the bore's radius."""
@@ -72,7 +73,7 @@ DIFFERENCE_M = 2e-4
 
 def coarse_poses(
     magnet: Magnet, points: Floats, readings: Floats, training: NDArray[np.bool_],
-    across_m: float = np.inf, pace: Pace | None = None,
+    across_m: float = np.inf, pace: Pace | None = None, total: bool = False,
 ) -> list[Floats]:
     """Return poses (6,), the best first: where the map's middle lies in m, and a rotation vector.
 
@@ -89,6 +90,8 @@ def coarse_poses(
         Prior standard deviation of the middle's distance from the axis along x and y.
     pace : Pace, optional
         Reports how many places and candidates are left, and the time.
+    total : bool
+        Whether the map is of |B|, which then stands in place of Bx.
     """
     rows = np.flatnonzero(training.any(axis=1))
     used = np.where(training, readings, 0.0)
@@ -97,11 +100,13 @@ def coarse_poses(
     points = points - middle_of(points)
     line = line_of(points[rows], NARROW * magnet.bore_radius)
     pace = pace or Pace(lambda _: None)
-    improved = _searched(magnet, points, used, training, pace, line, across_m)
+    vacuum = Shown(field_in_vacuum(magnet.blocks), total)
+    improved = _searched(magnet, vacuum, points, used, training, pace, line, across_m)
     best = improved[0][0]
     size = float(np.sqrt(np.sum(used[rows]**2) / training.sum()))
     if line is None and best > SUSPICIOUS * size:  # a line is its own mirror image
-        mirrored = _searched(magnet, points * MIRROR, -used * MIRROR, training, pace)[0][0]
+        mirrored = _searched(magnet, vacuum, points * MIRROR, used if total else -used * MIRROR,
+                             training, pace)[0][0]
         if mirrored < best / MIRRORED:
             raise MeasurementError(must_be(
                 "map", "registration", "that of the study's magnet",
@@ -113,12 +118,13 @@ def coarse_poses(
             "map", "registration", "one that some pose of the magnet explains",
             f"{best / size:.0%} of its field unexplained in the best one",
             "Check the axes and signs of its columns with halbach-fe check."))
-    most = MOST_POSES if line is None else MOST_OF_A_LINE
+    most = MOST_POSES if line is None and not total else MOST_OF_A_LINE
     return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:most]
 
 
 def _searched(
-    magnet: Magnet, points: Floats, used: Floats, training: NDArray[np.bool_], pace: Pace,
+    magnet: Magnet, vacuum: Shown, points: Floats, used: Floats, training: NDArray[np.bool_],
+    pace: Pace,
     line: Floats | None = None, across_m: float = np.inf,
 ) -> list[tuple[float, Floats]]:
     """Return the rms residuals in T of poses, and these, the best first.
@@ -126,9 +132,8 @@ def _searched(
     Points (n, 3) in m are about their middle; ``used`` (n, 3) are the readings, 0 where they may
     not be used; ``line`` (3,) is the direction of the line on which they lie, if they do.
     """
-    vacuum = field_in_vacuum(magnet.blocks)
     improved = [] if line is None else poses_along(
-        magnet, points, used, training, line, across_m, pace)
+        magnet, vacuum, points, used, training, line, across_m, pace)
     rotations = [matrix for matrix in right_angles()
                  if line is None or not along_the_axis(matrix, line)]
     scores = _scores(magnet, vacuum, points, used, training, rotations, pace)
@@ -150,7 +155,7 @@ def _chosen(training: NDArray[np.bool_], count: int) -> Ints:
 
 
 def _scores(
-    magnet: Magnet, vacuum: Field, points: Floats, used: Floats, training: NDArray[np.bool_],
+    magnet: Magnet, vacuum: Shown, points: Floats, used: Floats, training: NDArray[np.bool_],
     rotations: Sequence[Floats], pace: Pace,
 ) -> list[tuple[float, float, Floats]]:
     """Return misfits in T of places on the axis in m, and of rotations, the best first."""
@@ -168,7 +173,8 @@ def _scores(
         shifts, places = shifts[~inside], places[~inside]
         if not len(shifts):
             continue
-        fields = vacuum(places.reshape(-1, 3)).reshape(len(shifts), -1, 3) @ matrix
+        fields = vacuum(places.reshape(-1, 3)).reshape(len(shifts), -1, 3)
+        fields = vacuum.along(fields, matrix)
         scores += [(misfit_of(field, used[few], training[few])[0], shift, matrix)
                    for shift, field in zip(shifts.tolist(), fields, strict=True)]
     return sorted(scores, key=lambda each: each[0])
@@ -192,7 +198,7 @@ def _worth_trying(
 
 
 def _all_improved(
-    magnet: Magnet, vacuum: Field, points: Floats, used: Floats, training: NDArray[np.bool_],
+    magnet: Magnet, vacuum: Shown, points: Floats, used: Floats, training: NDArray[np.bool_],
     worth: Sequence[tuple[float, Floats]], pace: Pace,
 ) -> list[tuple[float, Floats]]:
     """Return misfits in T and different poses (6,) to which least squares leads from some."""
@@ -209,7 +215,7 @@ def _all_improved(
 
 
 def _improved(
-    magnet: Magnet, vacuum: Field, pose: Floats, points: Floats, readings: Floats,
+    magnet: Magnet, vacuum: Shown, pose: Floats, points: Floats, readings: Floats,
     training: NDArray[np.bool_]
 ) -> tuple[float | None, Floats]:
     """Return the rms and the pose (6,) of a fit to nominal blocks in vacuum; None in no air."""
@@ -217,7 +223,7 @@ def _improved(
         """Return the field (n, 3) along the map's axes at every pose, computed together."""
         turns = [Rotation.from_rotvec(each[3:]).as_matrix() for each in poses]
         places = [points @ matrix.T + each[:3] for matrix, each in zip(turns, poses, strict=True)]
-        return [field @ matrix for field, matrix in zip(
+        return [vacuum.along(field, matrix) for field, matrix in zip(
             np.split(vacuum(np.concatenate(places)), len(poses)), turns, strict=True)]
 
     (field,) = fields([pose])

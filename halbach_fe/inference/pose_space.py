@@ -7,6 +7,7 @@ middle from the axes of the map to those of the magnet.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
@@ -23,6 +24,26 @@ LONGEST_M, LONGEST_RAD = 5e-3, 0.05
 
 Field = Callable[[Floats], Floats]
 """Takes points (n, 3) in m and returns B (n, 3) in T."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A field, and how a map shows it: by components, or as |B| in place of Bx."""
+
+    field: Field
+    total: bool = False
+
+    def __call__(self, places: Floats) -> Floats:
+        """Return B (n, 3) in T at places (n, 3) in m."""
+        return self.field(places)
+
+    def along(self, field: Floats, matrix: Floats) -> Floats:
+        """Return what a map shows of B (..., n, 3), turned by a matrix from its axes."""
+        if not self.total:
+            return np.asarray(field @ matrix)
+        size = np.zeros(field.shape)
+        size[..., 0] = np.linalg.norm(field, axis=-1)
+        return size
 
 
 def right_angles() -> list[Floats]:

@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import reduce
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
+from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sparse
+import xarray as xr
+from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
 from halbach_fe.measurement.campaign import SAME_PLACE_M, SAME_READING, SHARED, Map, repeated
-from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes, remove_nonlinear_part
+from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    probe_points,
+    remove_nonlinear_part,
+    sensor_matrix,
+    total_without_nonlinear_part,
+)
 from halbach_fe.measurement.observation import (
     Observation,
     concatenate,
     excluded_components,
     held_out_readings,
     observe,
+    observe_total,
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
+from halbach_fe.response.matrix import Response, StoredMatrix
+from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.external_field import external_field
+from halbach_fe.stats.linear_gaussian import row_slices
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
@@ -52,6 +67,11 @@ class Readings:
     noise : NoiseCovariance
     parts, regions, maps : tuple of str
         Part (`TRAINING`, `HELD_OUT` or `HELD_OUT_MAP`), noise region and map of each reading.
+    vectors : Observation
+        The same with all components of B in place of each reading of |B|.
+    directions : dict of str to ndarray, shape (n, 3)
+        For each map of |B| the unit vectors of the field about which |B| is linearized, as a probe
+        of three components would show them.
     """
 
     observation: Observation
@@ -60,6 +80,54 @@ class Readings:
     parts: tuple[str, ...]
     regions: tuple[str, ...]
     maps: tuple[str, ...]
+    vectors: Observation
+    directions: dict[str, Floats] = field(default_factory=dict)
+
+    @cached_property
+    def total(self) -> NDArray[np.bool_]:
+        """Which readings (readings,) are |B|."""
+        return self.observation.of_total_field
+
+    @cached_property
+    def first(self) -> Ints:
+        """Number (readings,) of each reading, or of its first component, among `vectors`."""
+        width = np.where(self.total, 3, 1)
+        return np.asarray(np.cumsum(width) - width)
+
+    @cached_property
+    def projection(self) -> sparse.csr_array:
+        """Matrix from `vectors` to the readings."""
+        width = np.where(self.total, 3, 1)
+        values = np.ones(int(width.sum()))
+        values[np.repeat(self.total, width)] = self.observation.directions.ravel()
+        return sparse.csr_array((values, np.arange(len(values)), np.append(0, np.cumsum(width))),
+                                shape=(len(width), len(values)))
+
+    def of_components(self, values: Floats) -> Floats:
+        """Return B (k, 3) in T of all readings of |B| from those of `vectors`."""
+        return np.asarray(values[self.first[self.total][:, None] + np.arange(3)])
+
+    def projected(self, model: Response, folder: Path) -> Response:
+        """Return the response of the readings from that of `vectors`.
+
+        A large matrix is stored in a folder.
+        """
+        if not self.total.any():
+            return model
+        shape = len(self.total), len(model.parameters)
+
+        def part(rows: slice) -> Floats:
+            own = self.projection[rows]
+            used, place = np.unique(own.indices, return_inverse=True)
+            return np.asarray(sparse.csr_array(
+                (own.data, place, own.indptr), shape=(own.shape[0], len(used)))
+                @ model.matrix[used])
+
+        matrix = part(slice(None)) if isinstance(model.matrix, np.ndarray) else StoredMatrix.of(
+            map(part, row_slices(*shape)), shape, folder / "response-of-magnitude.npy")
+        # error bars of a component are already those of the vector at its point
+        return replace(model, matrix=matrix, offset=self.projection @ model.offset,
+                       error=model.error[self.first])
 
     @property
     def training(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -70,6 +138,7 @@ class Readings:
 def read_campaign(
     magnet: Magnet, maps: Sequence[Map], known: Noises | None = None,
     estimated: Sequence[MagnetBlock] | None = None,
+    directions: Mapping[str, Floats] | None = None,
 ) -> Readings:
     """Return the readings of all maps, by the instrument of each.
 
@@ -83,6 +152,9 @@ def read_campaign(
     estimated : sequence of MagnetBlock, optional
         Blocks with the magnetizations as they are estimated, in whose gradient uncertain positions
         make noise; by default the nominal ones.
+    directions : dict of str to ndarray, shape (k, 3), optional
+        Unit vectors at the readings of each map of |B|, see `Readings`; by default those of the
+        nominal blocks in vacuum.
 
     Raises
     ------
@@ -94,7 +166,8 @@ def read_campaign(
     several = sum(not one.is_validation for one in maps) > 1
     noises = {} if known is None else known
     blocks = magnet.blocks if estimated is None else estimated
-    found = [_read(magnet, one, several, noises, blocks) for one in maps]
+    found = [_read(magnet, one, several, noises, blocks, (directions or {}).get(one.name))
+             for one in maps]
     if magnet.dimension == 2:
         heights = np.concatenate([each.observation.points[:, 2] for each in found])
         _check_plane(heights, "map")
@@ -157,25 +230,23 @@ def check_validation_map(readings: Readings, study: Study) -> None:
 
 
 def _read(
-    magnet: Magnet, one: Map, several: bool, noises: Noises, blocks: Sequence[MagnetBlock]
+    magnet: Magnet, one: Map, several: bool, noises: Noises, blocks: Sequence[MagnetBlock],
+    directions: Floats | None,
 ) -> Readings:
     """Return the readings of a map; ``several`` puts its name into error messages and regions."""
     study, where = one.study, one.name if one.is_validation or not several else f"map {one.name}"
     called = where if several else f"the {where}"
     magnet = magnet.with_study(study)
     data = in_si_and_magnet_axes(study.instrument, one.data)
-    measured = ~np.isnan(data["B_T"].values)
-    if not one.is_validation:
-        measured &= ~excluded_components(study, data.sizes["point"], where)
-    if not measured.any():
-        raise MeasurementError(must_be(
-            "readings", where, "some that the study does not exclude", "none",
-            "Correct `inference.excluded_readings`."))
-    if not np.any(data["B_T"].values[measured]):
-        raise MeasurementError(must_be(
-            "flux densities", where, "those of a magnet", "zero at all points",
-            "Was the probe connected? Correct the map."))
-    observation = observe(study, points_of(data), measured, where)
+    measured = _measured(one, data, where)
+    if is_total_field(data):
+        shown = total_without_nonlinear_part(study.instrument, data)
+        directions = _at_all(measured[:, 0], directions, magnet, points_of(data))
+        observation, vectors = (observe_total(study, points_of(data), measured[:, 0], given, where)
+                                for given in (directions, None))
+    else:
+        directions, shown = None, remove_nonlinear_part(study.instrument, data)
+        observation = vectors = observe(study, points_of(data), measured, where)
     if magnet.dimension == 2:
         _check_plane(observation.points[:, 2], where)
         _doubt_field_along_z(data["B_T"].values, where)
@@ -202,12 +273,57 @@ def _read(
     if several:
         single = len(set(regions)) == 1
         regions = tuple(one.name if single else f"{one.name}: {region}" for region in regions)
-    values = observation.read(np.nan_to_num(remove_nonlinear_part(study.instrument, data)))
+    values = (observation.read(np.nan_to_num(shown)) if directions is None
+              else shown[observation.map_rows])
     if one.name not in noises:
         noises[one.name] = reading_noise(
             replace(magnet, blocks=tuple(blocks)), observation, data, called)
     return Readings(observation, values, noises[one.name], parts, regions,
-                    (one.name,) * len(observation))
+                    (one.name,) * len(observation), vectors,
+                    {} if directions is None else {one.name: directions})
+
+
+def _measured(one: Map, data: xr.Dataset, where: str) -> NDArray[np.bool_]:
+    """Return which components (n, 3) of a map are used; of |B|, all three or none."""
+    values = data["B_T"].values
+    total = is_total_field(data)
+    if total:
+        values = np.repeat(data[TOTAL_COLUMN].values[:, None], 3, axis=1)
+    measured = ~np.isnan(values)
+    if not one.is_validation:
+        excluded = excluded_components(one.study, data.sizes["point"], where)
+        measured &= ~(excluded.any(axis=1, keepdims=True) if total else excluded)
+    if not measured.any():
+        raise MeasurementError(must_be(
+            "readings", where, "some that the study does not exclude", "none",
+            "Correct `inference.excluded_readings`."))
+    if not np.any(values[measured]):
+        raise MeasurementError(must_be(
+            "flux densities", where, "those of a magnet", "zero at all points",
+            "Was the probe connected? Correct the map."))
+    return measured
+
+
+def _at_all(
+    measured: NDArray[np.bool_], directions: Floats | None, magnet: Magnet, points: Floats
+) -> Floats:
+    """Return directions (n, 3) at all points of a map from those at its readings (k, 3).
+
+    By default they are those of the field of the blocks in vacuum, as a probe shows it.
+    """
+    if directions is not None:
+        found = np.tile([1.0, 0.0, 0.0], (len(points), 1))
+        found[measured] = directions
+        return found
+    places = probe_points(magnet.study.instrument, points)
+    shown = field_of(magnet.blocks, places) + external_field(magnet, places)
+    return unit_vectors(shown @ sensor_matrix(magnet.study.instrument).T)
+
+
+def unit_vectors(vectors: Floats) -> Floats:
+    """Return the directions (n, 3) of vectors (n, 3); that of a zero is along x."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(size > 0, vectors / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
 
 
 def _stacked(first: Readings, second: Readings) -> Readings:
@@ -215,4 +331,5 @@ def _stacked(first: Readings, second: Readings) -> Readings:
     return Readings(
         concatenate(first.observation, second.observation),
         np.concatenate([first.values, second.values]), first.noise.stacked_with(second.noise),
-        first.parts + second.parts, first.regions + second.regions, first.maps + second.maps)
+        first.parts + second.parts, first.regions + second.regions, first.maps + second.maps,
+        concatenate(first.vectors, second.vectors), first.directions | second.directions)

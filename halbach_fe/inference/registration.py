@@ -128,7 +128,8 @@ def _registered(
     """Return the poses of a map by some hypotheses about what is open, see `register`."""
     fit, magnet, pace = fits[0], fits[0].magnet, Pace(say)
     say("searching the pose among rotations by right angles and shifts along the axis")
-    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0], pace)
+    starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0],
+                          pace, fit.total)
     starts = [each for each in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), each)]
     starts = starts[:most]
     if prior.stage is not None and starts:

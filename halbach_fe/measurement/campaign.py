@@ -16,7 +16,15 @@ from scipy.stats import binom
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.measurement.field_map import checked_map, points_of, read_map
+from halbach_fe.measurement.field_map import (
+    TOTAL_COLUMN,
+    TOTAL_SIGMA_COLUMN,
+    checked_map,
+    is_total_field,
+    points_of,
+    read_map,
+    refuse_total_field,
+)
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
 from halbach_fe.study.maps import InstrumentSd
@@ -173,6 +181,7 @@ def maps_of(
             found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
                              one.stage or one.name, one.name, one.stage_shift_sd_m))
         _refuse_repeated(found)
+        _refuse_mixed_probes(found)
     if validation_map is not None:
         validation_map = checked_map(validation_map, VALIDATION_MAP)
         own = study_for_validation_map(study.with_(maps=()), validation_map)
@@ -211,6 +220,13 @@ def check_maps(study: Study, data: object) -> xr.Dataset | dict[str, xr.Dataset]
             f"{', '.join(one.name for one in study.maps) or 'none'} for "
             f"{', '.join(map(str, data)) or 'none'}", "Read them by read_maps."))
     return {name: checked_map(one, name) for name, one in data.items()}
+
+
+def refuse_total_fields(data: Data, validation_map: xr.Dataset | None) -> None:
+    """Raise a MeasurementError if any map of a diagnosis is of |B| alone."""
+    for one in (*([data] if isinstance(data, xr.Dataset) else data.values()), validation_map):
+        if one is not None:
+            refuse_total_field(one, "diagnose")
 
 
 def with_pivots(maps: Sequence[Map]) -> list[Map]:
@@ -299,16 +315,31 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
                 "Remove one of them, or these rows of one."))
 
 
-def _rows(data: xr.Dataset, study: Study) -> tuple[Floats, Floats, float]:
-    """Return points (n, 3) in m, values (n, 3) in T and typical noise in T of a map.
+def _refuse_mixed_probes(maps: Sequence[Map]) -> None:
+    """Raise a StudyError if a map of |B| shares its probe with one of components."""
+    for one, other in combinations(maps, 2):
+        if one.probe == other.probe and is_total_field(one.data) != is_total_field(other.data):
+            raise StudyError(must_be(
+                f"`maps.probe` of '{one.name}' and '{other.name}'", "the campaign",
+                "different, as one map is of |B| and the other of components", f"'{one.probe}'",
+                "Leave `probe` out for one of them."))
 
-    Both are in SI units and along the axes of the magnet. The noise is 0 if nothing states it.
+
+def _rows(data: xr.Dataset, study: Study) -> tuple[Floats, Floats, float]:
+    """Return points (n, 3) in m, values (n, 4) in T and typical noise in T of a map.
+
+    Both are in SI units and along the axes of the magnet; the last value is |B| of a map of |B|
+    alone. The noise is 0 if nothing states it.
     """
     data = in_si_and_magnet_axes(study.instrument, data)
-    field = np.asarray(data["B_T"].values, float)
+    alone = is_total_field(data)
+    total = data[TOTAL_COLUMN].values if alone else np.full(data.sizes["point"], np.nan)
+    field = np.column_stack([data["B_T"].values, total])
     noise = [region.sigma_T for region in study.noise.regions] if study.noise else []
-    if "sigma_T" in data:
-        noise = [float(np.median(data["sigma_T"].values[np.isfinite(field)]))]
+    if alone and TOTAL_SIGMA_COLUMN in data:
+        noise = [float(np.median(data[TOTAL_SIGMA_COLUMN].values[np.isfinite(total)]))]
+    elif "sigma_T" in data:
+        noise = [float(np.median(data["sigma_T"].values[np.isfinite(field[:, :3])]))]
     return points_of(data), field, min(noise, default=0.0)
 
 

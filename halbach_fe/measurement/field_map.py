@@ -5,6 +5,9 @@ A map is an `xarray.Dataset` with
 * ``B_T`` (point, component): flux density in T, NaN where a component was not measured;
 * coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m and ``component`` = x, y, z;
 * optionally ``sigma_T`` (point, component), ``time_s`` (point) and ``scan`` (point);
+* optionally ``Babs_T`` (point), |B| in T as a probe without a direction reads it, and its noise
+  ``sigma_Babs_T`` (point). A map of |B| alone has no other reading; beside components,
+  |B| tests them;
 * attributes: provenance, as free text by key. `DIRECTION` = `UNDIRECTED` marks a map of a single
   component of which nobody has said which it is. It stands where Bz does, and only `register`,
   which tries all three, reads it.
@@ -43,6 +46,8 @@ from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SI
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
 SIGMA_COLUMNS = ("sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
+TOTAL_COLUMN, TOTAL_SIGMA_COLUMN = "Babs_T", "sigma_Babs_T"
+TOTAL_COLUMNS = (TOTAL_COLUMN, TOTAL_SIGMA_COLUMN)
 OTHER_COLUMNS = ("sigma_T", "time_s", "scan")
 UNDIRECTED_COLUMN = "B_T"
 """Column of a component of which nobody has said which it is."""
@@ -108,12 +113,46 @@ def refuse_undirected(data: xr.Dataset) -> None:
             "that it finds."))
 
 
+def total_field_map(
+    points: Floats, magnitude: Floats, sigma: Floats | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> xr.Dataset:
+    """Return a map of |B| (n,) in T alone at points (n, 3) in m, and its noise sigma (n,) in T."""
+    data = field_map(points, np.full(points.shape, np.nan), attributes=attributes)
+    return with_total_field(data, magnitude, sigma)
+
+
+def with_total_field(
+    data: xr.Dataset, magnitude: Floats, sigma: Floats | None = None
+) -> xr.Dataset:
+    """Return a map with |B| (n,) in T, and its noise sigma (n,) in T, beside what it has."""
+    columns = {TOTAL_COLUMN: magnitude} | ({} if sigma is None else {TOTAL_SIGMA_COLUMN: sigma})
+    return data.assign({name: ("point", np.array(values, float), {"units": "T"})
+                        for name, values in columns.items()})
+
+
+def is_total_field(data: xr.Dataset) -> bool:
+    """Tell whether a map holds |B| alone, without any component."""
+    return TOTAL_COLUMN in data and bool(np.isnan(data["B_T"].values).all())
+
+
+def refuse_total_field(data: xr.Dataset, what: str) -> None:
+    """Raise a MeasurementError if a map holds |B| alone, for what needs components of B."""
+    if is_total_field(data):
+        raise MeasurementError(must_be(
+            f"map {data.encoding.get('source', '')}".rstrip(), what,
+            "of components Bx, By or Bz", f"a map of |B| alone ({TOTAL_COLUMN})",
+            "`infer` and `register` take such a map, and `check` tests its readings."))
+
+
 def readings_sha256(data: xr.Dataset) -> str:
     """Return the SHA-256 of the points and readings of a map, in whatever format it is stored.
 
     Two maps have the same value if they have the same numbers in the same order.
     """
     values = np.column_stack([points_of(data), np.asarray(data["B_T"].values, dtype=float)])
+    if is_total_field(data):
+        values = np.column_stack([values, np.asarray(data[TOTAL_COLUMN].values, dtype=float)])
     values[np.isnan(values)] = np.nan  # NaN and zero have several binary forms
     return hashlib.sha256(np.ascontiguousarray(values + 0.0).astype("<f8").tobytes()).hexdigest()
 
@@ -146,8 +185,8 @@ def read_map(path: str | Path) -> xr.Dataset:
     """Read and validate a map from CSV, HDF5 (.h5, .hdf5, .nc) or VTU.
 
     In CSV, comments ``# key: value`` are attributes. The header names, in any order, the columns
-    x_m, y_m, z_m, at least one of Bx_T, By_T, Bz_T, and optionally sigma_T (or sigma_Bx_T ...),
-    time_s and scan. An empty field is a component that was not measured.
+    x_m, y_m, z_m, at least one of Bx_T, By_T, Bz_T or Babs_T (|B|), and optionally sigma_T (or
+    sigma_Bx_T ...), time_s and scan. An empty field is a component that was not measured.
 
     Parameters
     ----------
@@ -158,8 +197,8 @@ def read_map(path: str | Path) -> xr.Dataset:
     -------
     Dataset
         ``B_T`` (point, component) in T, NaN where a component was not measured, with the
-        coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m; and ``sigma_T``, ``time_s`` and ``scan``
-        if the file has them.
+        coordinates ``x_m``, ``y_m``, ``z_m`` (point) in m; and ``Babs_T``, ``sigma_Babs_T``,
+        ``sigma_T``, ``time_s`` and ``scan`` if the file has them.
 
     Raises
     ------
@@ -189,8 +228,9 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
                                                for name in POSITION_COLUMNS}
     if is_undirected(data):
         columns[UNDIRECTED_COLUMN] = data["B_T"].values[:, COMPONENTS.index("z")]
-    else:
+    elif not is_total_field(data):
         columns |= {name: data["B_T"].values[:, i] for i, name in enumerate(FIELD_COLUMNS)}
+    columns |= {name: data[name].values for name in TOTAL_COLUMNS if name in data}
     if "sigma_T" in data and is_undirected(data):
         columns["sigma_T"] = data["sigma_T"].values[:, COMPONENTS.index("z")]
     elif "sigma_T" in data:
@@ -203,7 +243,8 @@ def _write_vtu(data: xr.Dataset, path: Path) -> None:
     refuse_undirected(data)  # the format has no attributes
     points = points_of(data)
     cells = [("vertex", np.arange(len(points))[:, None])]
-    values = {name: data[name].values for name in ("B_T", "sigma_T", "time_s") if name in data}
+    values = {name: data[name].values
+              for name in ("B_T", *TOTAL_COLUMNS, "sigma_T", "time_s") if name in data}
     meshio.write(path, meshio.Mesh(points, cells, point_data=values), file_format="vtu")
 
 
@@ -259,7 +300,7 @@ def _labelled(data: xr.Dataset, where: str) -> xr.Dataset:
             "point", "component"))
     _check_names(data, where)
     by_point: tuple[str, ...] = ("point",)
-    expected = dict.fromkeys((*POSITION_COLUMNS, "time_s", "scan"), by_point)
+    expected = dict.fromkeys((*POSITION_COLUMNS, *TOTAL_COLUMNS, "time_s", "scan"), by_point)
     expected |= {"B_T": ("point", "component"), "sigma_T": ("point", "component")}
     for name, dims in expected.items():
         if name not in data.variables:
@@ -297,8 +338,9 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
             mesh = untrusted.read_mesh(Path(copy.name))
         data = field_map(mesh.points, mesh.point_data["B_T"], mesh.point_data.get("sigma_T"))
         _check_names(xr.Dataset(dict.fromkeys(mesh.point_data, 0.0)), where)
-        if "time_s" in mesh.point_data:
-            data["time_s"] = ("point", mesh.point_data["time_s"])
+        for name in (*TOTAL_COLUMNS, "time_s"):
+            if name in mesh.point_data:
+                data[name] = ("point", mesh.point_data[name])
     except MeasurementError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -310,10 +352,10 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
 def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     where = f"map {path}"
     attributes, header, rows = csv_table(raw, where, FOREIGN)
-    if not {*POSITION_COLUMNS, *FIELD_COLUMNS, UNDIRECTED_COLUMN}.intersection(header):
+    if not {*POSITION_COLUMNS, *FIELD_COLUMNS, UNDIRECTED_COLUMN, TOTAL_COLUMN} & set(header):
         raise MeasurementError(must_be(
             "header", where, f"complete with {', '.join(POSITION_COLUMNS)}, and at least one of "
-            f"{', '.join(FIELD_COLUMNS)}", ",".join(header), FOREIGN))
+            f"{', '.join((*FIELD_COLUMNS, TOTAL_COLUMN))}", ",".join(header), FOREIGN))
     _check_header(header, where)
     table: dict[str, list[float]] = {name: [] for name in header}
     scans: list[str] = []
@@ -338,6 +380,8 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     elif any(name in table for name in SIGMA_COLUMNS):
         data["sigma_T"] = (("point", "component"),
                            np.column_stack([table.get(n, empty) for n in SIGMA_COLUMNS]))
+    if TOTAL_COLUMN in table:
+        data = _with_total(data, table)
     if "time_s" in table:
         data["time_s"] = ("point", table["time_s"])
     if scans:
@@ -345,25 +389,40 @@ def _read_csv(raw: bytes, path: Path) -> xr.Dataset:
     return data
 
 
+def _with_total(data: xr.Dataset, table: Mapping[str, list[float]]) -> xr.Dataset:
+    """Return a map with |B| of a table; without components, its noise is what sigma_T says."""
+    data = with_total_field(data, np.array(table[TOTAL_COLUMN]))
+    sigma = table.get(TOTAL_SIGMA_COLUMN, table.get("sigma_T"))
+    if sigma is not None:
+        data = with_total_field(data, np.array(table[TOTAL_COLUMN]), np.array(sigma))
+    return data.drop_vars("sigma_T", errors="ignore") if is_total_field(data) else data
+
+
 def _check_header(header: list[str], where: str) -> None:
-    check_columns(header, (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS,
-                           UNDIRECTED_COLUMN), where)
+    check_columns(header, (*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *TOTAL_COLUMNS,
+                           *OTHER_COLUMNS, UNDIRECTED_COLUMN), where)
     missing = [name for name in POSITION_COLUMNS if name not in header]
-    if UNDIRECTED_COLUMN in header and set(header) & {*FIELD_COLUMNS, *SIGMA_COLUMNS}:
+    if UNDIRECTED_COLUMN in header and set(header) & {*FIELD_COLUMNS, *SIGMA_COLUMNS,
+                                                      *TOTAL_COLUMNS}:
         raise MeasurementError(must_be(
             "header", where, f"with {UNDIRECTED_COLUMN}, a component that is not known, or with "
-            f"{', '.join(FIELD_COLUMNS)}, not both", ",".join(header)))
-    if missing or not any(name in header for name in (*FIELD_COLUMNS, UNDIRECTED_COLUMN)):
-        expected = missing[0] if missing else "at least one of Bx_T, By_T, Bz_T"
+            f"{', '.join((*FIELD_COLUMNS, TOTAL_COLUMN))}, not both", ",".join(header)))
+    if missing or not any(name in header for name in (
+            *FIELD_COLUMNS, UNDIRECTED_COLUMN, TOTAL_COLUMN)):
+        expected = missing[0] if missing else "at least one of Bx_T, By_T, Bz_T, Babs_T"
         raise MeasurementError(must_be("header", where, f"complete with {expected}",
                                        ",".join(header)))
-    if "sigma_T" in header and any(name in header for name in SIGMA_COLUMNS):
+    if "sigma_T" in header and any(name in header for name in (
+            *SIGMA_COLUMNS, TOTAL_SIGMA_COLUMN)):
         raise MeasurementError(must_be("header", where, "with sigma_T or sigma_Bx_T ..., not both",
                                        ",".join(header)))
+    if TOTAL_SIGMA_COLUMN in header and TOTAL_COLUMN not in header:
+        raise MeasurementError(must_be(
+            "header", where, f"with {TOTAL_COLUMN} beside {TOTAL_SIGMA_COLUMN}", ",".join(header)))
 
 
 def _number(cell: str, name: str, number: int, where: str) -> float:
-    if not cell and (name in FIELD_COLUMNS or name in SIGMA_COLUMNS):
+    if not cell and name in (*FIELD_COLUMNS, *SIGMA_COLUMNS, *TOTAL_COLUMNS):
         return np.nan
     return finite(cell, f"{name} in line {number}", where,
                   "Write seconds, or call the column time and convert the file by halbach-fe "
@@ -381,6 +440,8 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
         raise MeasurementError(must_be(f"reading {row + 1}", where, "finite numbers",
                                        "an infinite or missing value"))
     blank = np.isnan(values).all(axis=1)
+    if TOTAL_COLUMN in data:
+        blank = _without_total(data, blank, where)
     if blank.any():
         raise MeasurementError(must_be(f"reading {int(np.argmax(blank)) + 1}", where,
                                        "at least one component", "none", "Remove the line."))
@@ -402,6 +463,42 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
     _check_duplicates(data, points, where)
 
 
+def _without_total(
+    data: xr.Dataset, blank: NDArray[np.bool_], where: str
+) -> NDArray[np.bool_]:
+    """Return which rows of a map hold nothing, |B| included; ``blank`` (n,) are those without any
+    component.
+
+    Raises
+    ------
+    MeasurementError
+        If |B| is negative or infinite, its noise is not positive, or some rows hold components and
+        others |B| alone.
+    """
+    total = data[TOTAL_COLUMN].values
+    wrong = np.isinf(total) | (total < 0)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise MeasurementError(must_be(
+            f"{TOTAL_COLUMN} of reading {row + 1}", where, "a magnitude, never negative",
+            f"{total[row]:g}", "If the column is a component, name it Bx_T, By_T or Bz_T."))
+    if TOTAL_SIGMA_COLUMN in data:
+        sigma = data[TOTAL_SIGMA_COLUMN].values[~np.isnan(total)]
+        if not (sigma > 0).all() or not np.isfinite(sigma).all():
+            raise MeasurementError(must_be(TOTAL_SIGMA_COLUMN, where, "positive for every reading",
+                                           "a zero, negative or missing value"))
+    if blank.all() and "sigma_T" in data:
+        raise MeasurementError(must_be(
+            "`sigma_T`", where, f"named {TOTAL_SIGMA_COLUMN} in a map of |B| alone", "sigma_T"))
+    if not blank.all() and (blank & ~np.isnan(total)).any():
+        row = int(np.argmax(blank & ~np.isnan(total)))
+        raise MeasurementError(must_be(
+            f"reading {row + 1}", where, "with a component of B, as other rows of it have",
+            f"{TOTAL_COLUMN} alone", "Put the rows of |B| into a map of their own; a study can "
+            "list both."))
+    return blank & np.isnan(total)
+
+
 def check_magnitudes(data: xr.Dataset) -> None:
     """Raise MeasurementError if a map's values are too large to be in m and T, or sigmas absurd.
 
@@ -415,15 +512,18 @@ def check_magnitudes(data: xr.Dataset) -> None:
             "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{farthest:g}",
             "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study, or "
             "convert the map by halbach-fe import-map."))
-    largest = float(np.nanmax(np.abs(data["B_T"].values)))
+    values, sigmas = data["B_T"].values, data.get("sigma_T")
+    if is_total_field(data):
+        values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
+    largest = float(np.nanmax(np.abs(values)))
     if largest > MAX_FIELD_T:
         unit, factor = ("gauss", 1e-4) if largest > 2000 else ("millitesla", 1e-3)
         raise MeasurementError(must_be(
             "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
             "study, or convert the map by halbach-fe import-map."))
-    if "sigma_T" in data:
-        sigma = data["sigma_T"].values[~np.isnan(data["B_T"].values)]
+    if sigmas is not None:
+        sigma = sigmas.values[~np.isnan(values)]
         for extreme in (sigma.max(), sigma.min()):
             if not MIN_SIGMA_T <= extreme <= MAX_SIGMA_T:
                 raise MeasurementError(must_be(

@@ -25,6 +25,8 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
+    TOTAL_COLUMN,
+    TOTAL_COLUMNS,
     check_magnitudes,
     points_of,
     refuse_undirected,
@@ -78,6 +80,7 @@ def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Datase
         sigma = to_magnet_axes(instrument.field_axes, data["sigma_T"].values) * unit
         sigma *= to_magnet_axes(instrument.field_axes, np.ones(sigma.shape))  # axes have signs
         read = read.assign(sigma_T=data["sigma_T"].copy(data=sigma))
+    read = read.assign({name: data[name] * unit for name in TOTAL_COLUMNS if name in data})
     check_magnitudes(read)
     return read
 
@@ -229,6 +232,40 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
     raise MeasurementError(must_be(
         "`instrument`", "study", "a law of the sensors that can be inverted",
         "a law whose inversion does not converge", "Make its nonlinear terms smaller."))
+
+
+def total_without_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
+    """Return |B| (n,) in T of a map of |B| alone without the part that is not linear in |B|.
+
+    Raises
+    ------
+    MeasurementError
+        If the instrument is no such one, see `check_total_field`.
+    """
+    check_total_field(instrument)
+    same = np.repeat(data[TOTAL_COLUMN].values[:, None], 3, axis=1)  # one law for all three columns
+    return np.asarray(remove_nonlinear_part(instrument, data.assign(
+        B_T=data["B_T"].copy(data=same)))[:, 0])
+
+
+def check_total_field(instrument: Instrument) -> None:
+    """Raise a MeasurementError if an instrument has terms that no probe of |B| has.
+
+    Its gain, offset, drift and nonlinearity are numbers, and its sensor is in one place.
+    """
+    for name in ("gain", "offset_T", "drift_T", "quadratic_per_T", "cubic_per_T2",
+                 "sensor_position_m"):
+        found = getattr(instrument, name)
+        if len(set(found)) > 1:
+            raise MeasurementError(must_be(
+                f"`instrument.{name}`", "a map of |B|",
+                "three equal entries, as |B| has one sensor", str(list(found)),
+                "State the number of the probe three times."))
+    for name in ("crosstalk", "planar_hall_per_T"):
+        found = getattr(instrument, name)
+        if any(found.values() if isinstance(found, dict) else found):
+            raise MeasurementError(must_be(
+                f"`instrument.{name}`", "a map of |B|", "left out, as |B| has no axes", str(found)))
 
 
 def _check_components(instrument: Instrument, missing: NDArray[np.bool_]) -> None:

@@ -31,6 +31,7 @@ from halbach_fe.measurement.field_map import (
     check_magnitudes,
     checked_map,
     points_of,
+    refuse_total_field,
     refuse_undirected,
 )
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
@@ -54,7 +55,7 @@ from halbach_fe.measurement.scan_lines import (
     point_spacing,
     scan_lines,
 )
-from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows, spikes
+from halbach_fe.measurement.suspect_rows import broken_rows, contradicted_rows, rough_rows, spikes
 from halbach_fe.study.types import COMPONENTS
 
 SMALLEST_FIELD_T = 1e-12
@@ -265,6 +266,8 @@ class MapCheck:
     corrected_T : ndarray, shape (n, 3)
         What a probe without errors would have read: Bx, By and Bz at the points of the map, by the
         instrument that the lines show which are not held out.
+    contradicted : tuple of int
+        Numbers of the rows whose column of |B| is not that of their components, from 1.
     """
 
     readings: int
@@ -290,6 +293,7 @@ class MapCheck:
     corrected_T: Floats
     position_noise_sd_m: float = 0.0
     position_noise_at_most: bool = False
+    contradicted: tuple[int, ...] = ()
 
     @property
     def suffices(self) -> bool:
@@ -387,6 +391,7 @@ def check_map(
     """
     data = checked_map(data, "`data`")
     refuse_undirected(data)
+    refuse_total_field(data, "Maxwell's check")
     check_magnitudes(data)
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
@@ -482,7 +487,8 @@ def check_map(
         structure=_structure(points[chosen], residual[chosen]),
         reach=_reach(points[held_out], floor, points[chosen], float(np.sqrt(np.mean(left**2)))),
         redundancy=redundancy, excluded=~usable,
-        residual_T=residual @ matrix, unseen_T=unseen @ matrix, corrected_T=model.ideal(train))
+        residual_T=residual @ matrix, unseen_T=unseen @ matrix, corrected_T=model.ideal(train),
+        contradicted=contradicted_rows(data))
 
 
 def _begin(pace: Pace, step: int, what: str) -> None:

@@ -24,6 +24,11 @@ from halbach_fe.study.measurement import CirclePositions, FluxDensity, FourierCo
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
+TOTAL = "abs"
+"""What stands for the component of a reading of |B|."""
+
+TOTAL_LABEL = "|B|"
+
 RADIUS_M = 1e-4
 """Largest distance in m of a reading from a held-out radius. Coordinates of maps are rounded, and
 the radii of circles differ by more than this tolerance."""
@@ -44,7 +49,8 @@ class Observation:
     map_points : ndarray, shape (m, 3), in m
         Positions as the map states them.
     labels : tuple of str
-        Name of each reading: ``Bx``, ``By``, ``Bz``, or ``A1`` ... ``B8`` of a circle.
+        Name of each reading: ``Bx``, ``By``, ``Bz``, ``|B|``, or ``A1`` ... ``B8`` of a circle.
+        A reading of |B| is linear in B about a field of given direction, see `observe_total`.
     positions : ndarray, shape (readings, 3), in m
         Position of each reading as the map states it; for a Fourier coefficient the point of its
         circle at angle 0.
@@ -62,8 +68,28 @@ class Observation:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Component x, y or z of each reading; empty for a Fourier coefficient."""
-        return tuple(label[1:] if label[1:] in COMPONENTS else "" for label in self.labels)
+        """Component x, y or z of each reading, `TOTAL` of |B|; empty for a Fourier coefficient."""
+        return tuple(TOTAL if label == TOTAL_LABEL else label[1:] if label[1:] in COMPONENTS else ""
+                     for label in self.labels)
+
+    @property
+    def of_total_field(self) -> NDArray[np.bool_]:
+        """Which readings (readings,) are |B|."""
+        return np.array([label == TOTAL_LABEL for label in self.labels])
+
+    @property
+    def directions(self) -> Floats:
+        """Unit vectors (k, 3) of the field along which the readings of |B| are linear."""
+        entries = self.analysis[self.of_total_field].tocoo()
+        rows, columns = entries.coords
+        found = np.zeros((entries.shape[0], len(COMPONENTS)))
+        found[rows, columns % len(COMPONENTS)] = entries.data
+        return found
+
+    @property
+    def map_rows(self) -> Ints:
+        """Number (readings,) of the map's point of each reading, of a circle that of the first."""
+        return np.asarray(self.analysis.indices[self.analysis.indptr[:-1]] // len(COMPONENTS))
 
     @property
     def radii(self) -> Floats:
@@ -133,7 +159,7 @@ class Observation:
         point of a flux density, and the amplitude ``hypot(A_k, B_k)`` of the harmonic of a Fourier
         coefficient.
         """
-        single = np.diff(self.analysis.indptr) == 1  # flux densities depend on one component
+        single = np.array([bool(name) for name in self.components])  # of one point of the map
         sensor = self.operator.indices[self.operator.indptr[:-1]] // len(COMPONENTS)
         result = np.linalg.norm(field, axis=1)[sensor]
         if not single.all():
@@ -165,10 +191,58 @@ def concatenate(first: Observation, second: Observation) -> Observation:
         first.labels + second.labels, np.vstack([first.positions, second.positions]))
 
 
+def observe_total(
+    study: Study, points: Floats, measured: NDArray[np.bool_], directions: Floats | None = None,
+    where: str = "map",
+) -> Observation:
+    """Return the observation of |B| at the points of a map, linear about fields of known direction.
+
+    The length of B along the direction of a near field B_0 is |B| but for
+    ``|B across B_0|^2 / 2 |B|``.
+
+    Parameters
+    ----------
+    study : Study
+    points : ndarray, shape (n, 3), in m
+        Positions as the map states them.
+    measured : ndarray of bool, shape (n,)
+        Whether the map holds |B| at a point.
+    directions : ndarray, shape (n, 3), optional
+        Unit vectors of the field, as a probe of three components would show it. Without them, the
+        three components are observed in place of each |B|.
+    where : str
+        What error messages call the map.
+
+    Raises
+    ------
+    MeasurementError
+        If the study observes Fourier coefficients.
+    """
+    if study.observation.quantity != "flux_density":
+        raise MeasurementError(must_be(
+            "components", where, "Bx and By at every point, for the Fourier coefficients of B_r",
+            "a map of |B| alone", "Observe flux_density instead."))
+    rows = np.flatnonzero(measured)
+    entries = 3 * rows[:, None] + np.arange(3)
+    count = len(rows) if directions is not None else 3 * len(rows)
+    values = np.ones(3 * len(rows)) if directions is None else directions[rows].ravel()
+    analysis = sparse.csr_array(
+        (values, entries.ravel(), np.linspace(0, 3 * len(rows), count + 1).astype(int)),
+        shape=(count, 3 * len(points)))
+    sensors = sensor_model(study.instrument, points)
+    operator = sparse.csr_array(analysis @ sensors.operator)
+    if directions is not None:
+        return Observation(sensors.points, operator, analysis, points,
+                           (TOTAL_LABEL,) * len(rows), points[rows])
+    return Observation(sensors.points, operator, analysis, points,
+                       tuple(f"B{axis}" for axis in COMPONENTS) * len(rows),
+                       np.repeat(points[rows], 3, axis=0))
+
+
 def observe(
     study: Study, points: Floats, measured: NDArray[np.bool_], where: str = "map"
 ) -> Observation:
-    """Return the study's observation at the points of a map.
+    """Return the study's observation of components at the points of a map.
 
     Parameters
     ----------
@@ -382,8 +456,7 @@ def held_out_readings(
                 "readings", where, "flux densities, to hold out lines of the scan by "
                 "`inference.held_out.scan_lines_every`", "Fourier coefficients"))
         apart = held_out_lines(scan_lines(observation.map_points), settings.scan_lines_every)
-        named[f"scan_lines_every = {settings.scan_lines_every}"] = apart[
-            observation.analysis.indices // len(COMPONENTS)]
+        named[f"scan_lines_every = {settings.scan_lines_every}"] = apart[observation.map_rows]
     for name, mask in named.items():
         if not mask.any():
             raise MeasurementError(must_be(

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.field_map import TOTAL_SIGMA_COLUMN, is_total_field
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix
-from halbach_fe.measurement.observation import Observation
+from halbach_fe.measurement.observation import TOTAL, Observation
 from halbach_fe.solver.exact_block_field import gradient_of
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.measurement import NoiseSettings
@@ -34,8 +35,8 @@ def noise_regions(
         The study's noise.
     z : ndarray, shape (readings,), in m
     components : sequence of str
-        Component of each reading, x, y or z; empty for a Fourier coefficient, which a region
-        contains whatever its components.
+        Component of each reading, x, y or z; `TOTAL` for |B|, and empty for a Fourier coefficient,
+        which a region contains whatever its components.
     where : str
         What error messages call the map.
 
@@ -45,10 +46,12 @@ def noise_regions(
         If a reading is in no region.
     """
     region = np.full(len(z), -1)
+    whole = ["", TOTAL]  # neither has one of the components that a region may list
     for number, window in reversed(list(enumerate(noise.regions))):
         low = -np.inf if window.z_min_m is None else window.z_min_m
         high = np.inf if window.z_max_m is None else window.z_max_m
-        region[(z >= low) & (z <= high) & np.isin(components, ["", *window.components])] = number
+        region[(z >= low) & (z <= high)
+               & np.isin(components, [*whole, *window.components])] = number
     if (region < 0).any():
         first = int(np.argmin(region))
         which = f", component {components[first]}," if components[first] else ""
@@ -77,7 +80,10 @@ def reading_noise(
         If neither map nor study states the noise.
     """
     settings = magnet.study.noise
-    if "sigma_T" in data:
+    if is_total_field(data) and TOTAL_SIGMA_COLUMN in data:
+        own = data[TOTAL_SIGMA_COLUMN].values[observation.map_rows]
+        covariance = sparse.diags_array(own**2)
+    elif "sigma_T" in data:
         points = np.nan_to_num(data["sigma_T"].values.ravel()) ** 2
         analysis = observation.analysis
         covariance = analysis @ sparse.diags_array(points) @ analysis.T

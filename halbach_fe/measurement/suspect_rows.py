@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import gammainc
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.measurement.field_map import TOTAL_COLUMN
 from halbach_fe.measurement.scan_lines import point_spacing
 
 CHANCE = 1e-3
@@ -28,6 +30,10 @@ OF_RANGE = 0.2
 """Smallest residual of such a row, relative to the range of its neighbours' field. At the corner of
 a map that ends 6 mm from the edges of magnets a quadratic function is off by 0.1 of it. Smaller
 spikes are left to the fit of a field without sources."""
+
+CONTRADICTION = 1e-4
+"""Smallest difference of |B| from that of the components that is a contradiction, in units of the
+largest |B|: below that of most probes, above what rounding to four digits leaves of it."""
 
 ROUGH_ROUNDS = 10
 """Number of times that spikes are looked for among the rows that are left."""
@@ -51,6 +57,25 @@ def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
         repeated[:] = False
     return {name: (1 + np.flatnonzero(rows)).tolist()
             for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
+
+
+def contradicted_rows(data: xr.Dataset) -> tuple[int, ...]:
+    """Return the rows, counted from 1, whose column of |B| is not that of their components.
+
+    Gains make both differ everywhere: a row is named if it differs otherwise than most rows do. It
+    is then not known which of the two is wrong.
+    """
+    if TOTAL_COLUMN not in data:
+        return ()
+    total = data[TOTAL_COLUMN].values
+    off = np.linalg.norm(data["B_T"].values, axis=1) - total
+    known = np.isfinite(off)
+    if not known.any():
+        return ()
+    off = off - np.median(off[known])
+    limit = max(SPIKE * 1.4826 * float(np.median(np.abs(off[known]))),
+                CONTRADICTION * float(total[known].max()))
+    return tuple((1 + np.flatnonzero(known & (np.abs(off) > limit))).tolist())
 
 
 def _all_alike_by_chance(alike: NDArray[np.bool_]) -> float:
@@ -77,15 +102,7 @@ def rough_rows(
         rows = np.flatnonzero(usable & ~found)
         near = neighbours(points[rows])
         residual = np.full_like(field, np.nan)
-        for part in np.array_split(np.arange(len(rows)), max(1, len(rows) // 1000)):
-            away = points[rows[near[part]]] - points[rows[part], None]
-            away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
-            x, y, z = np.moveaxis(away, 2, 0)
-            terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x],
-                             axis=2)
-            weights = np.linalg.pinv(terms, rcond=1e-6)[:, 0]  # of the value at the row itself
-            residual[rows[part]] = field[rows[part]] - np.einsum(
-                "nk,nkc->nc", weights, field[rows[near[part]]])
+        residual[rows], _ = quadratic_residual(points[rows], field[rows])
         size = np.linalg.norm(residual[rows], axis=1)
         worst = spikes(points, residual, usable & ~found, 1.0)
         around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
@@ -94,6 +111,25 @@ def rough_rows(
             break
         found |= worst
     return found
+
+
+def quadratic_residual(points: Floats, field: Floats) -> tuple[Floats, Floats]:
+    """Return how far rows (n, c) are off a quadratic function through their neighbours.
+
+    The second array (n,) is the standard deviation of that for noise of 1.
+    """
+    near = neighbours(points)
+    residual, sd = np.empty_like(field), np.empty(len(points))
+    for part in np.array_split(np.arange(len(points)), max(1, len(points) // 1000)):
+        away = points[near[part]] - points[part, None]
+        away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
+        x, y, z = np.moveaxis(away, 2, 0)
+        terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x],
+                         axis=2)
+        weights = np.linalg.pinv(terms, rcond=1e-6)[:, 0]  # of the value at the row itself
+        residual[part] = field[part] - np.einsum("nk,nkc->nc", weights, field[near[part]])
+        sd[part] = np.sqrt(1 + np.sum(weights**2, axis=1))
+    return residual, sd
 
 
 def spikes(

@@ -55,7 +55,7 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         "Yes. Model and readings agree: chi² per reading "
         f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
         f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
-        f"{solver}",
+        f"{_of_the_sign(result)}{solver}",
         f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
         f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
         f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
@@ -92,6 +92,13 @@ def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
     return ("Look for what the study lacks. (Before that, halbach-fe check tests the map by "
             "itself, and register finds where it lies.)",
             "halbach-fe diagnose STUDY --measurements MAP -o DIR")
+
+
+def _of_the_sign(result: InferenceResult) -> str:
+    """Say that |B| does not tell the sign of the field, if it is all that was read."""
+    return "" if not result.observation.of_total_field.all() else (
+        " All readings are |B|, which is the same if the field is reversed everywhere: the sign is "
+        "that of the study.")
 
 
 def _largest_field(result: InferenceResult) -> str:

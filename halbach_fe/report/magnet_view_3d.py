@@ -215,15 +215,19 @@ def colours_in_words(result: InferenceResult) -> str:
 def _residual_vectors(result: InferenceResult) -> tuple[Floats, Floats] | None:
     """Return points (n, 3) in m and what the posterior lacks there, B (n, 3) in T.
 
-    Components that were not read are zero. None if the readings are Fourier coefficients.
+    Components that were not read are zero; of |B| it is along the field. None if the readings are
+    Fourier coefficients.
     """
     observation = result.observation
     if not all(observation.components):
         return None
     points, number = np.unique(observation.places.round(9), axis=0, return_inverse=True)
     lacking = np.zeros((len(points), 3))
-    column = [COMPONENTS.index(label[1]) for label in observation.labels]
-    lacking[number.ravel(), column] = result.readings - result.prediction_posterior.mean
+    left = result.readings - result.prediction_posterior.mean
+    total = observation.of_total_field  # |B| lacks what it does along the field
+    lacking[number.ravel()[total]] = left[total, None] * observation.directions
+    column = [COMPONENTS.index(label[1]) for label in np.array(observation.labels)[~total]]
+    lacking[number.ravel()[~total], column] = left[~total]
     return points, lacking
 
 

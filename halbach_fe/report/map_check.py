@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach
 from halbach_fe.measurement.tables import write_csv
+from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -104,6 +105,46 @@ def answer(check: MapCheck) -> Answer:
         f"halbach-fe infer STUDY --measurements {used} -o DIR")
 
 
+def total_answer(check: TotalCheck) -> Answer:
+    """Say what a map of |B| shows by itself, and what it does not."""
+    if np.isfinite(check.repeatability_T):
+        noise = (f"{check.repeats} places that were read again say that the noise of a reading is "
+                 f"{flux_density(check.repeatability_T, 2)}.")
+    elif np.isfinite(check.noise_T):
+        noise = (f"The noise of a reading is at most {flux_density(check.noise_T, 2)}, which "
+                 "quadratic functions through neighbours leave.")
+    else:
+        noise = "Too few readings, or a line of them, do not tell the noise."
+    rows = sum(map(len, check.broken.values()))
+    found = f"{rows} of {check.points} rows are" if rows else f"None of {check.points} rows is"
+    return Answer(
+        "Are the readings of |B| sound?", f"{found} zero, repeated or a spike. {noise}",
+        "Only as far as that goes: Maxwell's equations are those of the components, so that they "
+        "do not test |B| here. Nor does |B| show the sign of the field, axes, gain or offset of "
+        "the probe; a model of the magnet does, but for the sign.",
+        "Register the map, if you do not know where it lies, or update the magnet with it.",
+        "halbach-fe register STUDY --measurements MAP -o DIR")
+
+
+def total_sentences(check: TotalCheck) -> list[str]:
+    """Return which rows of a map of |B| are broken."""
+    words = BROKEN | {"zero": "|B| is zero"}
+    return [f"Broken because {words[kind]}: row{'s' if len(rows) > 1 else ''} {_numbers(rows)}. "
+            "Exclude them by inference.excluded_readings."
+            for kind, rows in check.broken.items()]
+
+
+def write_total_check(data: xr.Dataset, check: TotalCheck, folder: Path) -> None:
+    """Write check.json, and oriented_map.csv without broken rows if there are some."""
+    maps = {"map": data}
+    if check.excluded.any():
+        maps["oriented_map"] = data.isel(point=np.flatnonzero(~check.excluded))
+        write_map(maps["oriented_map"], folder / "oriented_map.csv")
+    write_text(folder / "check.json", json.dumps(check.plain() | {
+        "maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}},
+        indent=1, allow_nan=False) + "\n")
+
+
 def _on_a_stage(check: MapCheck) -> bool:
     """Tell whether the origin is farther from the map than the map is long: no user puts the
     origin of a magnet's coordinates there.
@@ -172,10 +213,13 @@ def sentences(check: MapCheck) -> list[str]:
             ", ".join(_component(name) for name in names) for names in check.alike[:5])
             + (" ..." if len(check.alike) > 5 else "") + ".")
     for kind, rows in check.broken.items():
-        numbers = ", ".join(map(str, rows[:ROWS_NAMED]))
-        more = f" and {len(rows) - ROWS_NAMED} more" if len(rows) > ROWS_NAMED else ""
         found.append(f"Left out because {BROKEN[kind]}: row{'s' if len(rows) > 1 else ''} "
-                     f"{numbers}{more}.")
+                     f"{_numbers(rows)}.")
+    if check.contradicted:
+        found.append(
+            f"The map's column of |B| contradicts its components in {len(check.contradicted)} "
+            f"row{'s' if len(check.contradicted) > 1 else ''}, which one of the two has wrong: "
+            f"{_numbers(check.contradicted)}. Exclude them, unless you know which.")
     terms = sorted((term for term in check.terms if term.found),
                    key=lambda term: -abs(term.value) / term.sd)
     if terms:
@@ -187,6 +231,12 @@ def sentences(check: MapCheck) -> list[str]:
                         else "")
                      + ".")
     return found
+
+
+def _numbers(rows: Sequence[int]) -> str:
+    """Return the numbers of some rows, the first ones of many."""
+    more = f" and {len(rows) - ROWS_NAMED} more" if len(rows) > ROWS_NAMED else ""
+    return f"{', '.join(map(str, rows[:ROWS_NAMED]))}{more}"
 
 
 BROKEN = {"zero": "all components are zero",

@@ -27,6 +27,7 @@ from halbach_fe.inference.registration import (
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.doubted_terms import doubts_in_words, factor_in_words, known_factor
 from halbach_fe.measurement.field_map import (
+    TOTAL_COLUMN,
     UNDIRECTED_COLUMN,
     directed,
     is_undirected,
@@ -367,6 +368,9 @@ def _fit(best: Registration, before: str) -> str:
 def sentences(found: Sequence[Registration]) -> list[str]:
     """Return what else was found."""
     best, said = found[0], []
+    if best.total:
+        said.append("The map is of |B|, which is the same if the field is reversed everywhere: "
+                    "poses that differ by the sign of the field are equal.")
     if best.undetermined:
         said.append(
             f"The map by itself does not determine the {', '.join(best.undetermined)}: what was "
@@ -436,6 +440,12 @@ def probe_table(best: Registration) -> list[dict[str, str]]:
     rows = [{"of the probe": f"B{name[0]} sees B{name[1]}",
              "value": with_error(1e3 * value, 1e3 * sd.crosstalk) + "\u00a0mrad"}
             for name, value in instrument.crosstalk.items() if name[0] in there]
+    if best.total:
+        return [{"of the probe": "gain of |B|",
+                 "value": with_error(100 * instrument.gain[0], 100 * sd.gain) + "\u00a0%"},
+                {"of the probe": "offset of |B|",
+                 "value": with_error(1e3 * instrument.offset_T[0], 1e3 * sd.offset_T)
+                 + "\u00a0mT"}]
     for name, gain, offset, place in zip(COMPONENTS, instrument.gain, instrument.offset_T,
                                          instrument.sensor_position_m, strict=True):
         rows += [] if name not in there else [{"of the probe": f"gain of B{name}",
@@ -550,6 +560,9 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     points = 1e3 * probe_points(best.instrument, points_of(read))
     figure = figure_of(3.6)
     along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    if best.total:
+        along.plot(points[:, 2], 1e3 * read[TOTAL_COLUMN].values, ".", ms=2, color=POSTERIOR,
+                   label="|B| of the map")
     for name, values, colour in zip(COMPONENTS, read["B_T"].values.T,
                                     (SECOND, POSTERIOR, MEASURED), strict=True):
         if not np.isfinite(values).any():

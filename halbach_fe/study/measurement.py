@@ -56,7 +56,9 @@ class Instrument(StudyModel):
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
     + cubic_i B'_i^3 + offset_i + drift_i t``, where j and k are the two other components and t runs
     from 0 to 1 over the map (by its column time_s, or by the order of its rows). The key ``zx`` of
-    ``crosstalk`` is the sensitivity of the z sensor to B'_x.
+    ``crosstalk`` is the sensitivity of the z sensor to B'_x. The reading of a map of |B| is
+    ``(1 + gain) |B| + quadratic |B|^2 + cubic |B|^3 + offset + drift t``: the three entries of
+    these keys are equal, those of ``sensor_position_m`` too, and nothing else changes it.
     """
 
     length_unit_m: Unit = 1.0

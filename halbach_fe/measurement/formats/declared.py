@@ -25,7 +25,8 @@ class DeclaredFormat:
     columns : tuple of str
         Name of each column; ``-`` for a column to ignore.
     component : str
-        Component x, y or z of a column that is named just B; ``unknown`` if nobody knows it.
+        Component x, y or z of a column that is named just B; ``abs`` if it is |B|, ``unknown`` if
+        nobody knows it.
     at : mapping of str to float, in m
         Constant coordinates, for which the file has no column.
     origin_m : tuple of float or None

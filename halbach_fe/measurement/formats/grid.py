@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import points_of, refuse_total_field
 from halbach_fe.study.types import COMPONENTS
 
 TOLERANCE = 1e-3
@@ -57,6 +57,7 @@ def grid_of(data: xr.Dataset, where: str) -> Grid:
         If an axis has a single coordinate or unequal steps, if points are missing or repeated, or
         if a component was not measured at a point.
     """
+    refuse_total_field(data, "export on a grid")
     points, values = points_of(data), data["B_T"].values
     if np.isnan(values).any():
         row, component = np.argwhere(np.isnan(values))[0]

@@ -9,10 +9,12 @@ from halbach_fe.measurement.formats.units import CLOCK, TIMES, states_no_unit, u
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
-KNOWN = (*POSITIONS, *FIELDS, "B")
+TOTAL = "Babs"
+"""The magnitude |B|, as a quantity of its own."""
+KNOWN = (*POSITIONS, *FIELDS, "B", TOTAL)
 """Quantities of columns; B is a single component, or the magnitude beside its components."""
 MOVES = ("dx", "dy", "dz")
-NOISE = ("sigma", *(f"sigma_{name}" for name in FIELDS))
+NOISE = ("sigma", *(f"sigma_{name}" for name in (*FIELDS, TOTAL)))
 """Standard deviations: of all components of a reading, or of one."""
 OTHERS = ("t", "scan", *NOISE)
 """What a reading has beside its position and field: time, name of the scan, noise."""
@@ -23,6 +25,8 @@ that are recognized, but for which the user may state another."""
 ALIASES = {name.lower(): name for name in KNOWN} | {
     "xpos": "x", "ypos": "y", "zpos": "z", "posx": "x", "posy": "y", "posz": "z",
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
+    "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
+    "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
     "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"}
 
 TIME_NAMES = frozenset(("t", "time", "times", "timestamp", "timeofday", "clock", "datetime",

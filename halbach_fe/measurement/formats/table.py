@@ -15,7 +15,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement import clock_times as times
-from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected
+from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected, with_total_field
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
@@ -129,12 +129,16 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     points, flux_density = _cartesian(si, table.where)
     if declared.origin_m is not None:
         points = points + declared.origin_m
-    read = ~np.isnan(flux_density).all(axis=1)
-    data = _checked(points[read], flux_density[read], table.where)
+    total = si.get(names.TOTAL, np.full(count, np.nan))
+    read = ~(np.isnan(flux_density).all(axis=1) & np.isnan(total))
+    data = _checked(points[read], flux_density[read], total[read], table.where)
     noise = _noise(si, used, table, columns)
-    if noise is not None:
+    if noise is not None and not np.isnan(flux_density).all():
         _check_noise(noise, flux_density, used, columns, table.where)
         data["sigma_T"] = (("point", "component"), noise[read], {"units": "T"})
+    if names.TOTAL in si:
+        sigma = si.get(f"sigma_{names.TOTAL}", si.get("sigma"))
+        data = with_total_field(data, total[read], None if sigma is None else sigma[read])
     if "t" in used:
         seconds = _seconds(used["t"], unit_of["t"], table, columns)
         data["time_s"] = ("point", seconds[read], {"units": "s"})
@@ -355,13 +359,19 @@ def _used(
         used[column.quantity] = index
     components = [name for name in names.FIELDS if name in used]
     if declared.component and used:
-        name = f"B{'z' if declared.component == UNKNOWN else declared.component}"
+        name = f"B{'z' if declared.component == UNKNOWN else declared.component}"  # Bx, Babs
         if "B" not in used or components:
             raise _contradiction(table, "header", ", ".join(components) or "no column B",
                                  f"--component {declared.component}")
         used[name] = used.pop("B")
-    elif components:
-        used.pop("B", None)  # beside its components, B is the magnitude
+    elif components and "B" in used:  # beside its components, B is the magnitude
+        magnitude = used.pop("B")
+        if len(components) == 3:
+            used.setdefault(names.TOTAL, magnitude)
+    if components and names.TOTAL in used and not (
+            units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit
+            or table.field_unit):
+        del used[names.TOTAL]  # it is not needed
     for name in declared.at:
         if name in used:
             raise _contradiction(table, "header", f"a column {name}",
@@ -388,10 +398,11 @@ def _missing(
     if absent:
         missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
     if "B" in used:
-        missing.append("which component B is (--component x, y or z; or unknown, if nobody knows: "
-                       "halbach-fe register then tries all three)")
-    elif not set(names.FIELDS) & set(used):
-        missing.append("which columns are Bx, By or Bz (--columns)")
+        missing.append("which component B is (--component x, y or z), whether it is |B| "
+                       "(--component abs), or that nobody knows (--component unknown: halbach-fe "
+                       "register then tries all three)")
+    elif not {*names.FIELDS, names.TOTAL} & set(used):
+        missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns)")
     half = {"Br", "Bphi"} - set(used)
     if len(half) == 1:
         missing.append(f"{half.pop()}, without which the other is no Bx or By (--columns)")
@@ -493,11 +504,18 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
                                     si["Br"] * sin + si["Bphi"] * cos, si.get("Bz", empty)])
 
 
-def _checked(points: Floats, flux_density: Floats, where: str) -> xr.Dataset:
-    """Return the map; raise MeasurementError if its values are too large for a permanent magnet."""
+def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) -> xr.Dataset:
+    """Return the map without |B| ``total`` (n,) in T.
+
+    Raises
+    ------
+    MeasurementError
+        If values are too large for a permanent magnet.
+    """
     if not len(points):
         raise MeasurementError(must_be("content", where, "at least one reading", "none"))
-    largest, farthest = float(np.nanmax(np.abs(flux_density))), float(np.abs(points).max())
+    largest = float(np.nanmax(np.abs(np.column_stack([flux_density, total]))))
+    farthest = float(np.abs(points).max())
     if not largest <= MAX_FIELD_T:
         raise MeasurementError(must_be("flux densities", where, f"below {MAX_FIELD_T:g} T",
                                        f"{largest:g} T", "Is the unit right?"))
