@@ -162,16 +162,8 @@ def _read(
     observation = observe(study, points_of(data), measured, where)
     if magnet.dimension == 2:
         _check_plane(observation.points[:, 2], where)
-    inside = magnet.contains(observation.points)
-    if inside.any():
-        first = int(np.argmax(inside))
-        x, y, z = observation.points[first]
-        sensors = len(inside) // data.sizes["point"]
-        raise MeasurementError(must_be(
-            f"reading {first // sensors + 1}", where, "at a point in air",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron "
-            f"({inside.reshape(-1, sensors).any(axis=1).sum()} such readings)",
-            "Check the study's radii and the map's axes and units."))
+    observation = replace(observation, points=_places_in_air(
+        magnet, observation.points, data.sizes["point"], where))
     if one.is_validation:
         parts = (HELD_OUT_MAP,) * len(observation)
     else:
@@ -191,6 +183,36 @@ def _read(
             replace(magnet, blocks=tuple(blocks)), observation, data, called)
     return Readings(observation, values, noises[one.name], parts, regions,
                     (one.name,) * len(observation))
+
+
+def _places_in_air(magnet: Magnet, points: Floats, rows: int, where: str) -> Floats:
+    """Return sensors' points (n, 3) in m, those on a face of magnet or iron just outside.
+
+    Raises
+    ------
+    MeasurementError
+        If a point is not in air. ``rows`` is the number of the map's rows.
+
+    Warns
+    -----
+    HalbachWarning
+        If a point is on a face.
+    """
+    places = magnet.surroundings(points)
+    refused = places.refusal()
+    if refused is not None:
+        first, _, what, hint = refused
+        x, y, z = points[first]
+        sensors = len(points) // rows
+        count = places.no_air.reshape(-1, sensors).any(axis=1).sum()
+        raise MeasurementError(must_be(
+            f"reading {first // sensors + 1}", where, "at a point in air",
+            f"({x:g}, {y:g}, {z:g}) m, {what} ({count} such readings)",
+            hint or "Check the study's radii and the map's axes and units."))
+    remark = places.on_faces()
+    if remark is not None:
+        warnings.warn(remark, HalbachWarning, stacklevel=4)
+    return places.points
 
 
 def _stacked(first: Readings, second: Readings) -> Readings:

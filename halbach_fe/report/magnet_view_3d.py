@@ -273,7 +273,9 @@ def magnet_view(
     if found and magnet.dimension == 3:  # from their side, as the map would hide them
         x, _, z = np.mean([block.middle for block in found], axis=0).tolist()
         camera |= {"x": math.copysign(camera["x"], x), "z": math.copysign(camera["z"], z)}
-    figure.add_trace(cut_trace(magnet))
+    cut = cut_trace(magnet)
+    if cut is not None:
+        figure.add_trace(cut)
     _to_mm(figure)
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend=LEGEND,
