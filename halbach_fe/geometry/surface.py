@@ -78,8 +78,8 @@ class Body(Protocol):
 class _Section:
     """Where points (n,) lie relative to a cross-section.
 
-    ``distance`` (n,) in m from the boundary is negative inside, ``normal`` (n, 2) is the outward one
-    there, ``corner`` (n,) the distance in m from the nearest corner, and ``curved`` (n,) tells
+    ``distance`` (n,) in m from the boundary is negative inside, ``normal`` (n, 2) is the outward
+    one there, ``corner`` (n,) the distance in m from the nearest corner, and ``curved`` (n,) tells
     whether the nearest part of the boundary is an arc.
     """
 
@@ -264,9 +264,9 @@ class Surroundings:
         if not chosen.any():
             return None
         first = int(np.argmax(chosen))
-        return (f"{chosen.sum()} of {len(chosen)} points lie on a face of magnet or iron, the first "
-                f"on {self.names[first][0]}: their field is that just outside, where a probe can "
-                "be; just inside, its part along the face differs.")
+        return (f"{chosen.sum()} of {len(chosen)} points lie on a face of magnet or iron, the "
+                f"first on {self.names[first][0]}: their field is that just outside, where a probe "
+                "can be; just inside, its part along the face differs.")
 
 
 def surroundings(bodies: Sequence[Body], points: Floats) -> Surroundings:

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from halbach_fe.geometry.blocks import bore_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import iron_of
 
@@ -17,7 +16,7 @@ def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
     outer = f"{1e3 * magnet.array_outer_radius:.6g} mm"
     rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
             ("radius of the bore, outer radius",
-             f"{1e3 * bore_radius(magnet.blocks):.6g} mm, {outer}") if magnet.has_bore else (
+             f"{1e3 * magnet.free_radius:.6g} mm, {outer}") if magnet.has_bore else (
                 "outer radius", f"{outer}, without a bore"),
             ("remanence", f"{_range((abs(block.remanence) for block in blocks), 4)} T"),
             ("recoil permeability along, across the easy axis",
@@ -34,7 +33,7 @@ def in_one_line(magnet: Magnet) -> str:
     length = (f", {2e3 * magnet.array_half_length:.4g} mm long" if magnet.dimension == 3
               else ", in cross-section")
     iron = "without iron" if iron_of(magnet.study) is None else f"iron: {iron_description(magnet)}"
-    bore = f"bore {2e3 * bore_radius(magnet.blocks):.4g} mm" if magnet.has_bore else "no bore"
+    bore = f"bore {2e3 * magnet.free_radius:.4g} mm" if magnet.has_bore else "no bore"
     return (f"{layout(magnet)}{length}, {bore}, "
             f"outer diameter {2e3 * magnet.array_outer_radius:.4g} mm, remanence "
             f"{_range((abs(block.remanence) for block in magnet.blocks), 3)} T, {iron}")

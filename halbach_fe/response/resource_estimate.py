@@ -259,7 +259,8 @@ class Estimate:
             hints.append(f"use --jobs 1 ({alone:.2g} GiB)")
         largest = max(self.problems, key=lambda problem: problem.memory_GiB, default=None)
         if largest is None or largest.memory_GiB < self.own_memory_GiB:
-            hints.append("take fewer readings")
+            hints.append("take fewer mesh.cells_per_side" if self.route == "moments"
+                         else "take fewer readings")
         else:
             hints.append(COARSER[MESHES[largest.route]])
             if largest.route == "edge_elements" and self.route == largest.route:

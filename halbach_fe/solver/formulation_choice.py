@@ -78,6 +78,9 @@ MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
 """Kind of mesh by route, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`."""
 
+FINENESS = {"moments": "cells_per_side", "azimuthal_modes": "meridian_size_m"}
+"""Key of ``mesh`` by which a route becomes more exact; on all others it is ``block_size_m``."""
+
 BOUNDARY_NEAR = 0.5
 """Fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
 because the condition on the boundary affects their field."""
@@ -415,7 +418,8 @@ def check_points(
     Warns
     -----
     HalbachWarning
-        If points are on a face, or so near to the outer boundary that its condition affects their field.
+        If points are on a face, or so near to the outer boundary that its condition affects their
+        field.
     """
     if magnet.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
