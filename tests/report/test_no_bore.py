@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report import field_traces_3d, magnet_view_3d, page
 from halbach_fe.report import solution as solution_page
 from halbach_fe.report.field_traces_3d import cut_trace
 from halbach_fe.report.magnet_table import in_one_line, magnet_rows
@@ -49,10 +51,12 @@ def test_pages(places, bore, dimension, session, tmp_path):
         magnet = magnet_of([(0.0, 0.0, 0.0)], dimension)
         found = solve(magnet, session)
         answer = solution_page.write_solution_report(found, tmp_path, {})
-        assert "halbach-fe plan" in answer.command and (tmp_path / "report.html").exists()
+        assert "halbach-fe plan" in answer.command
+        assert (tmp_path / "report.html").exists()
     cut = cut_trace(magnet)
     shown = np.isfinite(np.array(cut.surfacecolor, float))
-    assert shown.any() and np.all(np.array(cut.surfacecolor)[shown] > 0)
+    assert shown.any()
+    assert np.all(np.array(cut.surfacecolor)[shown] > 0)
 
 
 def test_bar_in_two_dimensions(session):
@@ -73,8 +77,35 @@ def test_permeable_bar_over_the_origin(session):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_multipoles_say_that_there_is_no_axis(dimension, session):
-    with pytest.raises(StudyError, match="the reference circle of multipoles of study no-bore must "
-                                         "be in air.*which has no bore there"):
+    with pytest.raises(StudyError, match=r"the reference circle of multipoles of study no-bore must "
+                                         r"be in air.*which has no bore there"):
         multipole_model(magnet_of(ONE, dimension), MultipoleReference(), session)
     # the control: two poles have an axis
     multipole_model(magnet_of(POLES, dimension), MultipoleReference(), session)
+
+
+def test_very_many_blocks(monkeypatch):
+    """Above their limits pictures draw less, and say of how many."""
+    for module, name in ((magnet_view_3d, "MOST_UNEQUAL"), (page, "MOST_POINTING"),
+                         (page, "MOST_MEASURED"), (field_traces_3d, "MOST_SUMMED")):
+        monkeypatch.setattr(module, name, 20)
+    places = [(0.025 * i, 0.025 * j, 0.03 * k)
+              for i in range(-2, 3) for j in range(-2, 3) for k in range(2)]
+    magnet = magnet_of(places)
+    values = magnet_view_3d.BlockValues(np.zeros((50, 3)), magnet_view_3d.Colours(
+        np.where(np.arange(50) == 31, -5.0, 1.0), "change", [f"w{i}" for i in range(50)]))
+    blocks, kept = magnet_view_3d._merge_rings(magnet, values)
+    assert len(blocks) == 17
+    assert kept.colours.values.min() == -5.0  # the block that matters most is drawn
+    assert kept.colours.words[[block.name for block in blocks].index("b31")] == "w31"
+    assert cut_trace(magnet) is None
+    figure, axis = plt.subplots()
+    page.draw_cross_section(axis, magnet)
+    assert len(axis.lines) == 1
+    assert not axis.texts
+    plt.close(figure)
+    view = str(magnet_view_3d.magnet_view(magnet, values))
+    assert "17 of 50 blocks" in view
+    # the control: below the limits all are drawn
+    monkeypatch.setattr(magnet_view_3d, "MOST_UNEQUAL", 50)
+    assert len(magnet_view_3d._merge_rings(magnet, values)[0]) == 50
