@@ -26,7 +26,7 @@ from tests.geometry.test_free_blocks import LENGTH, SHAPES, magnet_of, row, sour
 
 BESIDE_M = 1e-6
 """Distances in m outside a face, of which magpylib's field is extrapolated linearly to the face,
-are this and twice this. Its cylinder segments are 1e-3 T wrong at some nanometres from an end face."""
+are this and twice this. Its segments of rings are 1e-3 T wrong at some nanometres from a face."""
 
 FACE_ERROR = 3e-6
 """In T, for points at least 2 mm from an edge: the extrapolation errs by about 1.3 T times the

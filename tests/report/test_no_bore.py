@@ -61,7 +61,8 @@ def test_pages(places, bore, dimension, session, tmp_path):
 
 def test_bar_in_two_dimensions(session):
     """Bx of an infinite bar 2a x 2b magnetized along x: both pole faces are charged sheets, each of
-    the angle it is seen at, over 2 pi."""
+    the angle it is seen at, over 2 pi.
+    """
     found = solve(magnet_of(ONE, 2), session)
     angles = [2 * np.arctan(0.01 / (0.05 + sign * 0.01)) for sign in (-1, 1)]
     assert found.flux_density[0, 0] == pytest.approx(
@@ -85,7 +86,7 @@ def test_multipoles_say_that_there_is_no_axis(dimension, session):
 
 
 def test_very_many_blocks(monkeypatch):
-    """Above their limits pictures draw less, and say of how many."""
+    """Above their limits pictures draw less and say so."""
     for module, name in ((magnet_view_3d, "MOST_UNEQUAL"), (page, "MOST_POINTING"),
                          (page, "MOST_MEASURED"), (field_traces_3d, "MOST_SUMMED")):
         monkeypatch.setattr(module, name, 20)

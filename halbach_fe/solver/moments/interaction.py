@@ -141,6 +141,14 @@ class Interaction:
         return (Neighbours.of(far[:, 0], far[:, 1], len(targets)),
                 Neighbours.of(*items, len(targets.order)))
 
+    @property
+    def near_pairs(self) -> int:
+        """Number of pairs of cells that are near to each other, which most of the memory is for."""
+        own = self.clusters
+        _, close = tree.pairs(own.children, own.centres, own.radii, own.children, own.centres,
+                              own.radii, self.opening)
+        return len(close)
+
     @cached_property
     def _kinds(self) -> tuple[Ints, Ints, Ints]:
         """Congruent near pairs, which have equal matrices along the axes of their targets.
