@@ -141,9 +141,9 @@ CELL_SECONDS, COLUMN_SECONDS = 1.2e-3, 1.6e-5
 """Time in s of the method of moments per cell, and per entry of H. Measured with 990 cubes and 396
 readings, and with 4 032 cubes and 432 readings."""
 
-MOMENTS_BYTES, CELL_BYTES, COLUMN_CELL_BYTES, NEAR_BYTES = 60e6, 8_000, 43_000, 300
-"""Memory in bytes of the method of moments: its compiled functions, per cell, per cell if H is
-computed too, and per pair of near cells. Slender and flat cells have many times the pairs of cubes.
+CELL_BYTES, COLUMN_CELL_BYTES, NEAR_BYTES = 8_000, 43_000, 300
+"""Memory in bytes of the method of moments per cell, per cell if H is computed too, and per pair of
+near cells. Slender and flat cells have many times the pairs of cubes.
 Without H the sum is within 20 % of that of lattices of 108 to 500 hexagonal prisms of 20 and 60 mm,
 aligned and turned at random, and of 512 and 1 728 cubes; with H it is that of the cubes above."""
 
@@ -449,7 +449,7 @@ def _cost_of_moments(
     cells = [len(each.cells) for each in found]
     iron = [magnet for magnet in there if magnet.iron]
     per_cell = COLUMN_CELL_BYTES if entries else CELL_BYTES
-    memory = MODES_BYTES * bool(iron) + MOMENTS_BYTES * bool(there) + max(
+    memory = MODES_BYTES * bool(iron) + max(
         (per_cell * len(each.cells) + NEAR_BYTES * each.near_pairs for each in found), default=0)
     return memory, (CELL_SECONDS * sum(cells) + COLUMN_SECONDS * entries * bool(there)
                     + MODES_SECONDS * len(iron))

@@ -198,7 +198,8 @@ def test_separate_blocks_are_estimated_by_their_cells(short_dipole):
     assert solve.route == "moments"
     own = solve.own_memory_GiB - vacuum.own_memory_GiB
     fine = of(resource_estimate.estimate_solve, cells=4).own_memory_GiB - vacuum.own_memory_GiB
-    assert 6 < fine / own < 9  # of cuboids whose sides are no multiples of each other
+    # of cuboids whose sides are no multiples of each other; inner cells have more near ones
+    assert 6 < fine / own < 12
     infer = of(resource_estimate.estimate_infer)
     assert infer.own_memory_GiB > solve.own_memory_GiB
     iron = of(resource_estimate.estimate_solve, iron_ring=STEEL)
@@ -206,11 +207,11 @@ def test_separate_blocks_are_estimated_by_their_cells(short_dipole):
 
 
 def test_memory_of_moments_follows_the_near_pairs():
-    """Measured peaks above that of the libraries, in GiB: System.of, solve and field_with_errors of
+    """Measured peaks of the whole process in GiB: System.of, solve and field_with_errors of
     lattices of hexagonal prisms with a permeability of 1.05. A factor of 1.5 is promised.
     """
-    for length, per_side, layers, measured in ((0.02, 6, 3, 0.0843), (0.06, 6, 3, 0.1524),
-                                               (0.02, 10, 5, 0.2342)):
+    for length, per_side, layers, measured in ((0.02, 6, 3, 0.291), (0.06, 6, 3, 0.359),
+                                               (0.02, 10, 5, 0.445)):
         places = [(0.0221 * i, 0.0221 * j, (length + 0.002) * k) for i in range(per_side)
                   for j in range(per_side) for k in range(layers)]
         count = len(places)
@@ -224,4 +225,5 @@ def test_memory_of_moments_follows_the_near_pairs():
             "observation": {"quantity": "flux_density", "positions": {
                 "kind": "points", "points_m": [[1.0, 1.0, 1.0]]}}}))
         found, _ = resource_estimate._cost_of_moments([magnet], np.ones((1, 3)), 0)
-        assert measured / 1.5 < found / 2**30 < 1.5 * measured
+        peak = (resource_estimate.PYTHON_BYTES + found) / 2**30
+        assert measured / 1.5 < peak < 1.5 * measured
