@@ -60,7 +60,8 @@ class Contact:
     @classmethod
     def nowhere(cls, count: int) -> Contact:
         """Return that of points outside."""
-        return cls(*(np.zeros(count, bool) for _ in range(3)), np.zeros((count, 3)))
+        return cls(np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool),
+                   np.zeros((count, 3)))
 
 
 class Body(Protocol):
