@@ -11,6 +11,10 @@ import argparse
 import time
 
 from halbach_fe.cli import common
+from halbach_fe.cli.streams import say
+
+MANY = 10_000
+"""Number of blocks above which the command says how far it is: it takes minutes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,11 +39,17 @@ def run(arguments: argparse.Namespace) -> int:
         return common.print_estimate(
             estimate_solve(magnet, study_observation(magnet), common.jobs(arguments)),
             arguments.json)
+    many = len(magnet.blocks) > MANY
+    if many:
+        say(f"{len(magnet.blocks)} blocks: first their field at the positions and far outside.")
     with common.session(arguments, magnet.study) as session:
         solution = solve(magnet, session)
     write_solution(solution, arguments.output)
     summary = solution.summary() | {
         "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output)}
+    if many:
+        say(f"Solved in {summary['seconds']} s, and written; now the page, which draws a part of "
+            "the blocks.")
     from halbach_fe.report.solution import field_table, write_solution_report
     from halbach_fe.report.stray_field import stray_rows
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import Outline, outline_area, outline_contains, outline_part
+from halbach_fe.geometry.outline import Outline, outline_area, outline_part
+from halbach_fe.geometry.surface import Contact, contact_of_prism
 from halbach_fe.study.materials import MU_0
 
 CORNER = 1 / 6
@@ -193,12 +194,24 @@ class MagnetBlock:
         return np.array(self.easy_axis) * self.remanence / (MU_0 * self.recoil_permeability)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3) in m lie inside the block or on its end faces."""
-        if not self.in_magnet_frame:
-            points = self.to_frame(points)
-        inside = (points[:, 2] >= self.z_min) & (points[:, 2] <= self.z_max)
-        inside[inside] = outline_contains(self.outline, points[inside, :2])
-        return inside
+        """Tell which points (n, 3) in m lie inside the block, and not on its surface."""
+        return self.contact(points).inside
+
+    def contact(self, points: Floats) -> Contact:
+        """Return where points (n, 3) in m of the magnet lie relative to the block's surface."""
+        if self.in_magnet_frame:
+            return self.contact_in_frame(points)
+        found = self.contact_in_frame(self.to_frame(points))
+        return replace(found, outward=found.outward @ self.axes.T)
+
+    def contact_in_frame(self, points: Floats) -> Contact:
+        """Return `contact` of points (n, 3) in m of the block's frame."""
+        found = contact_of_prism(self.outline, self.z_min, self.z_max, points)
+        for _, part in self.parts[1:]:  # whose edges are on the block's faces
+            own = contact_of_prism(part.outline, part.z_min, part.z_max, points).on_edge
+            found = replace(found, on_edge=found.on_edge | (own & found.on_face),
+                            on_face=found.on_face & ~own)
+        return found
 
 
 def moved_block(block: MagnetBlock, turn_rad: float, z_m: float, factor: float) -> MagnetBlock:
@@ -229,7 +242,8 @@ def vector(values: Floats) -> tuple[float, float, float]:
 
 def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
     """Return the radius in m of the largest cylinder about the z axis that nominal blocks leave
-    free, by points on their outlines; 1e-4 m if a block covers the axis.
+    free, by points on their outlines, at least 1e-4 m. If a block covers the axis, it is how far
+    the block's outline is from it.
     """
     t = np.linspace(0.0, 1.0, 17)
     smallest = np.inf

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.free_blocks import counter_clockwise
-from halbach_fe.geometry.outline import Outline, closed_outline, outline_contains, plane_rotation
+from halbach_fe.geometry.outline import Outline, closed_outline, plane_rotation
+from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
 from halbach_fe.study.iron import Iron, IronRing
 
 
@@ -36,18 +37,25 @@ class IronSolid:
     outline: Outline | None = None
 
     @property
+    def name(self) -> str:
+        """What sentences call it."""
+        return "the iron"
+
+    @property
     def radius(self) -> float:
         """Radius in m of the cylinder about the z axis around the body."""
         return self.outer_radius
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3) in m lie inside the body."""
-        inside = (points[:, 2] >= self.z_min) & (points[:, 2] <= self.z_max)
+        """Tell which points (n, 3) in m lie inside the body, and not on its surface."""
+        return self.contact(points).inside
+
+    def contact(self, points: Floats) -> Contact:
+        """Return where points (n, 3) in m lie relative to the body's surface."""
         if self.outline is not None:
-            inside[inside] = outline_contains(self.outline, points[inside, :2])
-            return inside
-        radius = np.hypot(points[:, 0], points[:, 1])
-        return inside & (radius >= self.inner_radius) & (radius <= self.outer_radius)
+            return contact_of_prism(self.outline, self.z_min, self.z_max, points)
+        return contact_of_tube(self.inner_radius, self.outer_radius, self.z_min, self.z_max,
+                               points)
 
 
 def iron_solids(

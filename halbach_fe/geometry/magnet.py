@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
@@ -21,6 +22,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import points_on
 from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
+from halbach_fe.geometry.surface import Surroundings, surroundings
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
 from halbach_fe.study.magnet import External, Neighbour
@@ -38,6 +40,10 @@ field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1 o
 beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles. Higher orders fall
 faster: for two rings of 80 mm with errors of 2 %, 0.01 units are missing. The distance is half of
 that to the boundary of 3D meshes."""
+
+BESIDE_RAD = 1e-6
+"""Angle in rad beyond half a turn without blocks about the axis, from which blocks are on one side.
+Two opposite poles leave half a turn, but for the rounding of their tables to micrometres."""
 
 SQUEEZED = 0.1
 """The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
@@ -234,9 +240,25 @@ class Magnet(ShownInNotebook):
     def bore_radius(self) -> float:
         """Radius in m of the largest cylinder about the z axis that the blocks leave free.
 
-        For equal rings it is their inner radius, which corners of turned cuboids may pass.
+        For equal rings it is their inner radius, which corners of turned cuboids may pass. Of a
+        magnet without a bore it is a length scale only, see `has_bore`.
         """
-        return self.array.inner_radius_m if self.array.is_uniform else bore_radius(self.blocks)
+        return self.array.inner_radius_m if self.array.is_uniform else self.free_radius
+
+    @cached_property
+    def free_radius(self) -> float:
+        """The same by the corners of turned cuboids too."""
+        return bore_radius(self.blocks)
+
+    @cached_property
+    def has_bore(self) -> bool:
+        """Whether the z axis is free, with blocks around it and not on one side only."""
+        angles = np.sort([np.arctan2(*block.middle[1::-1]) for block in self.blocks])
+        widest = np.diff(angles, append=angles[0] + 2 * np.pi).max()
+        reach = 0.0 if self.dimension == 2 else self.half_length
+        z = np.linspace(-reach, reach, 33)
+        axis = np.column_stack([0 * z, 0 * z, z])
+        return bool(widest < np.pi + BESIDE_RAD and not self.contains(axis).any())
 
     @property
     def iron_half_length(self) -> float:
@@ -256,13 +278,33 @@ class Magnet(ShownInNotebook):
         return max(self.array_half_length, self.iron_half_length)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Tell which points (n, 3) in m lie inside a block, a neighbour's block or the iron."""
-        inside = np.zeros(len(points), bool)
-        for block in self.blocks + neighbour_blocks(self.blocks, self.external.neighbours):
-            inside |= block.contains(points)
-        for body in self.iron:
-            inside |= body.contains(points)
-        return inside
+        """Tell which points (n, 3) in m are not in air.
+
+        These are inside a block, a neighbour's block or the iron, on an edge, or between two bodies
+        that touch. A point on a face is in air.
+        """
+        return self.surroundings(points).no_air
+
+    def surroundings(self, points: Floats) -> Surroundings:
+        """Return where points (n, 3) in m lie relative to blocks, neighbours and iron."""
+        if not len(points):
+            return surroundings((), points)
+        size = min(self.dimension, 3)  # blocks of a cross-section have no middle along z
+        middles = np.array([block.middle + block.displacement_m for block in self.blocks])
+        distance, _ = KDTree(points[:, :size]).query(middles[:, :size])
+        near = [self.blocks[number] for number in np.flatnonzero(distance <= self._reaches)]
+        others = neighbour_blocks(self.blocks, self.external.neighbours)
+        return surroundings((*near, *others, *self.iron), points)
+
+    @cached_property
+    def _reaches(self) -> Floats:
+        """Distance (blocks,) in m from the middle of every block within which it lies.
+
+        The `_corners` of arcs of up to half a turn are at most 0.5 % nearer than the arcs.
+        """
+        return np.array([
+            1.02 * np.linalg.norm((points - block.middle)[:, :self.dimension], axis=1).max()
+            for block, points in zip(self.blocks, self._corners, strict=True)])
 
     def with_(self, **changes: Any) -> Magnet:
         """Return the magnet of the same study with other values of some keys, see `Study.with_`."""

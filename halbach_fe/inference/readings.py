@@ -250,16 +250,8 @@ def _read(
     if magnet.dimension == 2:
         _check_plane(observation.points[:, 2], where)
         _doubt_field_along_z(data["B_T"].values, where)
-    inside = magnet.contains(observation.points)
-    if inside.any():
-        first = int(np.argmax(inside))
-        x, y, z = observation.points[first]
-        sensors = len(inside) // data.sizes["point"]
-        raise MeasurementError(must_be(
-            f"reading {first // sensors + 1}", where, "at a point in air",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron "
-            f"({inside.reshape(-1, sensors).any(axis=1).sum()} such readings)",
-            "Check the study's radii and the map's axes and units."))
+    places = _places_in_air(magnet, observation.points, data.sizes["point"], where)
+    observation, vectors = (replace(each, points=places) for each in (observation, vectors))
     if one.is_validation:
         parts = (HELD_OUT_MAP,) * len(observation)
     else:
@@ -324,6 +316,36 @@ def unit_vectors(vectors: Floats) -> Floats:
     """Return the directions (n, 3) of vectors (n, 3); that of a zero is along x."""
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(size > 0, vectors / np.where(size > 0, size, 1.0), [1.0, 0.0, 0.0])
+
+
+def _places_in_air(magnet: Magnet, points: Floats, rows: int, where: str) -> Floats:
+    """Return sensors' points (n, 3) in m, those on a face of magnet or iron just outside.
+
+    Raises
+    ------
+    MeasurementError
+        If a point is not in air. ``rows`` is the number of the map's rows.
+
+    Warns
+    -----
+    HalbachWarning
+        If a point is on a face.
+    """
+    places = magnet.surroundings(points)
+    refused = places.refusal()
+    if refused is not None:
+        first, _, what, hint = refused
+        x, y, z = points[first]
+        sensors = len(points) // rows
+        count = places.no_air.reshape(-1, sensors).any(axis=1).sum()
+        raise MeasurementError(must_be(
+            f"reading {first // sensors + 1}", where, "at a point in air",
+            f"({x:g}, {y:g}, {z:g}) m, {what} ({count} such readings)",
+            hint or "Check the study's radii and the map's axes and units."))
+    remark = places.on_faces()
+    if remark is not None:
+        warnings.warn(remark, HalbachWarning, stacklevel=4)
+    return places.points
 
 
 def _stacked(first: Readings, second: Readings) -> Readings:

@@ -17,11 +17,17 @@ UNSIGNED = "Cividis"
 CUT = (19, 27)
 """Numbers of points of the plane in which |B| is shown."""
 
+AROUND = 1.5
+"""How far that plane reaches around a magnet without a bore, relative to its outer radius."""
+
 LONGEST = 0.3
 """Length of the longest arrow of a residual relative to the radius of the bore."""
 
 NEAR_BLOCKS = 0.9
 """Part of the plane that the colours span: beside the blocks |B| is many times larger."""
+
+MOST_SUMMED = 20_000
+"""Largest number of blocks whose field is drawn in the plane: it takes 0.2 ms per block."""
 
 MOST_ARROWS = 5000
 """Largest number of arrows that are drawn: those of the largest residuals."""
@@ -40,11 +46,16 @@ def residuals_trace(positions: Floats, residual: Floats, bore_radius: float) -> 
         name=f"residuals, up to {flux_density(longest, 2)}", hoverinfo="skip")
 
 
-def cut_trace(magnet: Magnet) -> go.Surface:
+def cut_trace(magnet: Magnet) -> go.Surface | None:
     """Return the plane y = 0 of the bore, in 2D the bore itself, coloured by |B| of the nominal
     blocks in vacuum, as contours.
+
+    Without a bore it is the plane through and around the magnet. It is None if nothing of the plane
+    is in air, or of more than `MOST_SUMMED` blocks.
     """
-    reach = 0.9 * magnet.bore_radius
+    if len(magnet.blocks) > MOST_SUMMED:
+        return None
+    reach = 0.9 * magnet.bore_radius if magnet.has_bore else AROUND * magnet.radius
     first = np.linspace(-reach, reach, CUT[0])
     far = reach if magnet.dimension == 2 else magnet.half_length + reach
     a, b = np.meshgrid(first, np.linspace(-far, far, CUT[1]))
@@ -52,8 +63,10 @@ def cut_trace(magnet: Magnet) -> go.Surface:
     points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
     size = 1e3 * np.linalg.norm(field_of(magnet.blocks, points), axis=1)
     hidden = magnet.contains(points)
-    if magnet.dimension == 2:
+    if magnet.dimension == 2 and magnet.has_bore:
         hidden |= np.hypot(*points[:, :2].T) > reach
+    if hidden.all():
+        return None
     low, high = np.quantile(size[~hidden], (0.0, NEAR_BLOCKS))
     return go.Surface(
         x=x, y=y, z=z, surfacecolor=np.where(hidden, np.nan, size).reshape(x.shape), opacity=0.9,

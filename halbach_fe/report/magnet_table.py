@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from halbach_fe.geometry.blocks import bore_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import iron_of
 
@@ -14,10 +13,11 @@ from halbach_fe.study.model import iron_of
 def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
     """Return name and value of the properties of a magnet that its pages list."""
     array, blocks = magnet.array, magnet.blocks
+    outer = f"{1e3 * magnet.array_outer_radius:.6g} mm"
     rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
             ("radius of the bore, outer radius",
-             f"{1e3 * bore_radius(magnet.blocks):.6g} mm, "
-             f"{1e3 * magnet.array_outer_radius:.6g} mm"),
+             f"{1e3 * magnet.free_radius:.6g} mm, {outer}") if magnet.has_bore else (
+                "outer radius", f"{outer}, without a bore"),
             ("remanence", f"{_range((abs(block.remanence) for block in blocks), 4)} T"),
             ("recoil permeability along, across the easy axis",
              f"{_range((block.recoil_permeability for block in blocks), 3)}, "
@@ -33,7 +33,8 @@ def in_one_line(magnet: Magnet) -> str:
     length = (f", {2e3 * magnet.array_half_length:.4g} mm long" if magnet.dimension == 3
               else ", in cross-section")
     iron = "without iron" if iron_of(magnet.study) is None else f"iron: {iron_description(magnet)}"
-    return (f"{layout(magnet)}{length}, bore {2e3 * bore_radius(magnet.blocks):.4g} mm, "
+    bore = f"bore {2e3 * magnet.free_radius:.4g} mm" if magnet.has_bore else "no bore"
+    return (f"{layout(magnet)}{length}, {bore}, "
             f"outer diameter {2e3 * magnet.array_outer_radius:.4g} mm, remanence "
             f"{_range((abs(block.remanence) for block in magnet.blocks), 3)} T, {iron}")
 

@@ -48,6 +48,9 @@ MOST_BLOCKS = 2000
 """Largest number of blocks that are drawn one by one. In a larger array neighbouring rings are
 merged."""
 
+MOST_UNEQUAL = 10_000
+"""Largest number of blocks that are drawn of other magnets, whose rings cannot be merged."""
+
 LARGE = 4.0
 """Upper end of the colour scale of standardized residuals."""
 
@@ -277,7 +280,9 @@ def magnet_view(
     if found and magnet.dimension == 3:  # from their side, as the map would hide them
         x, _, z = np.mean([block.middle for block in found], axis=0).tolist()
         camera |= {"x": math.copysign(camera["x"], x), "z": math.copysign(camera["z"], z)}
-    figure.add_trace(cut_trace(magnet))
+    cut = cut_trace(magnet)
+    if cut is not None:
+        figure.add_trace(cut)
     _to_mm(figure)
     figure.update_layout(
         height=620, margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend=LEGEND,
@@ -344,8 +349,11 @@ def _merge_rings(
 
     In an array of more than `MOST_BLOCKS` blocks, the blocks of several neighbouring rings in the
     same slot are drawn as a single block. It has their mean magnetization, and the colour and text
-    of the block whose value is largest in magnitude.
+    of the block whose value is largest in magnitude. Of other magnets some blocks are drawn, see
+    `_some`.
     """
+    if not magnet.array.is_uniform and len(magnet.blocks) > MOST_UNEQUAL:
+        return _some(magnet, values)
     blocks, slots = magnet.blocks, magnet.array.blocks_per_ring
     step = _rings_per_prism(magnet)
     groups = [[number for number in range(first + slot, min(first + step * slots, len(blocks)),
@@ -367,6 +375,24 @@ def _merge_rings(
     magnetization = np.array([values.magnetization[group].mean(axis=0) for group in groups])
     return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],
             BlockValues(magnetization, colours))
+
+
+def _some(magnet: Magnet, values: BlockValues) -> tuple[Sequence[MagnetBlock], BlockValues]:
+    """Return `MOST_UNEQUAL` blocks at most and their values.
+
+    Of as many blocks that follow each other, the one whose colour is largest in magnitude is drawn.
+    """
+    there = np.flatnonzero([block.remanence != 0 for block in magnet.blocks])
+    colours = values.colours
+    magnitude = np.zeros(len(magnet.blocks)) if colours is None else np.abs(colours.values)
+    step = math.ceil(len(there) / MOST_UNEQUAL)
+    chosen = [int(some[np.argmax(magnitude[some])])
+              for some in np.split(there, range(step, len(there), step))]
+    if colours is not None:
+        colours = replace(colours, values=colours.values[chosen],
+                          words=[colours.words[number] for number in chosen])
+    return ([magnet.blocks[number] for number in chosen],
+            BlockValues(values.magnetization[chosen], colours))
 
 
 def _blocks_trace(
@@ -401,7 +427,9 @@ def _blocks_trace(
     return go.Mesh3d(
         x=points[:, 0], y=points[:, 1], z=points[:, 2], i=faces[:, 0], j=faces[:, 1],
         k=faces[:, 2], customdata=owner, meta=texts, hoverinfo="text",
-        flatshading=True, name="blocks", showlegend=True,
+        flatshading=True, showlegend=True,
+        name="blocks" if magnet.array.is_uniform or len(magnet.blocks) <= MOST_UNEQUAL
+        else f"{len(blocks)} of {len(magnet.blocks)} blocks",
         lighting={"ambient": 0.8, "diffuse": 0.4}, **look)
 
 

@@ -226,6 +226,14 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 
+MOST_POINTING = 500
+"""Largest number of blocks in a cross-section that have arrows: an arrow takes 10 ms, and more of
+them than this cannot be told apart."""
+
+MOST_MEASURED = 10_000
+"""Largest number of blocks whose sides are searched for their distance from the axis; of more the
+corners are drawn."""
+
 MOST_NUMBERED = 40
 """Largest number of blocks in a cross-section whose slots are numbered."""
 
@@ -242,7 +250,8 @@ number has no place in it."""
 def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
     """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
 
-    ``colour`` is that of the blocks. Their slots have numbers, unless there are too many to read.
+    ``colour`` is that of the blocks. Their slots have numbers and their easy axes are drawn, unless
+    there are too many to read.
     """
     t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
@@ -250,9 +259,15 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
         block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
     reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
     numbered = reach > 0 and len(shown) <= MOST_NUMBERED
+    outlines = []
     for block in shown:
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
-        outline = 1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2]
+        outlines.append(1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2])
+    if len(shown) > MOST_POINTING:
+        axis.plot(*np.vstack([part for outline in outlines for part in (
+            outline, [[np.nan, np.nan]])]).T, color=colour, lw=0.3)
+        shown = []
+    for block, outline in zip(shown, outlines, strict=False):
         axis.plot(*outline.T, color=colour, lw=0.6)
         middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
         length = 0.3 * float(np.ptp(outline, axis=0).min())
@@ -285,6 +300,8 @@ def _inner_radii(magnet: Magnet) -> list[float]:
 
     Of a block with flat sides that is the distance of an edge, which no corner has.
     """
+    if len(magnet.blocks) > MOST_MEASURED:
+        return [inner for _, (inner, _) in magnet.ring_sections]
     t, found = np.linspace(0, 1, 33), dict[int, float]()
     for block in magnet.blocks:
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])

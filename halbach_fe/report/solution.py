@@ -36,6 +36,8 @@ from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, is_fourier, relative
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution
+from halbach_fe.solver.formulation_choice import FINENESS, choose_route
+from halbach_fe.study.solver import CELLS_PER_SIDE
 from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
@@ -78,12 +80,25 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
         f"{compared}{of_blocks}",
         "Check that error with several meshes."
         if fine else
-        "See how the error falls with the mesh, then refine mesh.block_size_m.",
+        f"See how the error falls with the mesh, then {_finer(solution)}.",
         "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)
+
+
+def _finer(solution: Solution) -> str:
+    """Say which key of the mesh makes the field more exact on the route that computed it."""
+    key = FINENESS.get(choose_route(solution.magnet, solution.points), "block_size_m")
+    if key == "cells_per_side":
+        cells = solution.magnet.study.mesh.cells_per_side or CELLS_PER_SIDE
+        return f"enlarge mesh.{key} (now {cells})"
+    return f"refine mesh.{key}"
 
 
 def _after_an_exact_field(solution: Solution) -> tuple[str, str]:
     """Return the next step, and its command."""
+    if not solution.magnet.has_bore:
+        return ("Choose where to measure it." if _smallest_noise(solution) else
+                "Add [[noise.regions]] to the study, and choose where to measure it.",
+                "halbach-fe plan STUDY -o DIR")
     if solution.magnet.dimension == 2:
         return ("See its multipoles, with what the tolerances of the blocks make of them.",
                 "halbach-fe multipoles STUDY -o DIR")

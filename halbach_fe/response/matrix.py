@@ -201,7 +201,7 @@ def response_matrix(
     GetDPError
         If GetDP fails, or the columns do not add up to the field of the whole array.
     """
-    check_points(magnet, observation.points)
+    observation = replace(observation, points=check_points(magnet, observation.points))
     key = _key(magnet, observation, session, similar)
     path = session.folder / "response.h5"
     built = _read(path, key)

@@ -291,6 +291,7 @@ def multipole_models(
         orders, radius = unwanted_orders(magnet, reference)
         wanted.append((orders, radius, reference.z_m))
         observations.append(_observation(magnet, radius, max(*orders, main), reference.z_m))
+        _check_air(magnet, radius, observations[-1].points)
     bare = magnet.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(concatenate, observations), session)
     models, first = [], 0
@@ -310,6 +311,22 @@ def multipole_models(
             phases * _complexes(model.offset[part])[index], model.error[part][index],
             model.nominal, -turn))
     return models
+
+
+def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
+    """Refuse a reference circle of which points (n, 3) in m are not in air.
+
+    Raises
+    ------
+    StudyError
+    """
+    if magnet.contains(points).any():
+        bore = "" if magnet.has_bore else ", which has no bore there"
+        raise StudyError(must_be(
+            "the reference circle of multipoles", f"study {magnet.name}", "in air",
+            f"one of {1e3 * radius:.4g} mm about the z axis, inside magnet or iron{bore}",
+            "Only a field about a free axis has multipoles; halbach-fe solve computes this one at "
+            "any points."))
 
 
 def unwanted_orders(

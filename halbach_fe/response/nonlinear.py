@@ -122,7 +122,7 @@ def nonlinear_model(
     if magnet.curve is None:
         raise StudyError(f"Input `curve` of the iron of study {magnet.name} must be given for a "
                          "non-linear model; instead it is missing. Use the response matrix.")
-    check_points(magnet, observation.points)
+    observation = replace(observation, points=check_points(magnet, observation.points))
     route = _mesh_route(magnet, observation.points)
     base = _with_vacuum_for_iron(magnet, route)
     linear = response_matrix(base, observation, replace(session, folder=session.folder / "linear"))

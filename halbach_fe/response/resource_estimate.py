@@ -137,9 +137,15 @@ per block and point of the exact field; and per entry of H, times the number of 
 readings, whichever is smaller. Two threads took 2e-7 to 5e-7 s per block and point, in a plane and
 for sectors in space."""
 
-CELL_BYTES, CELL_SECONDS, COLUMN_SECONDS = 70_000, 1.2e-3, 1.6e-5
-"""Memory in bytes and time in s of the method of moments per cell, and time per entry of H.
-Measured with 990 cubes and 396 readings, and with 4 032 cubes and 432 readings."""
+CELL_SECONDS, COLUMN_SECONDS = 1.2e-3, 1.6e-5
+"""Time in s of the method of moments per cell, and per entry of H. Measured with 990 cubes and 396
+readings, and with 4 032 cubes and 432 readings."""
+
+CELL_BYTES, COLUMN_CELL_BYTES, NEAR_BYTES = 8_000, 43_000, 300
+"""Memory in bytes of the method of moments per cell, per cell if H is computed too, and per pair of
+near cells. Slender and flat cells have many times the pairs of cubes.
+Without H the sum is within 20 % of that of lattices of 108 to 500 hexagonal prisms of 20 and 60 mm,
+aligned and turned at random, and of 512 and 1 728 cubes; with H it is that of the cubes above."""
 
 MODES_BYTES, MODES_SECONDS = 2.0 * GIB, 60.0
 """Memory in bytes and time in s of iron by azimuthal modes with separate blocks in turn. Measured
@@ -259,7 +265,8 @@ class Estimate:
             hints.append(f"use --jobs 1 ({alone:.2g} GiB)")
         largest = max(self.problems, key=lambda problem: problem.memory_GiB, default=None)
         if largest is None or largest.memory_GiB < self.own_memory_GiB:
-            hints.append("take fewer readings")
+            hints.append("take fewer mesh.cells_per_side" if self.route == "moments"
+                         else "take fewer readings")
         else:
             hints.append(COARSER[MESHES[largest.route]])
             if largest.route == "edge_elements" and self.route == largest.route:
@@ -432,13 +439,18 @@ def _cost_of_moments(
 
     ``entries`` is the number of entries of H. Both results are 0 for other routes.
     """
+    from halbach_fe.solver.moments.interaction import Interaction  # import numba
+
     there = [magnet for magnet in magnets if not magnet.is_vacuum
              and choose_route(magnet, points) == "moments"]
-    cells = [len(cells_of(present_blocks(magnet.blocks),
-                          magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
+    found = [Interaction(cells_of(present_blocks(magnet.blocks),
+                                  magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
              for magnet in there]
+    cells = [len(each.cells) for each in found]
     iron = [magnet for magnet in there if magnet.iron]
-    memory = CELL_BYTES * max(cells, default=0) + MODES_BYTES * bool(iron)
+    per_cell = COLUMN_CELL_BYTES if entries else CELL_BYTES
+    memory = MODES_BYTES * bool(iron) + max(
+        (per_cell * len(each.cells) + NEAR_BYTES * each.near_pairs for each in found), default=0)
     return memory, (CELL_SECONDS * sum(cells) + COLUMN_SECONDS * entries * bool(there)
                     + MODES_SECONDS * len(iron))
 

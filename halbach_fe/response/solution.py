@@ -90,11 +90,26 @@ def study_observation(magnet: Magnet) -> Observation:
     ------
     StudyError
         If a position, or the place of a sensor of a probe at that position, is not in air.
+
+    Warns
+    -----
+    HalbachWarning
+        If a position is on a face of magnet or iron.
+    """
+    return _observed(magnet)[0]
+
+
+def _observed(magnet: Magnet) -> tuple[Observation, Floats]:
+    """Return `study_observation`, and the places (n, 3) in m at which to evaluate the field.
+
+    The first of them are those of the map, the last those of the sensors, and both may be the same.
     """
     points = points_from(magnet.study.observation.positions)
     observation = observe(magnet.study, points, np.ones_like(points, bool))
-    check_points(magnet, _places(points, observation))
-    return observation
+    displaced = not np.array_equal(observation.points, points)
+    places = check_points(
+        magnet, np.vstack([points, observation.points]) if displaced else points)
+    return replace(observation, points=places[-len(observation.points):]), places
 
 
 @alone
@@ -132,9 +147,8 @@ def solve(magnet: Magnet, session: Session) -> Solution:
     >>> round(float(solution.field_map["B_T"].sel(component="x").mean()), 3)
     0.603
     """
-    observation = study_observation(magnet)
+    observation, places = _observed(magnet)
     points = observation.map_points
-    places = _places(points, observation)
     parts = finite_element_part(magnet, places, session, columns=False)
     field = vacuum_part(magnet, places) + parts.nominal
     sensors = slice(-len(observation.points), None)
@@ -154,12 +168,3 @@ def write_solution(solution: Solution, folder: Path) -> None:
     write_text(folder / "readings.csv", csv_text({
         "label": solution.observation.labels, "x_m": x, "y_m": y, "z_m": z,
         "value_T": solution.readings, "error_T": solution.errors}))
-
-
-def _places(points: Floats, observation: Observation) -> Floats:
-    """Return the points of the map, followed by those of the sensors if the two differ.
-
-    In either case the last rows are the points of the sensors.
-    """
-    displaced = not np.array_equal(observation.points, points)
-    return np.vstack([points, observation.points]) if displaced else points

@@ -64,8 +64,8 @@ def unit_field(block: MagnetBlock, points: Floats) -> Floats:
     block : MagnetBlock
         Infinite ``z_min``, ``z_max`` give the field of the two-dimensional cross-section.
     points : ndarray, shape (n, 3), in m
-        Points off the block's surface, where the field is not defined. Inside the block the result
-        is mu_0 H instead of B.
+        Points off the block's edges, where the field is infinite. On a face the result is the limit
+        from outside. Inside the block it is mu_0 H instead of B.
 
     Returns
     -------
@@ -80,6 +80,9 @@ def _local_field(block: MagnetBlock, points: Floats) -> Floats:
     """Return the field matrices (n, 6) of a block along its own axes, at points of the magnet."""
     points = np.ascontiguousarray(
         points if block.in_magnet_frame else block.to_frame(points), float)
+    contact = block.contact_in_frame(points)
+    if contact.on_face.any():
+        points = points + contact.outward
     weighted = [factor * _outline_field(part, points) for factor, part in block.parts]
     return weighted[0] if len(weighted) == 1 else np.sum(weighted, axis=0)
 
@@ -244,8 +247,8 @@ def gradient_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
 def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
     """Yield the contribution of every block to `gradient_of`, (n, 3, 3) in T/m.
 
-    The radial and azimuthal derivatives are central differences. Those along z follow from
-    curl B = 0 and div B = 0.
+    The radial and azimuthal derivatives are central differences, or one-sided ones where a step
+    would lead into the block. Those along z follow from curl B = 0 and div B = 0.
     """
     angle = np.arctan2(points[:, 1], points[:, 0])
     zero = np.zeros(len(points))
@@ -254,9 +257,14 @@ def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
     step = _STEP * max(edge.radius for block in blocks for edge in block.outline)
     places = np.vstack([points + sign * step * along for along in (radial, azimuthal)
                         for sign in (1, -1)])
-    for block, unit in zip(blocks, unit_fields(blocks, places), strict=True):
-        fields = (unit @ (np.array(block.easy_axis) * block.remanence)).reshape(2, 2, -1, 3)
-        by_radius, by_angle = (fields[:, 0] - fields[:, 1]) / (2 * step)
+    for block in blocks:
+        inside = block.contains(places).reshape(2, 2, -1)
+        inside &= ~inside.all(axis=1, keepdims=True)
+        own = np.where(inside.reshape(-1, 1), np.tile(points, (4, 1)), places)
+        fields = (unit_field(block, own) @ (
+            np.array(block.easy_axis) * block.remanence)).reshape(2, 2, -1, 3)
+        across = step * (2 - inside.sum(axis=1))
+        by_radius, by_angle = (fields[:, 0] - fields[:, 1]) / across[..., None]
         expansion = np.sum(by_radius * radial + by_angle * azimuthal, axis=1)
         by_z = by_radius[:, 2:] * radial + by_angle[:, 2:] * azimuthal
         by_z[:, 2] = -expansion

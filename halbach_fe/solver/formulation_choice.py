@@ -79,6 +79,9 @@ MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
 """Kind of mesh by route, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`."""
 
+FINENESS = {"moments": "cells_per_side", "azimuthal_modes": "meridian_size_m"}
+"""Key of ``mesh`` by which a route becomes more exact; on all others it is ``block_size_m``."""
+
 BOUNDARY_NEAR = 0.5
 """Fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
 because the condition on the boundary affects their field."""
@@ -131,7 +134,7 @@ class ElementFields:
 
 def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
     """Return B (n, 3) in T of the nominal array at points (n, 3) in m, by the study's method."""
-    check_points(magnet, points)
+    points = check_points(magnet, points)
     return vacuum_part(magnet, points) + finite_element_part(
         magnet, points, session, columns=False, estimate=False).nominal
 
@@ -153,7 +156,7 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
     vacuum = field_in_vacuum(magnet.blocks)
 
     def field(points: Floats) -> Floats:
-        check_points(magnet, points)
+        points = check_points(magnet, points)
         return external_field(magnet, points) + vacuum(points) + reaction.field(points)
 
     return field
@@ -164,7 +167,7 @@ def iron_change(magnet: Magnet, points: Floats, session: Session) -> Floats | No
 
     The result is None for routes on which the whole magnet is solved in the same time.
     """
-    check_points(magnet, points)
+    points = check_points(magnet, points)
     if choose_route(magnet, points) != "moments" or not magnet.iron:
         return None
     return iron_alone(magnet, points, session)
@@ -408,8 +411,11 @@ def choose_route(magnet: Magnet, points: Floats) -> str:
 
 def check_points(
     magnet: Magnet, points: Floats, key: str = "observation.positions"
-) -> None:
+) -> Floats:
     """Refuse points at which the field cannot be computed well or measured by a probe.
+
+    The points at which to evaluate the field are returned: those on a face of magnet or iron lie
+    just outside, see `halbach_fe.geometry.surface`.
 
     Parameters
     ----------
@@ -421,28 +427,36 @@ def check_points(
     Raises
     ------
     StudyError
-        If a point lies inside magnet or iron, or if the points of a 2D study have different z.
+        If a point lies inside magnet or iron, on an edge or between bodies that touch, or if the
+        points of a 2D study have different z.
 
     Warns
     -----
     HalbachWarning
-        If points are so near to the outer boundary that its condition affects their field.
+        If points are on a face, or so near to the outer boundary that its condition affects their
+        field.
     """
     if magnet.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
             f"Input `{key}` of study {magnet.name} must lie in one plane, since it "
             f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
             "one circle, or a 3D study.")
-    inside = magnet.contains(points)
-    if inside.any():
-        x, y, z = points[np.argmax(inside)]
+    places = magnet.surroundings(points)
+    refused = places.refusal()
+    if refused is not None:
+        first, count, what, hint = refused
+        x, y, z = points[first]
         raise StudyError(
             f"Input `{key}` of study {magnet.name} must lie in air; instead "
-            f"{inside.sum()} of {len(points)} points lie inside magnet or iron, the first at "
-            f"({x:g}, {y:g}, {z:g}) m. Move them into the bore or beyond the ends.")
+            f"{count} of {len(points)} points lie {what}, the first at "
+            f"({x:g}, {y:g}, {z:g}) m. {hint or 'Move them into the bore or beyond the ends.'}")
+    remark = places.on_faces()
+    if remark is not None:
+        warnings.warn(remark, HalbachWarning, stacklevel=2)
+    points = places.points
     route = choose_route(magnet, points)
     if route == "moments":  # the blocks need no boundary
-        return
+        return points
     mesh = MESHES[route]
     directions = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,
              boundary_radius(magnet, mesh))]
@@ -458,3 +472,4 @@ def check_points(
                 f"the boundary of the mesh, which affects their field, the first at ({x:g}, {y:g}, "
                 f"{z:g}) m. Enlarge `open_boundary` of study {magnet.name}.", HalbachWarning,
                 stacklevel=2)
+    return points

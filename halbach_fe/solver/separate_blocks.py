@@ -247,7 +247,7 @@ def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     cells = system.interaction.cells
     interaction = Interaction(cells, opening=0.4, reading_degree=8)
     polarization = np.broadcast_to(system.remanence[:, None], cells.nodes.shape)
-    return lambda points: interaction.field_at(points, polarization)
+    return interaction.field_function(polarization)
 
 
 def _remembered(function: Field) -> Field:

@@ -66,7 +66,13 @@ processors sum.
 SECONDS = 1.0
 """Time in s between two readings; the held-out points are measured after the map."""
 
+<<<<<<< HEAD
 IDEAL = Instrument()
+=======
+SURFACE_M = 1e-9
+"""Distance in m from a surface up to which a point is on it: rounding errors of the coordinates of
+turned bodies are less, and magpylib's field jumps by the remanence within them."""
+>>>>>>> points
 
 LARGEST_CSV = 5e6 / 20
 """Count of numbers in a map, of some 20 characters each, from which it is written as HDF5."""
@@ -333,14 +339,17 @@ def real_places(study: Study, points: Floats, generator: np.random.Generator) ->
 
 
 def check_air(magnet: TrueMagnet, points: Floats) -> None:
-    """Raise a StudyError if a point (n, 3) in m is inside a block or iron."""
+    """Raise a StudyError if a point (n, 3) in m is inside a block or iron, or on its surface."""
     inside = magnet.holds(points)
+    for beside in np.vstack([np.eye(3), -np.eye(3)]) * SURFACE_M:
+        inside |= magnet.holds(points + beside)
     if inside.any():
         x, y, z = points[int(np.argmax(inside))]
         raise StudyError(must_be(
             "`observation.positions`", "the study", "in air, as must the held-out points halfway "
             "between them and the points to which hidden effects take the probe",
-            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron"))
+            f"({x:g}, {y:g}, {z:g}) m, inside magnet or iron or on its surface",
+            "Move it off by a micrometre or more."))
 
 
 def _map(

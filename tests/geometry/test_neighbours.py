@@ -50,7 +50,9 @@ def test_readings_inside_a_neighbour(short_dipole):
     magnet = build_magnet(short_dipole(**with_neighbours({"z_m": 0.17}, {"z_m": -0.5})))
     check_points(magnet, circle(0.05, z=0.17))
     with pytest.raises(StudyError, match="24 of 24 points lie inside magnet or iron"):
-        check_points(magnet, circle(0.14, z=0.17))
+        check_points(magnet, circle(0.14, z=0.172))
+    with pytest.raises(StudyError, match="24 of 24 points lie between r01s13 and r02s13, which"):
+        check_points(magnet, circle(0.14, z=0.17))  # where its rings touch
     # negative control: without the neighbour there is air
     check_points(build_magnet(short_dipole()), circle(0.14, z=0.17))
 

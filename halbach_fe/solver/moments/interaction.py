@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -141,6 +141,14 @@ class Interaction:
         return (Neighbours.of(far[:, 0], far[:, 1], len(targets)),
                 Neighbours.of(*items, len(targets.order)))
 
+    @property
+    def near_pairs(self) -> int:
+        """Number of pairs of cells that are near to each other, which most of the memory is for."""
+        own = self.clusters
+        _, close = tree.pairs(own.children, own.centres, own.radii, own.children, own.centres,
+                              own.radii, self.opening)
+        return len(close)
+
     @cached_property
     def _kinds(self) -> tuple[Ints, Ints, Ints]:
         """Congruent near pairs, which have equal matrices along the axes of their targets.
@@ -223,11 +231,16 @@ class Interaction:
     def _far(self, far: Neighbours, targets: Clusters, places: Floats, dipoles: Floats,
              degree: int) -> Floats:
         """Return the field (n, q, 3) of far clusters at places (n, q, 3) of target items."""
+        return self._far_of(far, targets, places, lambda: self._moments(dipoles, degree), degree)
+
+    def _far_of(self, far: Neighbours, targets: Clusters, places: Floats,
+                moments_of: Callable[[], tuple[Floats, Floats]], degree: int) -> Floats:
+        """Return `_far` from a function that returns the moments of clusters."""
         found = np.zeros_like(places)
         if not len(far.sources):
             return found
         own = self.clusters
-        moments = self._moments(dipoles, degree)
+        moments = moments_of()
         expansions = np.empty((len(targets), (degree + 1) ** 2), complex)
         in_threads(lambda first, last: tree.translate(
             far.starts, far.sources, first, last, targets.centres, own.centres, *moments, degree,
@@ -393,17 +406,31 @@ class Interaction:
 
         Near cells consist of uniformly polarized parts, one about every node, see `Cells.of_parts`.
         """
-        points = np.ascontiguousarray(points, float)
-        if not len(points) or not np.any(polarization):
-            return np.zeros((len(points), 3))
-        targets = Clusters.of(points, np.zeros(len(points)))
-        far, close = self._pairs_with(targets, 1 / self._reach)
-        found = self._far(far, targets, points[:, None], self.dipoles(polarization),
-                          self.reading_degree)[:, 0]
-        in_threads(lambda first, last: near.add_of_parts(
-            close.starts, close.sources, first, last, *self.arrays, self.cells.cuts, points,
-            self.cells.of_parts @ polarization, found), close.shares(32))
-        return found
+        return self.field_function(polarization)(points)
+
+    def field_function(self, polarization: Floats) -> Callable[[Floats], Floats]:
+        """Return `field_at` of a polarization as a function of points.
+
+        The moments of clusters, which take most of the time of a few points, are computed once.
+        """
+        moments = lru_cache(maxsize=1)(
+            lambda: self._moments(self.dipoles(polarization), self.reading_degree))
+        of_parts = self.cells.of_parts @ polarization
+
+        def field(points: Floats) -> Floats:
+            points = np.ascontiguousarray(points, float)
+            if not len(points) or not np.any(polarization):
+                return np.zeros((len(points), 3))
+            targets = Clusters.of(points, np.zeros(len(points)))
+            far, close = self._pairs_with(targets, 1 / self._reach)
+            found = self._far_of(far, targets, points[:, None], moments,
+                                 self.reading_degree)[:, 0]
+            in_threads(lambda first, last: near.add_of_parts(
+                close.starts, close.sources, first, last, *self.arrays, self.cells.cuts, points,
+                of_parts, found), close.shares(32))
+            return found
+
+        return field
 
 
 def six_of(matrix: Floats) -> Floats:

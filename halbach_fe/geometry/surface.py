@@ -1,0 +1,289 @@
+"""Points on the surface of blocks and iron: told from those inside and outside, to rounding.
+
+The normal component of B is continuous across a face and its tangential one is not, so that a point
+on a face stands for its limit from outside, where a probe can be. On edges the field of a uniformly
+magnetized body is infinite. Coordinates have rounding errors, those of turned bodies above all, so
+that a face is as thick as `ON_SURFACE` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.outline import Outline, outline_contains, points_on
+
+ON_SURFACE = 1e-8
+"""Distance from a surface, relative to the size of the body, up to which a point lies on it: 0.2 nm
+for a block of 20 mm. Rounding errors are 1e-16 of a coordinate, which is less even if the body lies
+a million times its size from the origin. Across this distance the field changes by about 1e-8 of
+the remanence."""
+
+BESIDE_FLAT, BESIDE_CURVED = 1e-11, 1e-8
+"""Distance, relative to the size of the body, at which the limit from outside is evaluated. Closed
+forms of flat faces tell it from the face by 1e-12; the quadrature on arcs has parts of 1e-8 of the
+arc, see `halbach_fe.solver.prism_kernel`."""
+
+EDGE_OF_CURVED = 1e-5
+"""Distance from an edge, relative to the size of the body, up to which a point on a curved face
+counts as on the edge: nearer, `BESIDE_CURVED` changes the field by more than 1e-4 of the remanence.
+"""
+
+SMOOTH = 1e-9
+"""Largest angle in rad between neighbouring parts of an outline that meet smoothly, as the arcs of
+a cylinder do. The field's singularity is proportional to it."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Where points (n,) lie relative to a body.
+
+    Attributes
+    ----------
+    inside, on_edge, on_face : ndarray of bool, shape (n,)
+        At most one is true.
+    outward : ndarray, shape (n, 3), in m
+        What takes a point on a face to its place just outside; zero for others.
+    """
+
+    inside: NDArray[np.bool_]
+    on_edge: NDArray[np.bool_]
+    on_face: NDArray[np.bool_]
+    outward: Floats
+
+    @classmethod
+    def nowhere(cls, count: int) -> Contact:
+        """Return that of points outside."""
+        return cls(np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool),
+                   np.zeros((count, 3)))
+
+
+class Body(Protocol):
+    """A block or a body of iron."""
+
+    @property
+    def name(self) -> str:
+        """Its name in sentences."""
+
+    def contact(self, points: Floats) -> Contact:
+        """Return where points (n, 3) in m of the magnet lie relative to the body."""
+
+
+@dataclass(frozen=True)
+class _Section:
+    """Where points (n,) lie relative to a cross-section.
+
+    ``distance`` (n,) in m from the boundary is negative inside, ``normal`` (n, 2) is the outward
+    one there, ``corner`` (n,) the distance in m from the nearest corner, and ``curved`` (n,) tells
+    whether the nearest part of the boundary is an arc.
+    """
+
+    distance: Floats
+    normal: Floats
+    corner: Floats
+    curved: NDArray[np.bool_]
+
+
+def contact_of_prism(outline: Outline, z_min: float, z_max: float, points: Floats) -> Contact:
+    """Return where points (n, 3) in m lie relative to a prism on an outline, in its frame.
+
+    Infinite ``z_min`` and ``z_max`` are those of a cross-section.
+    """
+    low, high, size = _extent(outline)
+    size = max(size, z_max - z_min) if np.isfinite(z_max) else size
+    near = np.flatnonzero(_in_box(points, (*low, z_min), (*high, z_max), ON_SURFACE * size))
+    if not len(near):
+        return Contact.nowhere(len(points))
+    return _contact(_section(outline, points[near, :2]), z_min, z_max, size, points, near)
+
+
+def contact_of_tube(inner: float, outer: float, z_min: float, z_max: float,
+                    points: Floats) -> Contact:
+    """Return where points (n, 3) in m lie relative to a tube or, with ``inner`` 0, to a disc."""
+    size = max(2 * outer, z_max - z_min) if np.isfinite(z_max) else 2 * outer
+    near = np.flatnonzero(_in_box(points, (-outer, -outer, z_min), (outer, outer, z_max),
+                                  ON_SURFACE * size))
+    radius = np.hypot(*points[near, :2].T)
+    hole = (radius < (inner + outer) / 2) & (inner > 0)
+    sign = np.where(hole, -1.0, 1.0)
+    normal = sign[:, None] * points[near, :2] / np.maximum(radius, 1e-300)[:, None]
+    section = _Section(sign * (radius - np.where(hole, inner, outer)), normal,
+                       np.full(len(near), np.inf), np.ones(len(near), bool))
+    return _contact(section, z_min, z_max, size, points, near)
+
+
+def _in_box(points: Floats, low: Sequence[float], high: Sequence[float],
+            margin: float) -> NDArray[np.bool_]:
+    """Tell which points (n, 3) lie in a box that is widened by a margin in m."""
+    inside = np.ones(len(points), bool)
+    for values, first, last in zip(points.T, low, high, strict=True):
+        inside &= (values >= first - margin) & (values <= last + margin)
+    return inside
+
+
+def _contact(section: _Section, z_min: float, z_max: float, size: float, points: Floats,
+             near: Ints) -> Contact:
+    """Return the contact of all points from the cross-section at those that are near."""
+    small = ON_SURFACE * size
+    z = points[near, 2]
+    above, below = z - z_max, z_min - z
+    beyond = np.maximum(above, below)
+    side = (np.abs(section.distance) <= small) & (beyond <= small)
+    end = (np.abs(beyond) <= small) & (section.distance <= small)
+    edge = (side & end) | ((section.corner <= small) & (beyond <= small))
+    edge |= side & section.curved & (
+        np.minimum(section.corner, np.abs(beyond)) <= EDGE_OF_CURVED * size)
+    face = (side | end) & ~edge
+    beside = size * np.where(side & section.curved, BESIDE_CURVED, BESIDE_FLAT)
+    distance = np.where(side, section.distance, np.where(end, beyond, 0.0))
+    normal = np.zeros((len(near), 3))
+    normal[side, :2] = section.normal[side]
+    normal[end, 2] = np.where(above > below, 1.0, -1.0)[end]
+    found = Contact.nowhere(len(points))
+    found.inside[near] = (section.distance < 0) & (beyond < 0) & ~side & ~end & ~edge
+    found.on_edge[near], found.on_face[near] = edge, face
+    found.outward[near] = (
+        np.where(face, np.maximum(beside - distance, 0.0), 0.0)[:, None] * normal)
+    return found
+
+
+@lru_cache(maxsize=4096)
+def _extent(outline: Outline) -> tuple[Floats, Floats, float]:
+    """Return the corners (2,) in m of a box about an outline, and the outline's size in m.
+
+    Radii of arcs count for the size too: rounding errors are relative to them.
+    """
+    points = points_on(outline)
+    bulge = max((edge.radius * (1 - np.cos(edge.angles[1] / 2)) for edge in outline if edge.arc),
+                default=0.0)  # arcs may pass the points on them by less than this
+    low, high = points.min(axis=0) - bulge, points.max(axis=0) + bulge
+    size = max(float(np.ptp(points, axis=0).max()),
+               max((edge.radius for edge in outline if edge.arc), default=0.0))
+    return low, high, size
+
+
+@lru_cache(maxsize=4096)
+def _sharp_corners(outline: Outline) -> Floats:
+    """Return the corners (m, 2) in m of an outline at which it is not smooth."""
+    outline = tuple(edge for edge in outline if edge.length > 0)
+    ends = np.array([edge.at(np.array([0.0, 1.0]))[1] for edge in outline])
+    ends = ends / np.linalg.norm(ends, axis=2, keepdims=True)
+    before, after = np.roll(ends[:, 1], 1, axis=0), ends[:, 0]
+    sharp = np.linalg.norm(before - after, axis=1) > SMOOTH
+    return np.array([edge.start for edge in outline])[sharp]
+
+
+def _section(outline: Outline, points: Floats) -> _Section:
+    """Return where points (n, 2) in m lie relative to an outline."""
+    nearest, signed = np.full(len(points), np.inf), np.zeros(len(points))
+    normal, curved = np.zeros((len(points), 2)), np.zeros(len(points), bool)
+    for edge in outline:
+        if not edge.length > 0:
+            continue
+        if edge.arc:
+            first, sweep = edge.angles
+            turn = np.sign(sweep) * (np.arctan2(points[:, 1], points[:, 0]) - first)
+            # from the middle of the arc, so that what is beyond an end is nearest to that end
+            middle = abs(sweep) / 2
+            share = ((turn - middle + np.pi) % (2 * np.pi) - np.pi + middle) / abs(sweep)
+        else:
+            along = np.subtract(edge.end, edge.start)
+            share = (points - edge.start) @ along / (along @ along)
+        foot, outward = edge.at(np.clip(share, 0.0, 1.0))
+        outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        apart = points - foot
+        distance = np.hypot(*apart.T)
+        closer = distance < nearest
+        nearest[closer], curved[closer] = distance[closer], edge.arc
+        normal[closer] = outward[closer]
+        signed[closer] = np.einsum("ij,ij->i", apart, outward)[closer]
+    # beside a corner the sign is that of the outline; on a face that of the normal
+    away = np.abs(np.abs(signed) - nearest) > 1e-3 * nearest
+    away |= nearest > 1e-3 * _extent(outline)[2]
+    signed[away] = (np.where(outline_contains(outline, points), -1.0, 1.0) * nearest)[away]
+    corners = _sharp_corners(outline)
+    apart = points[:, None] - corners
+    corner = np.hypot(apart[..., 0], apart[..., 1]).min(axis=1, initial=np.inf)
+    return _Section(signed, normal, corner, curved)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Where points (n,) lie in a magnet.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), in m
+        Points at which the field is to be evaluated: those on a face are just outside.
+    inside, on_edge : ndarray of bool, shape (n,)
+        Inside a body, and on an edge of one.
+    faces : ndarray of int, shape (n,)
+        Number of bodies on whose faces a point lies; 2 between bodies that touch.
+    names : dict of int to list of str
+        Names of the bodies whose faces or edges the point with this number touches.
+    """
+
+    points: Floats
+    inside: NDArray[np.bool_]
+    on_edge: NDArray[np.bool_]
+    faces: Ints
+    names: dict[int, list[str]]
+
+    @property
+    def no_air(self) -> NDArray[np.bool_]:
+        """Which points have no field that a probe could measure."""
+        return np.asarray(self.inside | self.on_edge | (self.faces > 1))
+
+    def refusal(self) -> tuple[int, int, str, str] | None:
+        """Return why points are refused: number of the first, how many, what they are, what to do.
+
+        It is None if no point is.
+        """
+        touching = (self.faces > 1) & ~self.inside & ~self.on_edge
+        edges = self.on_edge & ~self.inside
+        for chosen, what, hint in (
+                (self.inside, "inside magnet or iron", ""),
+                (edges, "on an edge of {}, where the field is infinite",
+                 "Move them off the edge, by 0.1 mm say."),
+                (touching, "between {}, which touch there, so that it is not in air",
+                 "Move them out of the blocks.")):
+            if chosen.any():
+                first = int(np.argmax(chosen))
+                names = " and ".join(self.names.get(first, [])[:2])
+                return first, int(chosen.sum()), what.format(names), hint
+        return None
+
+    def on_faces(self) -> str | None:
+        """Return the sentence about points on faces, None if there are none."""
+        chosen = self.faces > 0
+        if not chosen.any():
+            return None
+        first = int(np.argmax(chosen))
+        return (f"{chosen.sum()} of {len(chosen)} points lie on a face of magnet or iron, the "
+                f"first on {self.names[first][0]}: their field is that just outside, where a probe "
+                "can be; just inside, its part along the face differs.")
+
+
+def surroundings(bodies: Sequence[Body], points: Floats) -> Surroundings:
+    """Return where points (n, 3) in m lie relative to all bodies of a magnet."""
+    inside, edge = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    faces, moved = np.zeros(len(points), int), np.array(points, float)
+    names: dict[int, list[str]] = {}
+    for body in bodies:
+        found = body.contact(points)
+        inside |= found.inside
+        touched = np.flatnonzero(found.on_edge | found.on_face)
+        if not len(touched):
+            continue
+        edge |= found.on_edge
+        faces += found.on_face
+        moved += found.outward
+        for number in touched.tolist():
+            names.setdefault(number, []).append(body.name)
+    return Surroundings(moved, inside, edge, faces, names)
