@@ -66,13 +66,11 @@ processors sum.
 SECONDS = 1.0
 """Time in s between two readings; the held-out points are measured after the map."""
 
-<<<<<<< HEAD
 IDEAL = Instrument()
-=======
+
 SURFACE_M = 1e-9
 """Distance in m from a surface up to which a point is on it: rounding errors of the coordinates of
 turned bodies are less, and magpylib's field jumps by the remanence within them."""
->>>>>>> points
 
 LARGEST_CSV = 5e6 / 20
 """Count of numbers in a map, of some 20 characters each, from which it is written as HDF5."""
