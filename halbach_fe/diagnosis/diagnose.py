@@ -127,6 +127,13 @@ class _Round:
     identified: tuple[IdentifiedEffect, ...]
     misfit: float
 
+    @property
+    def gives_way(self) -> bool:
+        """Whether a cause of any shape takes the place of effects once these are in the model."""
+        effects = {self.search.hypotheses[number] for number in self.judgement.best.effects}
+        return bool(self.judgement.best.terms) and not effects.issuperset(
+            effect.hypothesis for effect in self.identified)
+
 
 def diagnose(
     study: Study, data: Data, session: Session, blocks: BlockTable | None = None,
@@ -269,7 +276,8 @@ def _diagnose(
         converged = _has_converged(identified, found)
         this = _Round(number + 1, update, search, judgement, identified,
                       _held_out_misfit(update, search, first[0]))
-        if best is None or this.misfit <= best.misfit * _chance(first[0]):
+        if not this.gives_way and (
+                best is None or this.misfit <= best.misfit * _chance(first[0])):
             best = this
         if converged:
             # the model has the old amplitudes; their sd and evidence are those of this round
