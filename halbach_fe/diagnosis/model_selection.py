@@ -198,7 +198,9 @@ def with_wide_priors(evidence: Evidence, candidates: Sequence[Candidate]) -> Evi
     return evidence.widened(free, widths)
 
 
-def _likeliest_widths(evidence: Evidence, spans: Sequence[slice], pinned: NDArray[np.bool_]) -> Floats:
+def _likeliest_widths(
+    evidence: Evidence, spans: Sequence[slice], pinned: NDArray[np.bool_]
+) -> Floats:
     """Return the standard deviations (k,) of the likeliest prior of every column, by candidates."""
     every = range(len(pinned))
     sizes = evidence.widened(every, np.where(pinned, PINNED_SD, WIDE_PRIOR_SD)).fit(every).mean**2
@@ -210,7 +212,9 @@ def _likeliest_widths(evidence: Evidence, spans: Sequence[slice], pinned: NDArra
     return widths
 
 
-def _needless(evidence: Evidence, widths: Floats, span: slice, candidate: Candidate) -> NDArray[np.bool_]:
+def _needless(
+    evidence: Evidence, widths: Floats, span: slice, candidate: Candidate
+) -> NDArray[np.bool_]:
     """Return which amplitudes of a candidate are 0 in its likeliest part.
 
     The evidence of a part relative to that of all amplitudes is the posterior density of 0 over the

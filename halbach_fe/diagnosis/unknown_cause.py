@@ -18,7 +18,6 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.competition import Competition, Explanation, Term
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,

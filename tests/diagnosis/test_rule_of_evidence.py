@@ -1,4 +1,4 @@
-"""When a cause is named: small quadrupoles by magpylib, whose truth no model of the fit computes."""
+"""When a cause is named: quadrupoles by magpylib, whose truth no model of the fit computes."""
 
 from __future__ import annotations
 
