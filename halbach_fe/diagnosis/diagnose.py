@@ -320,7 +320,8 @@ def _diagnose(
         groups_after=_groups(update, search.marginal, search.training),
         loo_residuals_before=loo_residuals(first[1].marginal, first[1].training),
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
-        answer=answer, gross_errors=gross_errors, poses=poses, outliers=outliers, position_noise=position_noise,
+        answer=answer, gross_errors=gross_errors, poses=poses, outliers=outliers,
+        position_noise=position_noise,
         solver_error=solver_error, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)
