@@ -21,7 +21,8 @@ STUDY = parse_study(DOCUMENT | {
     "array": DOCUMENT["array"] | {"multipole_order": 2}, "inference": {"held_out": {"every": 4}}})
 POINTS = np.vstack([circle(radius, 10, z, 0.1) for z in np.linspace(-0.14, 0.14, 9)
                     for radius in (0.04, 0.07)])
-ALONG_Z = ("mapper_translation", "magnet_shifted", "ring_gap", "length", "z_scale", "gain_z")
+ALONG_Z = ("mapper_translation", "magnet_shifted", "ring_gap", "length", "z_scale", "gain_z",
+           "wrong_line")
 
 
 def some(*names):
