@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,9 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.instrument import with_memory, without_memory
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 from tests.diagnosis.campaign import drawn, field
@@ -77,6 +81,28 @@ def slow(readings, part):
     for reading in readings[1:]:
         shown.append(reading + part * (shown[-1] - reading))
     return np.array(shown)
+
+
+@pytest.mark.parametrize("rows", [0.0, 3.0])
+def test_the_memory_of_an_instrument(generator, rows):
+    """Row by row, of rows that are not in the order of the scan and some readings missing."""
+    readings, part, kept = generator.standard_normal((12, 3)), 0.3, np.exp(-1 / 3) if rows else 0.0
+    mean, expected = readings[0], [readings[0]]
+    for before, reading in pairwise(readings):
+        mean = kept * mean + (1 - kept) * before
+        expected.append((1 - part) * reading + part * mean)
+    order = generator.permutation(12)
+    instrument = Instrument(memory=part, memory_rows=rows)
+    shown = with_memory(instrument, readings[order], order / 11)
+    np.testing.assert_allclose(shown, np.array(expected)[order], atol=1e-12)
+    np.testing.assert_allclose(without_memory(instrument, shown, order / 11), readings[order],
+                               atol=1e-12)
+    assert np.abs(shown - readings[order]).max() > 0.1
+    missing = np.where(np.arange(12)[:, None] == 5, np.nan, readings)
+    found = with_memory(instrument, missing, np.arange(12.0))
+    np.testing.assert_allclose(np.delete(found, 5, axis=0), with_memory(
+        instrument, np.delete(readings, 5, axis=0), np.arange(11.0)))
+    assert np.isnan(found[5]).all()
 
 
 SLOW = ("slow_readings", "inner_radius", "ferromagnetic_object", "mapper_translation", "lag",
