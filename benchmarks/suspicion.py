@@ -117,7 +117,7 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
             suspected: list[list[Any]] = []
             if probability_at_most(search, named) >= SUSPECTED:
                 judgement = judge(search, update, named, flexible)
-                suspected = _listed(suspicions(judgement, search.hypotheses))
+                suspected = _listed(suspicions(judgement, STUDY, search))
             if named and suspected:
                 whole = diagnose(STUDY, data, replace(session, folder=session.folder / str(seed)),
                                  effects=effects)

@@ -32,9 +32,9 @@ from halbach_fe.diagnosis.model_selection import (
 MOST_TERMS = 3
 """Largest number of families in one explanation."""
 
-MANY = 3
+SEVERAL = 2
 """Number of effects from which one unlisted cause is reported if it explains the readings as well:
-so many effects seldom come together."""
+effects seldom come together."""
 
 FITS = 1.2
 """Chi-squared per reading up to which terms alone are a full explanation, so that no other has to
@@ -368,7 +368,7 @@ class Competition:
             best = self.extended(others) if others else without
         if not best.terms:
             tie = without.log_odds > best.log_odds - INDISTINGUISHABLE_LOG_EVIDENCE
-            instead = tie and len(best.effects) >= MANY
+            instead = tie and len(best.effects) >= SEVERAL
             return without if instead and without.terms else by_catalogue, without
         if not best.effects:
             return best, without

@@ -67,7 +67,8 @@ def detection_limits(
             for number in range(len(signatures)):
                 own = slice(columns.shape[1] + count * number, columns.shape[1] + count * (
                     number + 1))
-                found.append(sd * smallest_amplitude(evidence.information[own, own], threshold))
+                found.append(sd * smallest_amplitude(
+                    evidence.information[own, own], threshold + np.log(max(1, len(effect.parts)))))
         return np.array(found)
 
     return DetectionLimits(

@@ -18,6 +18,10 @@ they explain far less.
 Random errors of the probe's positions are noise rather than an effect: their size is estimated in
 every round, and the comparison is repeated with that noise until it no longer changes.
 
+The answer is the round whose model predicts held-out readings best. It is the last one, unless
+effects that only the training readings seemed to show made the prediction worse. If the study
+without any effect predicts best, nothing in the catalogue explains the map.
+
 Several maps of one magnet, which the study lists, are diagnosed together: effects of the magnet
 must explain all of them, and those of an instrument belong to a map or to a probe.
 """
@@ -25,7 +29,7 @@ must explain all of them, and those of an instrument belong to a map or to a pro
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -39,10 +43,11 @@ from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.equal_positions import possible_positions
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
-from halbach_fe.diagnosis.model_selection import probabilities
+from halbach_fe.diagnosis.model_selection import Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     PositionNoise,
@@ -65,6 +70,7 @@ from halbach_fe.diagnosis.search import (
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
 from halbach_fe.diagnosis.summary import place_in_words
 from halbach_fe.diagnosis.unknown_cause import (
+    Judgement,
     describe_unknown,
     families_of,
     judge,
@@ -86,8 +92,47 @@ CONVERGENCE_TOLERANCE = 0.2
 """Largest change of an amplitude between rounds that counts as converged, in units of the
 amplitude's posterior standard deviation."""
 
+WORSE = 3.0
+"""Standard deviations of the mean square of held-out residuals by which a round must predict worse
+than the best one if it is not to be the answer."""
+
 ON_AXIS_M = 1e-6
 """Distance from the axis below which a point has no azimuth."""
+
+Rivals = dict[Hypothesis, tuple[tuple[Candidate, float], ...]]
+"""Alternatives of effects, with their log Bayes factors less that of the effect."""
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A round of the search, of whose model the effects in it are known.
+
+    Attributes
+    ----------
+    number : int
+        Counted from 1.
+    update : InferenceResult
+    search : Search
+    judgement : Judgement
+    identified : tuple of IdentifiedEffect
+        The effects in the model.
+    misfit : float
+        Mean square of the held-out residuals, in units of the noise.
+    """
+
+    number: int
+    update: InferenceResult
+    search: Search
+    judgement: Judgement
+    identified: tuple[IdentifiedEffect, ...]
+    misfit: float
+
+    @property
+    def gives_way(self) -> bool:
+        """Whether a cause of any shape takes the place of effects once these are in the model."""
+        effects = {self.search.hypotheses[number] for number in self.judgement.best.effects}
+        return bool(self.judgement.best.terms) and not effects.issuperset(
+            effect.hypothesis for effect in self.identified)
 
 
 def diagnose(
@@ -166,6 +211,8 @@ def _diagnose(
     outliers: tuple[Outlier, ...] = ()
     solver_error: SolverErrorExplanation | None = None
     flexible: list[Family] = []
+    best: _Round | None = None
+    rivals: Rivals = {}
     solved: Magnet | None = None  # the last whose single blocks were solved for
 
     def changed(identified: Sequence[IdentifiedEffect]) -> Study:
@@ -213,6 +260,7 @@ def _diagnose(
         judgement = judge(search, update, found, flexible)
         if number > 0 or judgement.is_clear or _has_converged(identified, found):
             found = named_effects(corrected, search, judgement, found)
+        found = with_first_rivals(found, identified, rivals)
         estimate = position_noise if judgement.fits else estimate_position_noise(
             update, campaign, search.marginal,
             np.hstack([search.columns, *judgement.whitened_terms()]), search.training,
@@ -227,6 +275,11 @@ def _diagnose(
             closing = pace.is_over
             continue
         converged = _has_converged(identified, found)
+        this = _Round(number + 1, update, search, judgement, identified,
+                      _held_out_misfit(update, search, first[0]))
+        if not this.gives_way and (
+                best is None or this.misfit <= best.misfit * _chance(first[0])):
+            best = this
         if converged:
             # the model has the old amplitudes; their sd and evidence are those of this round
             present = {effect.hypothesis: effect.values for effect in identified}
@@ -241,11 +294,19 @@ def _diagnose(
         if closing:
             say("the time is up: the effects so far are put into the model")
     assert first is not None
+    answer = number + 1
+    if best is not None and not solver_error and best.number < answer:
+        say(f"round {best.number} predicts the held-out readings best, and is the answer")
+        answer, update, search, judgement, identified = (
+            best.number, best.update, best.search, best.judgement, best.identified)
+        if not identified:  # what explains the map is none of the effects
+            judgement = replace(judgement, best=judgement.without)
     unknown: UnknownCause | None = None
     suspected: tuple[Suspicion, ...] = ()
     if not solver_error:
         unknown = describe_unknown(judgement, update, search, identified)
-        suspected = suspicions(judgement, search.hypotheses) if unknown is None else ()
+        if unknown is None and answer == number + 1:
+            suspected = suspicions(judgement, corrected, search)
     if unknown is not None and unknown.alone and not start and not position_noise:
         update, search = first
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
@@ -260,10 +321,63 @@ def _diagnose(
         groups_after=_groups(update, search.marginal, search.training),
         loo_residuals_before=loo_residuals(first[1].marginal, first[1].training),
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
-        gross_errors=gross_errors, poses=poses, outliers=outliers, position_noise=position_noise,
+        answer=answer, gross_errors=gross_errors, poses=poses, outliers=outliers,
+        position_noise=position_noise,
         solver_error=solver_error, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)
+
+
+def _held_out_misfit(update: InferenceResult, search: Search, first: InferenceResult) -> float:
+    """Return the mean square of the held-out residuals, in units of the noise of the first round.
+
+    Without held-out readings it is that of the training readings, each predicted from all others.
+    """
+    chosen = update.held_out
+    if not chosen.any():
+        return float(np.mean(loo_residuals(search.marginal, search.training)**2))
+    residual = (update.readings - update.prediction_posterior.mean)[chosen]
+    return float(np.mean((residual / first.errors.sd[chosen])**2))
+
+
+def _chance(first: InferenceResult) -> float:
+    """Return the ratio of two mean squares of held-out residuals that is still chance."""
+    count = int(first.held_out.sum()) or int((~first.held_out).sum())
+    return 1 + WORSE * float(np.sqrt(2 / count))
+
+
+def with_first_rivals(
+    found: Sequence[IdentifiedEffect], identified: Sequence[IdentifiedEffect], rivals: Rivals
+) -> tuple[IdentifiedEffect, ...]:
+    """Return effects with the alternatives that they had when they were found.
+
+    All signatures are then linear. Later only that of the effect in the model is exact, and an
+    equal cause whose signature is not seems to explain less.
+
+    Parameters
+    ----------
+    found : sequence of IdentifiedEffect
+    identified : sequence of IdentifiedEffect
+        The effects in the model.
+    rivals : dict
+        The alternatives by effect, relative to it in log Bayes factor. Those of effects that are
+        not in the model yet are stored.
+    """
+    present = {effect.hypothesis for effect in identified}
+    names = {(effect.hypothesis.effect.name, effect.hypothesis.place.name) for effect in found}
+    changed = []
+    for effect in found:
+        own = effect.selection
+        if effect.hypothesis not in present:
+            rivals[effect.hypothesis] = tuple(
+                (one, factor - own.log_bayes_factor) for one, factor in own.alternatives)
+        known = names | {(one.effect, one.place) for one, _ in own.alternatives}
+        further = tuple((one, own.log_bayes_factor + more)
+                        for one, more in rivals.get(effect.hypothesis, ())
+                        if (one.effect, one.place) not in known)
+        changed.append(replace(effect, selection=replace(
+            own, alternatives=(*own.alternatives, *further))))
+    return tuple(changed)
 
 
 def _is_over(pace: Pace, closing: bool) -> bool:

@@ -147,13 +147,14 @@ class Evidence:
         return replace(self, temperature=factor * self.temperature, score=self.score / factor,
                        chi2=self.chi2 / factor)
 
-    def widened(self, chosen: Sequence[int], width: float) -> Evidence:
+    def widened(self, chosen: Sequence[int], width: float | Floats) -> Evidence:
         """Return the evidence with another prior standard deviation for a set of columns.
 
-        ``width`` is in units of the usual prior standard deviation of these columns.
+        ``width``, of all or of each (k,), is in units of the usual prior standard deviation of
+        these columns.
         """
         prior = self.prior.copy()
-        prior[np.asarray(chosen, int)] = width**-2
+        prior[np.asarray(chosen, int)] = np.asarray(width, float)**-2
         return replace(self, prior=prior)
 
     def log_evidences(self, groups: Sequence[Sequence[int]]) -> Floats:

@@ -3,6 +3,12 @@
 A candidate is an effect at one place (a block or a seam, for example), with one or more amplitudes.
 The prior probability of an effect is shared by its candidates, so that an effect which may be in
 any of hundreds of blocks has no advantage.
+
+The amplitudes of one candidate are free in parts: a mapper may be displaced along z alone, with x
+and y exactly 0. All parts of a candidate are equally probable before the readings are known. Its
+evidence is the mean over them; in a model of several effects each has its likeliest part. What a
+candidate shares with other effects, such as the common shift of all rings beside a gap, does not
+give it its name: it must be likelier than that alone, by `DETERMINED_LOG_EVIDENCE`.
 """
 
 from __future__ import annotations
@@ -11,6 +17,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.evidence import Evidence
@@ -20,6 +27,14 @@ DETECTION_LOG_ODDS = 5.0
 
 INDISTINGUISHABLE_LOG_EVIDENCE = 3.0
 """Difference in log evidence below which the readings do not distinguish two explanations."""
+
+DETERMINED_LOG_EVIDENCE = INDISTINGUISHABLE_LOG_EVIDENCE
+"""Log evidence that the amplitudes which give an effect its name add to that of its other
+amplitudes alone, from which they count as determined: 20 to 1."""
+
+PINNED_SD = 1e-6
+"""Standard deviation, in units of the usual prior, of amplitudes that are 0: so small that rounding
+is all that is left of them, and large enough for matrices that can be inverted."""
 
 WIDE_PRIOR_SD = 5.0
 """Standard deviation of the wide prior, in units of the usual one. Both have probability 1/2. With
@@ -56,6 +71,13 @@ class Candidate:
     places : int or None
         Number of places of the effect, which share its prior probability; None if all of them are
         candidates.
+    parts : tuple of tuple of int
+        Amplitudes that may be free together while the others are 0, as positions in ``columns``.
+        It is empty if all are free.
+    shared : tuple of int
+        Amplitudes that do not give the effect its name, as positions in ``columns``.
+    relative_odds : float
+        Prior odds of the effect, relative to others.
     """
 
     effect: str
@@ -64,11 +86,19 @@ class Candidate:
     is_binary: bool = False
     unique: bool = False
     places: int | None = None
+    parts: tuple[tuple[int, ...], ...] = ()
+    shared: tuple[int, ...] = ()
+    relative_odds: float = 1.0
 
     @property
     def free(self) -> tuple[int, ...]:
         """Columns whose amplitudes are fitted."""
         return self.columns[1:] if self.is_binary else self.columns
+
+    @property
+    def free_in_parts(self) -> list[tuple[int, ...]]:
+        """Columns whose amplitudes are fitted, in every part."""
+        return [tuple(self.columns[k] for k in part) for part in self.parts] or [self.free]
 
     @property
     def name(self) -> str:
@@ -110,34 +140,99 @@ def prior_log_odds(candidates: Sequence[Candidate]) -> Floats:
     """Return the log prior odds (candidates,) of each candidate."""
     names = [candidate.effect for candidate in candidates]
     counts = {name: names.count(name) for name in set(names)}
-    return np.array([np.log(EFFECT_PRIOR_ODDS / (candidate.places or counts[candidate.effect]))
+    return np.array([np.log(EFFECT_PRIOR_ODDS * candidate.relative_odds
+                            / (candidate.places or counts[candidate.effect]))
                      for candidate in candidates])
 
 
 def log_bayes_factors(evidence: Evidence, candidates: Sequence[Candidate]) -> Floats:
-    """Return the log Bayes factor (candidates,) of each candidate over no effect."""
+    """Return the log Bayes factor (candidates,) of each candidate over no effect.
+
+    It is over what the candidate shares with other effects where that explains the readings about
+    as well.
+    """
     factors = np.empty(len(candidates))
     free = [number for number, candidate in enumerate(candidates) if not candidate.is_binary]
-    columns = [candidates[number].columns for number in free]
-    wide = evidence.widened(range(len(evidence.prior)), WIDE_PRIOR_SD)
-    factors[free] = np.logaddexp(evidence.log_evidences(columns), wide.log_evidences(columns)
-                               ) - np.log(2)
+    if free:
+        parts = [candidates[number].free_in_parts for number in free]
+        counts = np.array([len(one) for one in parts])
+        every = _of_groups(evidence, [part for one in parts for part in one])
+        factors[free] = np.logaddexp.reduceat(every, np.cumsum(counts) - counts) - np.log(counts)
+    partly = [number for number in free if candidates[number].shared]
+    own = factors[partly] - _of_groups(evidence, [tuple(
+        candidates[number].columns[k] for k in candidates[number].shared) for number in partly])
+    factors[partly] = np.where(own < DETERMINED_LOG_EVIDENCE,
+                               np.minimum(own, factors[partly]), factors[partly])
     for number, candidate in enumerate(candidates):
         if candidate.is_binary:
             factors[number] = log_evidence(evidence, [candidate])
     return factors
 
 
-def with_wide_priors(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
-    """Return the evidence with the wide prior for those of the given candidates that are large.
+def _of_groups(evidence: Evidence, groups: Sequence[tuple[int, ...]]) -> Floats:
+    """Return the log evidence (groups,) of columns, whose prior is the usual or the wide one."""
+    wide = evidence.widened(range(len(evidence.prior)), WIDE_PRIOR_SD)
+    return np.logaddexp(evidence.log_evidences(groups), wide.log_evidences(groups)) - np.log(2)
 
-    All given candidates are in the model together.
+
+def with_wide_priors(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
+    """Return the evidence with the likeliest priors of the amplitudes of the given candidates.
+
+    They are the wide prior for candidates that are large, and 0 for amplitudes outside the
+    likeliest part of a candidate. All given candidates are in the model together.
     """
     free = [column for candidate in candidates for column in candidate.free]
-    sizes = dict(zip(free, evidence.widened(free, WIDE_PRIOR_SD).fit(free).mean**2, strict=True))
-    large = [column for candidate in candidates for column in candidate.free
-             if np.mean([sizes[other] for other in candidate.free]) > WIDE_PRIOR_FROM**2]
-    return evidence.widened(large, WIDE_PRIOR_SD)
+    if not free:
+        return evidence
+    own = evidence.only(free)
+    ends = np.cumsum([len(candidate.free) for candidate in candidates])
+    spans = [slice(end - len(candidate.free), end)
+             for end, candidate in zip(ends, candidates, strict=True)]
+    pinned = np.zeros(len(free), bool)
+    widths = _likeliest_widths(own, spans, pinned)
+    for candidate, span in zip(candidates, spans, strict=True):
+        if len(candidate.parts) > 1:
+            pinned[span] = _needless(own.widened(range(len(free)), widths), widths, span,
+                                     candidate)
+            widths = _likeliest_widths(own, spans, pinned)
+    return evidence.widened(free, widths)
+
+
+def _likeliest_widths(
+    evidence: Evidence, spans: Sequence[slice], pinned: NDArray[np.bool_]
+) -> Floats:
+    """Return the standard deviations (k,) of the likeliest prior of every column, by candidates."""
+    every = range(len(pinned))
+    sizes = evidence.widened(every, np.where(pinned, PINNED_SD, WIDE_PRIOR_SD)).fit(every).mean**2
+    widths = np.where(pinned, PINNED_SD, 1.0)
+    for span in spans:
+        free = np.arange(span.start, span.stop)[~pinned[span]]
+        if len(free) and np.mean(sizes[free]) > WIDE_PRIOR_FROM**2:
+            widths[free] = WIDE_PRIOR_SD
+    return widths
+
+
+def _needless(
+    evidence: Evidence, widths: Floats, span: slice, candidate: Candidate
+) -> NDArray[np.bool_]:
+    """Return which amplitudes of a candidate are 0 in its likeliest part.
+
+    The evidence of a part relative to that of all amplitudes is the posterior density of 0 over the
+    prior one (J. M. Dickey, Annals of Mathematical Statistics 42, 204, 1971).
+    """
+    fit = evidence.fit(range(len(widths)))
+    size = span.stop - span.start
+    best, least = -np.inf, np.zeros(size, bool)
+    for part in candidate.parts:
+        left_out = np.ones(size, bool)
+        left_out[list(part)] = False
+        index = span.start + np.flatnonzero(left_out)
+        own = fit.covariance[np.ix_(index, index)]
+        gain = float(np.log(widths[index]).sum() - np.linalg.slogdet(own)[1] / 2
+                     - fit.mean[index] @ np.linalg.solve(own, fit.mean[index]) / 2)
+        if gain > best:
+            best, least = gain, left_out
+    return least
 
 
 def with_candidates(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
@@ -158,7 +253,7 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
             own = evidence.part(np.array([column]))[0, 0]
             total += float(evidence.score[column] - own / 2)
             evidence = evidence.shifted(column)
-        total -= np.log(2) * bool(candidate.free)
+        total -= np.log(2) * bool(candidate.free) + np.log(max(1, len(candidate.parts)))
     return total + with_wide_priors(evidence, candidates).fit(
         [column for candidate in candidates for column in candidate.free]).log_evidence
 

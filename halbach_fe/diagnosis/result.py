@@ -87,6 +87,10 @@ class Suspicion:
         Probability of each of the effects.
     log_bayes_factor : float
         Of the likeliest effect at its place.
+    reason : str
+        Why it is not named: ``odds`` that are too small; the readings do not tell ``which`` of
+        several it is; its amplitude would be ``impossible``; its signature was computed only
+        ``roughly``; or the search ``dropped`` it again.
     """
 
     effects: tuple[str, ...]
@@ -94,6 +98,7 @@ class Suspicion:
     hypothesis: Hypothesis
     shares: tuple[float, ...]
     log_bayes_factor: float
+    reason: Literal["odds", "which", "impossible", "roughly", "dropped"] = "odds"
 
 
 @dataclass(frozen=True)
@@ -257,6 +262,8 @@ class Diagnosis(ShownInNotebook):
         Standardized leave-one-out residuals of the training readings.
     rounds : int
         Number of rounds of solving and searching.
+    answer : int
+        Number of the round whose model predicts held-out readings best, and is the result.
     gross_errors : tuple of GrossError
         Errors of the map's units, axes or magnet.
     poses : tuple of FoundPose
@@ -317,6 +324,12 @@ class Diagnosis(ShownInNotebook):
     floor_T: Floor | None = None
     uncompared: int | None = None
     suspected: tuple[Suspicion, ...] = ()
+    answer: int = 0
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the search came to rest, at effects that held-out readings do not contradict."""
+        return self.converged and self.answer in (0, self.rounds)
 
     @property
     def found_anything(self) -> bool:

@@ -30,6 +30,7 @@ from halbach_fe.measurement.instrument import (
     probe_points,
     sensor_matrix,
     sensor_positions,
+    with_memory,
 )
 from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS
 from halbach_fe.study.measurement import Instrument
@@ -337,4 +338,5 @@ def _shown(instrument: Instrument, nominal: NominalFields, stated: Floats) -> Fl
     away = sensor_positions(instrument, stated) - nominal.points[:, None]
     field = nominal.field[:, None] + np.einsum("ncj,nsj->nsc", nominal.gradient, away)
     linear = np.einsum("sc,nsc->ns", sensor_matrix(instrument), field)
-    return np.asarray(linear + nonlinear_part(instrument, linear, nominal.time))
+    return with_memory(
+        instrument, linear + nonlinear_part(instrument, linear, nominal.time), nominal.time)

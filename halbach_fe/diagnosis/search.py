@@ -18,6 +18,7 @@ from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
+    PINNED_SD,
     Candidate,
     SelectedEffect,
     select_effects,
@@ -268,7 +269,8 @@ def score_hypotheses(
             effect.name, place.name, tuple(range(own.shape[1])), not is_rough and (
                 effect.is_binary or (effect.applied_in_full
                                      and own.shape[1] > len(effect.parameters))),
-            effect.unique, len(places[effect.name]))
+            effect.unique, len(places[effect.name]), _parts(effect, own.shape[1]),
+            effect.shared, effect.relative_odds)
 
     def compare(hypothesis: Hypothesis) -> None:
         """Compute the signature of a hypothesis, unless it is known or the time is up."""
@@ -351,7 +353,9 @@ def score_hypotheses(
             columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
             candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
                                         effect.is_binary, effect.unique,
-                                        len(places[effect.name]) + 1))
+                                        len(places[effect.name]) + 1,
+                                        _parts(effect, signature.shape[1]), effect.shared,
+                                        effect.relative_odds))
     while True:
         kept_in = {number for number, hypothesis in enumerate(scored)
                    if (hypothesis.effect.name, hypothesis.place) in in_model}
@@ -558,6 +562,8 @@ def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[Iden
     fit = with_wide_priors(evidence, [selection.candidate for selection in selected]).fit(
         [column for selection in selected for column in selection.candidate.free])
     deviation = np.sqrt(np.diag(fit.covariance))
+    mean, deviation = (np.where(deviation > 2 * PINNED_SD, each, 0.0)  # outside the likeliest part
+                       for each in (fit.mean, deviation))
     identified, first = [], 0
     for selection in selected:
         hypothesis = search.hypotheses[search.candidates.index(selection.candidate)]
@@ -565,7 +571,7 @@ def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[Iden
         scale = amplitude_scale(hypothesis.effect)[fixed:fixed + free]
         part = slice(first, first + len(scale))  # without the tolerance of binary effects
         identified.append(IdentifiedEffect(
-            hypothesis, np.concatenate([np.ones(fixed), scale * fit.mean[part]]),
+            hypothesis, np.concatenate([np.ones(fixed), scale * mean[part]]),
             np.concatenate([np.zeros(fixed), scale * deviation[part]]), selection))
         first += free
     return tuple(identified)
@@ -588,6 +594,12 @@ def with_short_steps(
         limited.append(replace(effect, values=start + np.clip(
             effect.values - start, -longest, longest)))
     return tuple(limited)
+
+
+def _parts(effect: Effect, columns: int) -> tuple[tuple[int, ...], ...]:
+    """Return the parts of an effect, of which every one has all refinements."""
+    refinements = tuple(range(len(effect.parameters), columns))
+    return tuple((*part, *refinements) for part in effect.parts)
 
 
 def amplitude_scale(effect: Effect) -> Floats:

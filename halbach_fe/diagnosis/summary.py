@@ -408,6 +408,7 @@ def diagnosis_summary(
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
+        "answer": diagnosis.answer or diagnosis.rounds,
         "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},
         "verdict": "numerical" if diagnosis.solver_error else
         "unknown" if diagnosis.unknown and not (
@@ -484,7 +485,7 @@ def _suspicion(one: Suspicion) -> dict[str, object]:
     return {"effects": dict(zip(one.effects, one.shares, strict=True)),
             "place": one.hypothesis.place.name, "maps": list(one.hypothesis.place.maps),
             "probability": one.probability,
-            "log_bayes_factor": one.log_bayes_factor}
+            "log_bayes_factor": one.log_bayes_factor, "not_named": one.reason}
 
 
 def _unknown_entry(unknown: UnknownCause) -> dict[str, object]:

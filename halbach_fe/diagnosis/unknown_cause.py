@@ -15,10 +15,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.diagnosis.competition import MANY, Competition, Explanation, Term
+from halbach_fe.diagnosis.competition import Competition, Explanation, Term
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,
@@ -44,6 +43,9 @@ MOST = 0.5
 """Share of the excess of chi-squared that terms may leave if they account for most of it. Of
 independent errors at hundreds of points they account for a fifth, as they have `MOST_WAVES`
 functions for each component."""
+
+MANY = 3
+"""Number of sources from which they may stand for a field of any shape."""
 
 NEAR_SOURCES = 0.6
 """Distance, relative to that from the axis, within which two magnetized objects may stand for one
@@ -263,7 +265,9 @@ def _part(term: Term, field: Floats, rivals: Sequence[Term]) -> UnknownPart:
         family.span / waves if waves > 0 else None, term.fitted.log_bayes_factor, family.map)
 
 
-def suspicions(judgement: Judgement, hypotheses: Sequence[Hypothesis]) -> tuple[Suspicion, ...]:
+def suspicions(
+    judgement: Judgement, corrected: Study, search: Search
+) -> tuple[Suspicion, ...]:
     """Return what is likelier than not to be missing, but not certain enough to be named.
 
     The probabilities assume that at most one more thing is missing: an effect of the catalogue, or
@@ -297,5 +301,22 @@ def suspicions(judgement: Judgement, hypotheses: Sequence[Hypothesis]) -> tuple[
         return ()
     likeliest = int(np.argmax(odds))
     factor = float(odds[likeliest] - competition.prior[likeliest])
-    return (Suspicion(tuple(named), probability, hypotheses[likeliest],
-                      tuple(by_name[name] for name in named), factor),)
+    return (Suspicion(tuple(named), probability, search.hypotheses[likeliest],
+                      tuple(by_name[name] for name in named), factor,
+                      _why_not_named(judgement, corrected, search, likeliest, probability)),)
+
+
+def _why_not_named(
+    judgement: Judgement, corrected: Study, search: Search, likeliest: int, probability: float
+) -> Literal["odds", "which", "impossible", "roughly", "dropped"]:
+    """Return why the likeliest candidate beside the named effects is only suspected."""
+    competition, effects = judgement.competition, judgement.best.effects
+    own = selected_effect(competition.evidence, competition.candidates, (*effects, likeliest),
+                          likeliest, competition.prior, ())
+    if own.log_odds < DETECTION_LOG_ODDS:
+        certain = probability > (1 - probability) * np.exp(DETECTION_LOG_ODDS)
+        return "which" if certain else "odds"
+    if likeliest in competition.excluded:
+        return "roughly"
+    found = amplitudes(replace(search, evidence=competition.evidence), [own])
+    return "dropped" if possible(corrected, found, search.campaign) else "impossible"

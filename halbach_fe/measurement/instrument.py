@@ -6,7 +6,7 @@ applied in three ways:
 * Units and axes of the map are converted when it is read (`in_si_and_magnet_axes`).
 * Effects that are linear in B (positions, orientation, gains and crosstalk of the sensors) are part
   of the model of a reading (`sensor_model`).
-* All other effects (offset, drift and nonlinearity) are subtracted from the map
+* All other effects (offset, drift, nonlinearity and memory) are subtracted from the map
   (`remove_nonlinear_part`).
 """
 
@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
@@ -194,6 +195,44 @@ def nonlinear_part(instrument: Instrument, fields: Floats, time: Floats) -> Floa
         + np.outer(time, instrument.drift_T))
 
 
+def with_memory(instrument: Instrument, values: Floats, time: Floats) -> Floats:
+    """Return what a slow instrument shows (n, 3) of readings (n, 3), which are in any order.
+
+    Readings that are NaN have no influence on others.
+    """
+    return _filtered(values, time, *_memory_law(instrument)) if instrument.memory else values
+
+
+def without_memory(instrument: Instrument, shown: Floats, time: Floats) -> Floats:
+    """Return the readings (n, 3) of which a slow instrument shows these; see `with_memory`."""
+    if not instrument.memory:
+        return shown
+    numerator, denominator = _memory_law(instrument)
+    return _filtered(shown, time, denominator, numerator)
+
+
+def _memory_law(instrument: Instrument) -> tuple[list[float], list[float]]:
+    """Return the coefficients of the filter from a reading to what a slow instrument shows."""
+    part, rows = instrument.memory, instrument.memory_rows
+    kept = float(np.exp(-1 / rows)) if rows else 0.0
+    return [1 - part, part * (1 - kept) - (1 - part) * kept], [1.0, -kept]
+
+
+def _filtered(
+    values: Floats, time: Floats, numerator: list[float], denominator: list[float]
+) -> Floats:
+    """Return values (n, 3) after a filter along the time (n,), as if the first had always been."""
+    order = np.argsort(time, kind="stable")
+    found = np.full(values.shape, np.nan)
+    for axis, column in enumerate(values[order].T):
+        rows = np.isfinite(column)
+        if rows.any():
+            first = column[rows][0]
+            found[order[rows], axis] = first + lfilter(
+                numerator, denominator, column[rows] - first)
+    return found
+
+
 def map_time(data: xr.Dataset) -> Floats:
     """Return the time (n,) of each point of a map, scaled to run from 0 to 1.
 
@@ -217,10 +256,10 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
         If the planar Hall effect needs a component that the map does not hold, or the iteration
         does not converge.
     """
-    shown = np.asarray(data["B_T"].values, float)
+    time = map_time(data)
+    shown = without_memory(instrument, np.asarray(data["B_T"].values, float), time)
     missing = np.isnan(shown)
     _check_components(instrument, missing)
-    time = map_time(data)
     linear = instrument.with_(rotation_rad=(0.0, 0.0, 0.0))
     matrix, field = sensor_matrix(linear), np.nan_to_num(shown)
     for _ in range(ROUNDS):

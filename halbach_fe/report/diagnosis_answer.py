@@ -33,9 +33,10 @@ from halbach_fe.report.unknown_cause import (
 )
 from halbach_fe.report.words import decimals, in_a_row
 
-UNUSUAL_AMPLITUDE = 20.0
-"""Amplitude in prior standard deviations above which the page warns: far beyond the errors of a
-magnet that is built with care."""
+UNUSUAL_AMPLITUDE = 10.0
+"""Amplitude in prior standard deviations above which the page warns and does not say "Yes": twice
+the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the errors of a magnet that
+is built with care."""
 
 
 REMEDIES = {
@@ -52,12 +53,12 @@ def answer(diagnosis: Diagnosis) -> Answer:
     # what was named stands, whatever is suspected besides
     only_suspected = diagnosis.suspected and not diagnosis.identified
     sound = not (diagnosis.unknown or only_suspected or diagnosis.solver_error or _fails(
-        diagnosis) or diagnosis.after.held_out_conflict)
+        diagnosis) or diagnosis.after.held_out_conflict or _is_restless(diagnosis))
     if diagnosis.identified and doubts:
         # besides how well the model fits now, and error bars that are too wide
         doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
         wrong = (diagnosis.unknown or diagnosis.solver_error or _fails(diagnosis)
-                 or diagnosis.after.held_out_conflict)
+                 or diagnosis.after.held_out_conflict or _is_restless(diagnosis))
         verdict = ("No" if wrong else "Only in part" if doubtful else
                    "Yes, but what is suspected is not in the model" if diagnosis.suspected else
                    "Yes")
@@ -89,7 +90,7 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     if diagnosis.suspected:
         return f"Only in part: a suspicion is no certainty. Without it {chi2}."
     if not _fails(diagnosis):
-        return f"No. {diagnosis.after.held_out_conflict}"
+        return f"No. {diagnosis.after.held_out_conflict or 'The search did not come to rest.'}"
     return f"No: {chi2}."
 
 
@@ -115,6 +116,10 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
                 "it: hold out others, spread over the whole map ([inference.held_out]), and "
                 "diagnose again. If they are a map of its own, test first whether it is of the "
                 "same magnet in the same state.", again)
+    if _is_restless(diagnosis):
+        return ("Do not use these effects: they changed from round to round, as they do where the "
+                "cause is not in the catalogue. Repeat some lines in another order and with the "
+                "probe turned by 180°: that shows whether magnet or instrument is in error.", again)
     if diagnosis.found_anything:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
         if any(map(rivals, diagnosis.identified)):
@@ -166,6 +171,11 @@ def _also_possible(diagnosis: Diagnosis) -> str:
             "it is.") if said else ""
 
 
+def _is_restless(diagnosis: Diagnosis) -> bool:
+    """Whether the search had time, and did not come to rest at what predicts best."""
+    return not diagnosis.is_at_rest and diagnosis.uncompared is None
+
+
 def _fails(diagnosis: Diagnosis) -> bool:
     """Whether the readings disagree with what the diagnosis leaves."""
     return diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
@@ -179,7 +189,7 @@ def _found(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.solver_error:
         return sentences
     if diagnosis.identified:
-        fits = diagnosis.converged and not (
+        fits = diagnosis.is_at_rest and not (
             _fails(diagnosis) or diagnosis.after.held_out_conflict)
         start = f"{_maps(diagnosis)} explained by" if fits else (
             "The best explanation from the catalogue is")
@@ -199,6 +209,11 @@ def _found(diagnosis: Diagnosis) -> list[str]:
             agree = f"The others of {these} agree"
         sentences.append(f"{start} {agree} with the study within noise (chi² per reading "
                          f"{decimals(after.prior_conflict)}).")
+    if not diagnosis.identified and _is_restless(diagnosis):
+        sentences.append(
+            f"Nothing in the catalogue explains {'the maps' if after.is_campaign else 'the map'}: "
+            f"of {diagnosis.rounds} rounds the study without any effect predicts held-out readings "
+            "best.")
     if unknown is not None:
         sentences += unknown_sentences(unknown, bool(diagnosis.identified))
     elif not diagnosis.identified and not diagnosis.suspected and _fails(diagnosis):
@@ -255,10 +270,12 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "Far larger than usual (relative to the prior's standard deviation): "
             f"{', '.join(unusual)}. Unless another measurement confirms such an effect, "
             "suspect another cause.")
-    if diagnosis.identified and not diagnosis.converged and diagnosis.uncompared is None:
+    if diagnosis.identified and _is_restless(diagnosis):
         sentences.append(
             f"The search had not converged after {diagnosis.rounds} rounds: the effects or "
-            "their amplitudes still changed.")
+            "their amplitudes still changed." if diagnosis.answer in (0, diagnosis.rounds) else
+            f"The search ended after {diagnosis.rounds} rounds, of which round {diagnosis.answer} "
+            "predicts held-out readings best; what later rounds added made the prediction worse.")
     if len(diagnosis.identified) == MAX_EFFECTS:
         sentences.append(
             f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "

@@ -102,16 +102,33 @@ def _alternative(text: str) -> str:
     return f"{said} in map {where}" if where else said
 
 
+MANY_TO_ONE = 1000.0
+"""Odds beyond which their number says nothing more."""
+
+NOT_NAMED = {
+    "odds": "Suspected with a probability of {} % (odds {} : 1), which is too little to name it: "
+            "{}.",
+    "which": "Something is missing (odds {1} : 1), but the map does not tell which of these it is, "
+             "so that none is named: {2}.",
+    "impossible": "Suspected (odds {1} : 1), but not named, as no valid study has it at the size "
+                  "that the readings ask for: {2}. Another cause may look like it.",
+    "roughly": "Suspected (odds {1} : 1), but not named, as its field was only estimated: {2}.",
+    "dropped": "Suspected (odds {1} : 1), but not named, as the search dropped it again beside the "
+               "other effects: {2}."}
+"""What is said of a suspicion, by the reason for which it is not named."""
+
+
 def suspicion_in_words(suspicion: Suspicion, titles: dict[str, str]) -> str:
-    """Say what is suspected, with its odds."""
+    """Say what is suspected, with its odds, and why it is not named."""
     place = place_in_words(suspicion.hypothesis.place)
     first = titles.get(suspicion.effects[0], suspicion.effects[0]) + (f", {place}" if place else "")
     odds = suspicion.probability / max(1 - suspicion.probability, 1e-9)
     others = [f"{titles.get(name, name)} ({100 * share:.0f} %)"
               for name, share in zip(suspicion.effects[1:], suspicion.shares[1:], strict=True)]
     together = f", or else {', '.join(others)}" if others else ""
-    return (f"Suspected with a probability of {100 * suspicion.probability:.0f} % (odds {odds:.1f} "
-            f": 1), which is too little to name it: {first}{together}.")
+    return NOT_NAMED[suspicion.reason].format(
+        f"{100 * suspicion.probability:.0f}", f"{odds:.1f}" if odds < MANY_TO_ONE else
+        f"over {MANY_TO_ONE:.0f}", first + together)
 
 
 def more_readings(suspicion: Suspicion) -> str:
@@ -119,6 +136,9 @@ def more_readings(suspicion: Suspicion) -> str:
 
     The expected log Bayes factor rises in proportion to the number of readings.
     """
+    if suspicion.reason not in ("odds", "which"):
+        return ("Look at magnet and mapper for what is suspected: the same map again would not "
+                "decide it.")
     factor = max(suspicion.log_bayes_factor, 1.0)
     prior = np.log(suspicion.shares[0] / max(1 - suspicion.probability, 1e-9)) - factor
     times = max(2, int(np.ceil((DETECTION_LOG_ODDS - prior) / factor)))

@@ -13,7 +13,7 @@ from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.mounting import mountings
-from halbach_fe.measurement.instrument import nonlinear_part, sensor_model
+from halbach_fe.measurement.instrument import nonlinear_part, sensor_model, with_memory
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.study.reader import parse_study
@@ -40,7 +40,8 @@ def shown(study):
     field = field_of(build_magnet(study).blocks, used.points) + external_field(build_magnet(study),
                                                                                used.points)
     linear = (used.operator @ field.ravel()).reshape(-1, 3)
-    return linear + nonlinear_part(study.instrument, linear, TIME)
+    return with_memory(study.instrument, linear + nonlinear_part(study.instrument, linear, TIME),
+                       TIME)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.loo_residuals import loo_residuals, residual_groups
@@ -13,7 +13,9 @@ from halbach_fe.diagnosis.model_selection import (
     best_factors,
     log_bayes_factors,
     log_evidence,
+    prior_log_odds,
     select_effects,
+    with_wide_priors,
 )
 
 
@@ -175,6 +177,54 @@ def test_shuffled_signatures_break_the_naming():
              for number, candidate in enumerate(candidates)]
     assert {one.candidate.effect for one in select_effects(evidence, wrong)}.isdisjoint(
         {"effect 3", "effect 7"})
+
+
+def moved(amplitudes, parts, shared=(), seed=0):
+    """Evidence of an effect of three amplitudes in units of their priors, and the effect."""
+    generator = np.random.default_rng(seed)
+    signatures = 30 * generator.standard_normal((200, 3)) / np.sqrt(200)
+    residual = signatures @ np.array(amplitudes) + generator.standard_normal(200)
+    return (Marginal.of(np.zeros((200, 1))).evidence(signatures, residual),
+            Candidate("moved", "", (0, 1, 2), parts=parts, shared=shared))
+
+
+ALL_PARTS = ((0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2))
+
+
+def test_an_effect_competes_by_its_parts():
+    """The mean evidence of all parts, each with the price of its own amplitudes only."""
+    evidence, effect = moved((0.0, 0.0, 1.0), ALL_PARTS)
+    parts = [log_bayes_factors(evidence, [Candidate("moved", "", part)])[0] for part in ALL_PARTS]
+    factor, = log_bayes_factors(evidence, [effect])
+    assert factor == pytest.approx(special.logsumexp(parts) - np.log(7))
+    assert factor > parts[-1]  # of all amplitudes, two of which are not needed
+    assert log_evidence(evidence, [effect]) == pytest.approx(
+        log_evidence(evidence, [Candidate("moved", "", (2,))]) - np.log(7), abs=1e-6)
+    fit = with_wide_priors(evidence, [effect]).fit(effect.free)
+    alone = evidence.fit([2])
+    assert fit.mean == pytest.approx([0, 0, alone.mean[0]], abs=1e-6)
+    assert fit.covariance[2, 2] == pytest.approx(alone.covariance[0, 0])
+    # the negative control: all that moved is free
+    evidence, effect = moved((1.0, -1.0, 1.0), ALL_PARTS)
+    assert np.abs(with_wide_priors(evidence, [effect]).fit(effect.free).mean).min() > 0.5
+
+
+@pytest.mark.parametrize(("amplitudes", "named"), [((0.0, 0, 1.0), False), ((0.5, 0, 1.0), True)])
+def test_what_effects_share_names_none_of_them(amplitudes, named):
+    """A gap with a common shift: the shift alone is no gap, and its own effect is named."""
+    evidence, gap = moved(amplitudes, ((0,), (0, 2)), shared=(2,))
+    shift = Candidate("shift", "", (2,))
+    found = {one.candidate.effect for one in select_effects(evidence, [gap, shift])}
+    assert ("moved" in found) == named
+    factor, alone = log_bayes_factors(evidence, [gap, shift])
+    assert alone > 100
+    assert (factor > alone) if named else (factor < 0)
+
+
+def test_relative_odds_are_prior_odds():
+    rare = Candidate("rare", "", (0,), relative_odds=0.1)
+    usual, fewer = prior_log_odds([Candidate("usual", "", (1,)), rare])
+    assert usual - fewer == pytest.approx(np.log(10))
 
 
 def test_fewer_columns_have_the_same_covariance(generator):

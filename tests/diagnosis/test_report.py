@@ -121,6 +121,9 @@ def test_verdicts(flat):
     huge = replace(one, values=one.values * 30 / usual)
     assert "(30 times)" in verdict(replace(found, identified=(huge,)))
     assert answer(replace(found, identified=(huge,))).trust.startswith("Only in part. ")
+    for ratio, said in ((8, "Yes. "), (12, "Only in part. ")):
+        assert answer(replace(found, identified=(replace(
+            one, values=one.values * ratio / usual),))).trust.startswith(said)
     assert answer(replace(found, unknown=unknown)).trust.startswith("No. ")
     assert answer(replace(found, after=found.before)).trust.startswith("No. ")
     assert answer(found).trust.startswith("Yes. ")
@@ -132,6 +135,12 @@ def test_verdicts(flat):
     assert "infer" in besides.command
     assert "Far larger" not in verdict(found)
     assert "had not converged" in verdict(replace(found, converged=False))
+    assert not answer(replace(found, converged=False)).sound
+    earlier = answer(replace(found, rounds=5, answer=2))  # later rounds predict worse
+    assert "of which round 2 predicts held-out readings best" in earlier.trust
+    assert not earlier.sound
+    assert earlier.command.startswith("halbach-fe diagnose")
+    assert answer(replace(found, converged=False, uncompared=3)).sound  # the time was up
     assert "had not converged" not in verdict(found)
     many = verdict(replace(found, identified=found.identified[:1] * MAX_EFFECTS))
     assert "a fit rather than a diagnosis" in many
@@ -160,6 +169,15 @@ def test_verdicts(flat):
     assert "Measure the same map 2 times in all" in text
     assert diagnosis_summary(doubt)["verdict"] == "suspected"
     assert diagnosis_summary(doubt)["suspected"][0]["effects"] == {"gain_x": 0.6, "gain_y": 0.3}
+    assert diagnosis_summary(doubt)["suspected"][0]["not_named"] == "odds"
+    for reason, said in (("which", "the map does not tell which"), ("impossible", "no valid study"),
+                         ("roughly", "only estimated"), ("dropped", "dropped it again")):
+        text = verdict(replace(nothing, suspected=(replace(
+            suspicion, probability=1 - 1e-5, reason=reason),)))
+        assert said in text
+        assert "(odds over 1000 : 1)" in text
+        assert "too little" not in text
+        assert ("Measure the same map" in text) == (reason == "which")
     fine = replace(found.before, prior_conflict=1.0)
     assert verdict(replace(nothing, before=fine, after=fine)).startswith("Nothing is missing")
     assert "Yes: the readings are explained" in verdict(replace(nothing, before=fine, after=fine))

@@ -110,6 +110,8 @@ def test_without_the_competition_false_names_appear(small, diagnosed, monkeypatc
     data, _ = simulate_unlisted(small, 3, UNLISTED[3])
     monkeypatch.setattr(module, "named_effects", lambda *given: given[3])
     monkeypatch.setattr(module, "MAX_ROUNDS", 2)  # it would not come to rest
+    monkeypatch.setattr(module._Round, "gives_way", False)
+    monkeypatch.setattr(module, "WORSE", np.inf)  # held-out readings are not heard either
     assert false_names(diagnosed(small, data))
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -130,6 +131,16 @@ class Effect(ABC):
         Whether `apply` puts the whole effect into a study and ignores the first amplitude, since no
         study can contain, for instance, half an iron ring. With such an effect in the model, its
         signature is the difference between the study with it and without it.
+    defining : tuple of str
+        Names of the parameters that give the effect its name: it is named only if one of them is
+        determined away from zero. By default all of them do. The others are shared with effects
+        that have names of their own.
+    is_divisible : bool
+        Whether some of the parameters may be exactly zero, so that the effect competes by its
+        parts, such as a displacement along z alone. A vector that has any direction is not
+        divisible.
+    relative_odds : float
+        Prior odds that the effect is missing, relative to those of other effects.
     """
 
     name: ClassVar[str]
@@ -140,6 +151,28 @@ class Effect(ABC):
     is_binary: ClassVar[bool] = False
     unique: ClassVar[bool] = False
     applied_in_full: ClassVar[bool] = False
+    defining: ClassVar[tuple[str, ...]] = ()
+    is_divisible: ClassVar[bool] = True
+    relative_odds: ClassVar[float] = 1.0
+
+    @property
+    def shared(self) -> tuple[int, ...]:
+        """Numbers of the parameters that do not give the effect its name."""
+        return tuple(number for number, parameter in enumerate(self.parameters)
+                     if self.defining and parameter.name not in self.defining)
+
+    @property
+    def parts(self) -> tuple[tuple[int, ...], ...]:
+        """Sets of parameters, by number, that may be free together while the others are zero.
+
+        Each has a parameter that gives the effect its name.
+        """
+        numbers = range(len(self.parameters))
+        if not self.is_divisible or self.is_binary or self.applied_in_full or len(numbers) < 2:
+            return ()
+        sizes = range(1, len(numbers) + 1)
+        return tuple(part for size in sizes for part in combinations(numbers, size)
+                     if not set(part) <= set(self.shared))
 
     def places(self, study: Study) -> Sequence[Place]:
         """Return the places where the effect can occur; none if the study rules it out."""

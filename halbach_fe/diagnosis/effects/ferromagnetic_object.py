@@ -36,6 +36,7 @@ class FerromagneticObjectEffect(Effect):
     name = "ferromagnetic_object"
     title = "ferromagnetic object near the bore"
     kind = "field"
+    is_divisible = False
     parameters = (
         Parameter("x", "A m2", 3.0), Parameter("y", "A m2", 3.0), Parameter("z", "A m2", 3.0),)
     refinements = tuple(Parameter(f"at {axis}", "m", 0.05, longest_step=0.02) for axis in "xyz")

@@ -27,13 +27,14 @@ class RingGapEffect(Effect):
 
     The rings on the outer side of the gap move away from the magnet's centre; a gap in the middle
     moves both halves by half of it. Which rings have really moved depends on where the others are
-    held. Therefore all rings may in addition have moved together along z.
+    held. Therefore all rings may in addition have moved together along z, which alone is no gap.
     """
 
     name = "ring_gap"
     title = "gap between two rings"
     kind = "field"
     parameters = (Parameter("gap", "m", 2e-4), Parameter("shift", "m", 1e-4))
+    defining = ("gap",)
 
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""

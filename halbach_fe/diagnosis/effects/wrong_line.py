@@ -20,6 +20,7 @@ class WrongLineEffect(InstrumentEffect):
     title = "wrong line of measurement"
     parameters = (
         Parameter("x", "m", 2e-2), Parameter("y", "m", 2e-2), Parameter("z", "m", 2e-2))
+    is_divisible = False  # along one axis it would be no other cause than a displaced mapper
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
