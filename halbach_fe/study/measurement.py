@@ -61,7 +61,7 @@ class Instrument(StudyModel):
     readings before, in the order of the scan: of the last one, or of all with weights that fall by
     a factor e within ``memory_rows`` rows. The reading of a map of |B| is
     ``(1 + gain) |B| + quadratic |B|^2 + cubic |B|^3 + offset + drift t``: the three entries of
-    these keys are equal, those of ``sensor_position_m`` too, and nothing else changes it.
+    these keys are equal, those of ``sensor_position_m`` too; besides, ``memory`` alone changes it.
     """
 
     length_unit_m: Unit = 1.0

@@ -58,8 +58,19 @@ def values(instrument: Instrument, fields: Floats, time: Floats) -> Floats:
         for pair, part in instrument.crosstalk.items():
             if pair[0] == name:
                 value = value + part * seen[COMPONENTS.index(pair[1])]
-        shown.append(value)
+        shown.append(_slow(instrument, value))
     return np.column_stack(shown)
+
+
+def _slow(instrument: Instrument, readings: Floats) -> Floats:
+    """Return what a slow instrument shows (n,) of readings (n,) in the order of the scan."""
+    fall = np.exp(-1 / instrument.memory_rows) if instrument.memory_rows else 0.0
+    earlier = readings[0]  # as if the first reading had always been there
+    shown = []
+    for before, reading in zip(np.append(readings[:1], readings), readings, strict=False):
+        earlier = fall * earlier + (1 - fall) * before
+        shown.append((1 - instrument.memory) * reading + instrument.memory * earlier)
+    return np.array(shown)
 
 
 def columns(axes: Axes, vectors: Floats, unit: float) -> Floats:

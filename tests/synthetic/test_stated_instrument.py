@@ -13,6 +13,7 @@ from halbach_fe.measurement.instrument import (
     nonlinear_part,
     sensor_model,
     sensor_positions,
+    with_memory,
 )
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
@@ -27,7 +28,7 @@ STATED = {
     "gain": [0.01, -0.02, 0.03], "crosstalk": {"xy": 0.004, "zx": -0.006},
     "planar_hall_per_T": [0.01, 0.02, -0.03], "quadratic_per_T": [0.01, 0.0, 0.02],
     "cubic_per_T2": [0.02, -0.01, 0.0], "offset_T": [1e-4, 2e-4, -3e-4],
-    "drift_T": [1e-4, -1e-4, 2e-4]}
+    "drift_T": [1e-4, -1e-4, 2e-4], "memory": 0.02}
 
 
 def field(points):
@@ -35,13 +36,15 @@ def field(points):
     return np.stack([0.3 + 2 * x - z, 0.1 * y + z**2, 0.2 - x * y * 30], axis=-1)
 
 
-@pytest.mark.parametrize("keys", [[key] for key in STATED] + [list(STATED)])
+@pytest.mark.parametrize("keys", [
+    *[[key] for key in STATED], list(STATED), ["memory", "memory_rows"]])
 def test_it_is_what_the_correction_undoes(keys):
     """Two ways of writing the law of `Instrument`: they agree to rounding."""
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     points = np.concatenate([np.column_stack(
         [0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full(8, z)]) for z in (-0.03, 0.0, 0.04)])
-    instrument = Instrument.model_validate({key: STATED[key] for key in keys})
+    instrument = Instrument.model_validate({key: (STATED | {"memory_rows": 3.0})[key]
+                                            for key in keys})
     places = stated_instrument.places(instrument, points)
     np.testing.assert_allclose(places.transpose(1, 0, 2), sensor_positions(instrument, points),
                                rtol=0, atol=1e-15)
@@ -54,7 +57,8 @@ def test_it_is_what_the_correction_undoes(keys):
     rest = np.column_stack([
         nonlinear_part(instrument, stated_instrument.values(turned, np.array([each] * 3), time),
                        time)[:, sensor] for sensor, each in enumerate(seen)])
-    np.testing.assert_allclose(shown, linear + rest, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(shown, with_memory(instrument, linear + rest, time),
+                               rtol=0, atol=1e-14)
     ideal = stated_instrument.values(Instrument(), field(np.array([points] * 3)), time)
     assert np.abs(shown - ideal).max() > 1e-6  # the control: every key changes the readings
 
