@@ -126,6 +126,24 @@ class InstrumentTerms:
 
 
 @dataclass(frozen=True)
+class Amplitudes:
+    """Uncertain amplitudes that were estimated together with the magnetizations.
+
+    Attributes
+    ----------
+    names : tuple of str
+        As in the tables ``[[uncertain]]`` of the study: those of the magnet, then of instruments.
+    change, sd, prior_sd : ndarray, shape (amplitudes,)
+        Change from what the study says, and standard deviations after and before.
+    """
+
+    names: tuple[str, ...]
+    change: Floats
+    sd: Floats
+    prior_sd: Floats
+
+
+@dataclass(frozen=True)
 class Overlap:
     """How one map agrees with what an update by another map alone predicts.
 
@@ -256,6 +274,9 @@ class InferenceResult(ShownInNotebook):
         `halbach_fe.stats.linear_gaussian.LinearPosterior`.
     terms : InstrumentTerms or None
         Terms of the instruments that were estimated with the magnetizations; None if all are known.
+    amplitudes : Amplitudes or None
+        Uncertain amplitudes of the study, see `halbach_fe.study.uncertain.Uncertain`; None if there
+        are none.
     overlaps : tuple of Overlap
         How maps agree where they overlap.
     noise_blocks : tuple of MagnetBlock or None
@@ -298,6 +319,7 @@ class InferenceResult(ShownInNotebook):
     measured_blocks: tuple[str, ...] | None = None
     left_out: float = 0.0
     terms: InstrumentTerms | None = None
+    amplitudes: Amplitudes | None = None
     overlaps: tuple[Overlap, ...] = ()
     noise_blocks: tuple[MagnetBlock, ...] | None = None
     stray_field: StrayField | None = None
