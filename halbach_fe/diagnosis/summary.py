@@ -33,6 +33,7 @@ from halbach_fe.diagnosis.result import (
     Suspicion,
     UnknownCause,
 )
+from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.inference.result import (
     ALL_READINGS,
     COVERAGE_Z,
