@@ -343,6 +343,23 @@ class InferenceResult(ShownInNotebook):
         return self.magnet.study
 
     @property
+    def of_blocks(self) -> InferenceResult:
+        """The result without the uncertain amplitudes of the magnet among its parameters.
+
+        The error bars of the blocks contain them. It serves what moves blocks from slot to slot.
+        """
+        if not self.study.uncertain_of_magnet:
+            return self
+        count = len(self.response.parameters) - len(self.study.uncertain_of_magnet)
+        prior, posterior = (Gaussian(each.mean[:count], np.asarray(each.root)[:count])
+                            for each in (self.prior, self.posterior))
+        response = replace(
+            self.response, matrix=self.response.whole[:, :count],
+            parameters=self.response.parameters[:count], nominal=self.response.nominal[:count])
+        return replace(self, magnet=self.magnet.with_(uncertain=()), prior=prior,
+                       posterior=posterior, response=response)
+
+    @property
     def magnetizations(self) -> xr.Dataset:
         """Nominal magnetizations, and mean and sd of prior and posterior, in A/m by parameter."""
         values = {
