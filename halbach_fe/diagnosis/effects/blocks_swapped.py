@@ -7,18 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.assembly import SHORTLIST
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, place_of, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
-
-SHORTLIST = 40
-"""Number of pairs whose signatures are computed.
-
-All pairs, of which there can be tens of thousands, are ranked by an estimate of their evidence.
-"""
 
 
 class BlocksSwappedEffect(Effect):
