@@ -146,9 +146,9 @@ def turned(polarizations, ring, angle_deg, slots, axis="z"):
 
 def half_a_turn(polarizations, study):
     """One block of ring 2 is turned about its radius."""
-    found, block = polarizations.copy(), build_magnet(study).blocks[15]
+    found, block = polarizations.copy(), build_magnet(study).blocks[13]
     radius = Rotation.from_euler("z", block.angle_deg, degrees=True).apply([1.0, 0, 0])
-    found[15] = Rotation.from_rotvec(np.pi * radius).apply(polarizations[15])
+    found[13] = Rotation.from_rotvec(np.pi * radius).apply(polarizations[13])
     return found
 
 
@@ -168,7 +168,7 @@ def upside_down(polarizations, study):
 
 
 CASES = [
-    (QUADRUPOLE, half_a_turn, "block_put_in_wrongly", "r02s04, half a turn about its radius"),
+    (QUADRUPOLE, half_a_turn, "block_put_in_wrongly", "r02s02, half a turn about its radius"),
     (STEPPED, exchanged, "rings_swapped", "ring 2 and ring 3"),
     (QUADRUPOLE, by_a_slot, "rings_turned", "ring 1 by +1 slot"),
     (SKEW, upside_down, "rings_upside_down", "ring 3 about 90° from x")]

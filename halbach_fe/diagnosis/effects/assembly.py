@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -98,4 +99,18 @@ def _exception(to: MagnetBlock, source: MagnetBlock, turn: Floats) -> BlockExcep
     axes = rotation_matrix((0.0, 0.0, np.radians(to.angle_deg)))
     x, y, z = np.degrees(axes.T @ Rotation.from_matrix(rest).as_rotvec()).round(9).tolist()
     came = None if to is source else (source.ring, source.slot)
-    return BlockException(ring=to.ring, slot=to.slot, mounted_from=came, rotation_deg=(x, y, z))
+    return BlockException(ring=to.ring, slot=to.slot, mounted_from=came, rotation_deg=(x, y, z),
+                          **brought_along(to, source))
+
+
+def brought_along(to: MagnetBlock, source: MagnetBlock) -> dict[str, Any]:
+    """Return the keys of an exception for what a block from another slot has with it: its material.
+
+    They are empty if the material is the same in both slots.
+    """
+    names = ("remanence", "recoil_permeability", "recoil_permeability_across")
+    mine, theirs = ([getattr(block, name) for name in names] for block in (to, source))
+    if mine == theirs or not source.remanence:
+        return {}
+    return {"remanence_T": abs(source.remanence), "recoil_permeability": theirs[1],
+            "recoil_permeability_across": theirs[2]}
