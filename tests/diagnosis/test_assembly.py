@@ -11,9 +11,17 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.search import (
+    NominalSolver,
+    apply_effects,
+    identify_effects,
+    score_hypotheses,
+)
 from halbach_fe.geometry.fitting_turns import turns_in_slot
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.mounting import mountings
+from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
@@ -70,34 +78,47 @@ def field_of_cubes(polarizations, points, moved=0.0):
     return total
 
 
-def named(study, true, session, generator, effects=RIVALS):
-    """Effects, with their places, that a diagnosis names."""
+def selected(study, true, session, generator):
+    """Effects that are selected in the first round of a diagnosis."""
     shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
-    found = diagnose(study, shown, session, effects=effects)
-    assert found.unknown is None
-    return [(one.hypothesis.effect.name, one.place.name) for one in found.identified], found
+    result = infer(build_magnet(study), shown, session)
+    search = score_hypotheses(study, (), result, result.prior.mean, Campaign.of(study, shown),
+                              NominalSolver(session), RIVALS, (), {})
+    return identify_effects(study, search)
+
+
+def names_of(found):
+    """Effects with their places."""
+    return [(one.hypothesis.effect.name, one.place.name) for one in found]
 
 
 def test_a_cube_a_quarter_turn_wrong(session, generator):
+    """In full: the diagnosis, and the study that it proposes."""
     study = mri()
     polarizations = drawn(study, generator)
-    before = polarizations.copy()
     polarizations[16] = Rotation.from_euler("z", 90, degrees=True).apply(polarizations[16])
     true = field_of_cubes(polarizations, POINTS)
-    names, found = named(study, true, session, generator)
-    assert names == [("block_put_in_wrongly", "c16, a quarter turn about z")]
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    found = diagnose(study, shown, session, effects=RIVALS)
+    assert names_of(found.identified) == [("block_put_in_wrongly", "c16, a quarter turn about z")]
     assert found.converged
-    # negative control: all cubes as they should be
-    assert named(study, field_of_cubes(before, POINTS), session.within("clean"), generator)[0] == []
+    assert found.unknown is None
+    assert found.after.prior_conflict < found.after.conflict_limit
+
+
+def test_nothing_is_wrong(session, generator):
+    """The negative control of all cases here."""
+    study = mri()
+    assert not selected(study, field_of_cubes(drawn(study, generator), POINTS), session, generator)
 
 
 def test_a_layer_along_the_axis(session, generator):
     study = mri()
     moved = np.where(np.arange(RINGS * CUBES) // CUBES == 1, 5e-4, 0.0)
     true = field_of_cubes(drawn(study, generator), POINTS, moved)
-    names, found = named(study, true, session, generator)
-    assert names == [("ring_shifted_along", "r02")]
-    (layer,) = found.identified
+    found = selected(study, true, session, generator)
+    assert names_of(found) == [("ring_shifted_along", "r02")]
+    (layer,) = found
     assert abs(layer.values[0] - 5e-4) < 3.5 * layer.sd[0] < 5e-4
 
 
@@ -144,6 +165,19 @@ def turned(polarizations, ring, angle_deg, slots, axis="z"):
     return found
 
 
+def test_equal_moves_are_one():
+    """A ring of a regular order that is upside down is one that is turned, unless the directions
+    of its blocks are those of no slot (the control); if two equal rings are exchanged, nothing
+    changes. Of 4 rings and 2 halves, each has 5 other directions of a quadrupole of 12 slots.
+    """
+    for array, counts in ((QUADRUPOLE, (0, 30, 0)), (SKEW, (0, 30, 36))):
+        study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | array})
+        mean = build_magnet(study).nominal_magnetization
+        found = [len(EFFECTS[name].shortlist(study, mean, np.eye(len(mean)), 0 * mean))
+                 for name in ("rings_swapped", "rings_turned", "rings_upside_down")]
+        assert tuple(found) == counts
+
+
 def half_a_turn(polarizations, study):
     """One block of ring 2 is turned about its radius."""
     found, block = polarizations.copy(), build_magnet(study).blocks[13]
@@ -178,13 +212,21 @@ CASES = [
 def test_assembly_of_rings(array, change, name, place, session, generator):
     study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | array})
     polarizations = change(drawn(study, generator), study)
-    names, found = named(study, field(study, polarizations, POINTS), session, generator)
-    assert names == [(name, place)]
-    assert found.converged
+    found = selected(study, field(study, polarizations, POINTS), session, generator)
+    assert names_of(found) == [(name, place)]
     # the study that is written has the blocks in these places, with what they are known to have
     before = build_magnet(study).nominal_magnetization.reshape(-1, 3)
-    after = build_magnet(found.study)
+    after = build_magnet(apply_effects(study, found))
     expected = change(before, study)
     assert after.nominal_magnetization.reshape(-1, 3) == pytest.approx(expected, abs=1.0)
     mounted = [matrix @ before[number] for number, matrix in mountings(after)]
     assert np.array(mounted) == pytest.approx(expected, abs=1.0)
+
+
+def test_exchanged_blocks_bring_their_remanence_along():
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | STEPPED})
+    effect = EFFECTS["blocks_swapped"]
+    before = build_magnet(study)
+    after = build_magnet(effect.apply(study, Place(1, 2, other=(2, 5)), [1.0]))
+    assert [after.blocks[number].remanence for number in (1, 16)] == [1.12, 1.2]
+    assert [before.blocks[number].remanence for number in (1, 16)] == [1.2, 1.12]

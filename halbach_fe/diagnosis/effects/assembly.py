@@ -24,8 +24,8 @@ SHORTLIST = 40
 """Number of places whose signatures are compared; all of them are ranked by an estimate of their
 evidence."""
 
-NO_CHANGE = 1e-6
-"""Change of a magnetization below which there is none, as a fraction of the largest one."""
+NO_CHANGE = 1e-5
+"""Difference of magnetizations below which there is none, as a fraction of the largest one."""
 
 Sources = tuple[tuple[tuple[int, int], ...], Floats]
 """Number from 0 of every slot that changes, and of the slot from which the block that is there
@@ -44,20 +44,29 @@ class AssemblyEffect(Effect):
     def sources(self, magnet: Magnet, place: Place) -> Sources:
         """Return which blocks are where, and how they are turned."""
 
+    def simpler(self, magnet: Magnet) -> Sequence[Sources]:
+        """Return changes by other effects, which explain a map in place of equal ones of this."""
+        return ()
+
     def shortlist(
         self, study: Study, mean: Floats, information: Floats, score: Floats
     ) -> Sequence[Place]:
         """Return the places of the largest estimated evidence, see `Effect.shortlist`.
 
         The evidence of a known change c of the magnetizations is c' score - c' information c / 2.
+        Of places that change them equally, as far as they are known, the first is returned.
         """
         magnet, size = build_magnet(study), study.dimension
         vectors = mean.reshape(-1, size)
         places, evidence = [], []
+        known = {_rounded(_change(each, vectors), vectors) for each in self.simpler(magnet)}
+        known.add(())  # no change
         for place in self.places(study):
             change = _change(self.sources(magnet, place), vectors)
-            if np.abs(list(change.values())).max() < NO_CHANGE * np.abs(vectors).max():
-                continue  # the same magnet, as far as the prior knows
+            rounded = _rounded(change, vectors)
+            if rounded in known:
+                continue
+            known.add(rounded)
             places.append(place)
             index = (np.array(list(change))[:, None] * size + np.arange(size)).ravel()
             values = np.concatenate(list(change.values()))
@@ -91,6 +100,14 @@ def _change(sources: Sources, magnetizations: Floats) -> dict[int, Floats]:
     size = magnetizations.shape[1]
     return {to: np.asarray(turn[:size, :size] @ magnetizations[source] - magnetizations[to])
             for to, source in pairs}
+
+
+def _rounded(change: dict[int, Floats], vectors: Floats) -> tuple[tuple[int, ...], ...]:
+    """Return the blocks that change, and their changes in units of what counts as none."""
+    unit = NO_CHANGE * float(np.abs(vectors).max())
+    whole = {number: np.rint(value / unit).astype(int) for number, value in change.items()}
+    return tuple((number, *value.tolist()) for number, value in sorted(whole.items())
+                 if np.abs(value).max() > 1)
 
 
 def _exception(to: MagnetBlock, source: MagnetBlock, turn: Floats) -> BlockException:

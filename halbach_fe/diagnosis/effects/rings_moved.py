@@ -13,6 +13,10 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.model import Study
 
 
+KINDS = ("exchanged", "turned", "upside down")
+"""Moves of rings, the simplest first."""
+
+
 class RingsMovedEffect(AssemblyEffect):
     """Whole rings are moved, after which every block fits a slot again."""
 
@@ -24,6 +28,14 @@ class RingsMovedEffect(AssemblyEffect):
     def places(self, study: Study) -> Sequence[Place]:
         """See `Effect.places`."""
         return [Place(words=words) for words in moves_of_rings(build_magnet(study), self.move)]
+
+    def simpler(self, magnet: Magnet) -> Sequence[Sources]:
+        """See `AssemblyEffect.simpler`: a ring of a regular order that is upside down may be equal
+        to one that is turned, and exchanged halves to turned ones.
+        """
+        kinds = KINDS[:KINDS.index(self.move)]
+        return [(move.pairs, np.array(move.turn)) for kind in kinds
+                for move in moves_of_rings(magnet, kind).values()]
 
     def sources(self, magnet: Magnet, place: Place) -> Sources:
         """See `AssemblyEffect.sources`."""
