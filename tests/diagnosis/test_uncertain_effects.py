@@ -7,6 +7,7 @@ import pytest
 import tomlkit
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.api import shim
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
@@ -139,6 +140,10 @@ def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator
     write_inference(result, session.folder)
     stored = read_posterior(result.magnet, session.folder / "posterior.h5")["posterior"]
     np.testing.assert_allclose(stored.covariance, result.posterior.covariance, rtol=1e-9)
+    alone = result.of_blocks  # for what moves blocks
+    assert alone.posterior.covariance == pytest.approx(
+        result.posterior.covariance[:drawn_T.size, :drawn_T.size], rel=1e-9)
+    assert shim(result, session.within("shim"), swaps=1, turns=0).before.orders
     with pytest.raises(MeasurementError, match="uncertain"):
         read_posterior(build_magnet(study.with_(uncertain=())), session.folder / "posterior.h5")
 
