@@ -15,7 +15,6 @@ from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects.base import Parameter
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import WIDE_PRIOR_FROM, WIDE_PRIOR_SD
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.study.model import Study
@@ -36,7 +35,8 @@ def with_uncertain_effects(study: Study, identified: Sequence[IdentifiedEffect])
         found = effect.hypothesis.apply(found, effect.values.tolist())
         before, after = identified[:number], identified[number + 1:]
         for which, parameter in enumerate(effect.parameters):
-            if effect.sd[which] > 0 and not (which == 0 and effect.hypothesis.effect.applied_in_full):
+            is_switch = which == 0 and effect.hypothesis.effect.applied_in_full
+            if effect.sd[which] > 0 and not is_switch:
                 change = _change(study, (before, effect, after), which, parameter)
                 if change:
                     tables.append(Uncertain(

@@ -20,8 +20,8 @@ from halbach_fe.geometry.outline import points_on
 from halbach_fe.study.array import Array
 
 FITS = 0.99
-"""A body whose size is reduced by this factor lies within its slot wherever it fits: slots are wider
-than blocks by about a hundredth, and edges of a block may differ by as much."""
+"""A body whose size is reduced by this factor lies within its slot wherever it fits: slots are
+wider than blocks by about a hundredth, and edges of a block may differ by as much."""
 
 SAME = 1e-3
 """Difference of directions up to which two turns of a block are one."""

@@ -168,8 +168,8 @@ class OpenTerms:
 
 
 AMPLITUDE_STEP = 1e-3
-"""Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its laws
-are linear to 1e-6 over it."""
+"""Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
+laws are linear to 1e-6 over it."""
 
 
 def amplitude_columns(

@@ -73,7 +73,7 @@ def field_of_cubes(polarizations, points, moved=0.0):
     for centre, angle, polarization, shift in zip(centres, angles, polarizations, z, strict=True):
         turn = Rotation.from_euler("z", angle)
         total += magpylib.magnet.Cuboid(
-            position=centre + [0, 0, shift], dimension=[SIDE_M] * 3, orientation=turn,
+            position=centre + np.array([0, 0, shift]), dimension=[SIDE_M] * 3, orientation=turn,
             polarization=turn.inv().apply(polarization)).getB(points)
     return total
 
