@@ -24,13 +24,18 @@ STEP = 1e-3
 """Step of the differences by an amplitude, in its prior standard deviations, see
 `halbach_fe.diagnosis.scene.STEP`."""
 
+DIGITS = 9
+"""Digits of a derivative that differences have, of which rounding leaves no more."""
+
 
 def with_uncertain_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
     """Return a study without some effects, with these at their amplitudes, which stay uncertain.
 
-    Amplitudes that were not fitted (a block is missing or it is not) are exact.
+    Amplitudes that were not fitted (a block is missing or it is not) are exact, but for those of
+    refinements: the place of an object is uncertain too if it was taken from a search.
     """
     found, tables = study, list(study.uncertain)
+    identified = [_with_refinements(effect) for effect in identified]
     for number, effect in enumerate(identified):
         found = effect.hypothesis.apply(found, effect.values.tolist())
         before, after = identified[:number], identified[number + 1:]
@@ -43,6 +48,15 @@ def with_uncertain_effects(study: Study, identified: Sequence[IdentifiedEffect])
                         name=_name(effect, parameter, {one.name for one in tables}),
                         sd=_prior_sd(effect, which, parameter), change=change))
     return found.with_(uncertain=tuple(tables))
+
+
+def _with_refinements(identified: IdentifiedEffect) -> IdentifiedEffect:
+    """Return an effect with the amplitudes of its refinements, which are 0 at its place."""
+    effect = identified.hypothesis.effect
+    missing = [parameter.sd for parameter in (
+        *effect.parameters, *effect.refinements)[len(identified.values):]]
+    return replace(identified, values=np.append(identified.values, 0.0 * np.array(missing)),
+                   sd=np.append(identified.sd, missing))
 
 
 def _prior_sd(effect: IdentifiedEffect, which: int, parameter: Parameter) -> float:
@@ -80,7 +94,7 @@ def _change(
         changes = number_changes(sides[-1][1], sides[0][1])
     except ValueError:
         return {}
-    return {name: change / between for name, change in changes.items()}
+    return {name: float(f"{change / between:.{DIGITS}g}") for name, change in changes.items()}
 
 
 def _name(effect: IdentifiedEffect, parameter: Parameter, taken: set[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import magpylib
 import numpy as np
 import pytest
 import tomlkit
@@ -146,6 +147,30 @@ def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator
     assert shim(result, session.within("shim"), swaps=1, turns=0).before.orders
     with pytest.raises(MeasurementError, match="uncertain"):
         read_posterior(build_magnet(study.with_(uncertain=())), session.folder / "posterior.h5")
+
+
+def test_the_place_of_an_object_has_a_bar(session, generator):
+    document = DOCUMENT | {"array": DOCUMENT["array"] | SHORT}
+    study = parse_study(document)
+    polarizations = drawn(study, generator)
+    at_m, moment = np.array([0.05, 0.19, 0.16]), np.array([0.0, 8.0, 4.0])
+    true = field(study, polarizations, POINTS) + magpylib.misc.Dipole(
+        position=at_m, moment=moment).getB(POINTS)
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    effects = [effect for effect in catalogue()
+               if effect.name in ("ferromagnetic_object", "gain_x")]
+    found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
+    assert [one.hypothesis.effect.name for one in found.identified] == ["ferromagnetic_object"]
+    assert len(found.study.uncertain) == 6  # moment and place
+    chi2, result = update(found.study, shown, polarizations, session.within("update"))
+    assert abs(chi2 - 1) < 4 * np.sqrt(2 / polarizations.size)
+    amplitudes = result.amplitudes
+    (dipole,) = found.study.external.dipoles
+    off = np.concatenate([dipole.moment_A_m2 - moment, dipole.position_m - at_m])
+    assert (np.abs(off + amplitudes.change) < 3.5 * amplitudes.sd).all()
+    # the readings say half of the moment, and three quarters of the place
+    assert (amplitudes.sd < 0.6 * amplitudes.prior_sd).all()
+    check_axis(result, study, polarizations, session)
 
 
 def test_all_laws_of_an_instrument_can_be_uncertain(session, generator):

@@ -12,7 +12,6 @@ from halbach_fe.geometry.fitting_turns import moves_of_rings
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.model import Study
 
-
 KINDS = ("exchanged", "turned", "upside down")
 """Moves of rings, the simplest first."""
 
