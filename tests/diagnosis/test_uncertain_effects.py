@@ -170,7 +170,9 @@ def test_the_place_of_an_object_has_a_bar(session, generator):
     assert (np.abs(off + amplitudes.change) < 3.5 * amplitudes.sd).all()
     # the readings say half of the moment, and three quarters of the place
     assert (amplitudes.sd < 0.6 * amplitudes.prior_sd).all()
-    check_axis(result, study, polarizations, session)
+    beside = study.with_(external__dipoles=[
+        {"position_m": at_m.tolist(), "moment_A_m2": moment.tolist()}])  # its field counts too
+    check_axis(result, beside, polarizations, session)
 
 
 def test_all_laws_of_an_instrument_can_be_uncertain(session, generator):
