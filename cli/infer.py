@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer, observation_of
     from halbach_fe.inference.storage import inference_summary, write_inference
-    from halbach_fe.measurement.campaign import refuse_open_instruments
+    from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
     from halbach_fe.measurement.field_map import refuse_total_field
     from halbach_fe.response.magnetic_axis import magnetic_axis
     from halbach_fe.response.stray_field import stray_field
@@ -64,6 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
         for one in [validation_map, *(data.values() if isinstance(data, dict) else [data])]:
             if one is not None:
                 refuse_total_field(one, "--samples")
+        refuse_uncertain(study, "--samples")
     if arguments.dry_run:
         from halbach_fe.response.resource_estimate import estimate_infer
 

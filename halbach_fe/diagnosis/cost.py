@@ -13,8 +13,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.diagnosis.diagnose import MAX_ROUNDS
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.assembly import SHORTLIST, AssemblyEffect
 from halbach_fe.diagnosis.effects.base import Effect, Place
-from halbach_fe.diagnosis.effects.blocks_swapped import SHORTLIST
 from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
 from halbach_fe.diagnosis.map_pose import MIN_MISFIT_OF_A_POSE, misfits_of
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -112,8 +112,8 @@ def estimate_diagnosis(
         places = campaign.places(effect, study)
         if not places:
             continue
-        signatures += min(len(places), SHORTLIST) if effect.name == "blocks_swapped" else len(
-            places)
+        ranked = effect.name == "blocks_swapped" or isinstance(effect, AssemblyEffect)
+        signatures += min(len(places), SHORTLIST) if ranked else len(places)
         asked = _asked(effect, own, points, places[0])
         if asked:  # all places of an effect need fields of much the same cost
             fields += len(places) * len(asked)

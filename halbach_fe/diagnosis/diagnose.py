@@ -69,6 +69,7 @@ from halbach_fe.diagnosis.search import (
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
 from halbach_fe.diagnosis.summary import place_in_words
+from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.diagnosis.unknown_cause import (
     Judgement,
     describe_unknown,
@@ -314,7 +315,8 @@ def _diagnose(
     limits = detection_limits(update, campaign, search.columns[:, in_model])
     return Diagnosis(
         corrected_study=corrected, before=first[0], after=update,
-        study=changed(identified), identified=identified, unknown=unknown,
+        study=with_position_noise(with_uncertain_effects(corrected, identified), position_noise),
+        identified=identified, unknown=unknown,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         evidence=first[1].evidence, candidates=first[1].candidates,
         groups_before=_groups(first[0], first[1].marginal, first[1].training),

@@ -33,6 +33,7 @@ from halbach_fe.diagnosis.result import (
     Suspicion,
     UnknownCause,
 )
+from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.inference.result import (
     ALL_READINGS,
     COVERAGE_Z,
@@ -201,6 +202,8 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     for effect in diagnosis.identified:
         study = effect.hypothesis.apply(study, effect.values.tolist())
         yield study, note(effect)
+    yield (with_uncertain_effects(diagnosis.corrected_study, diagnosis.identified),
+           "estimated with the blocks")
     yield diagnosis.study, "; ".join(
         f"vibration: {_in_map(one.map)}{1e3 * one.sd_m:.2g} mm, log Bayes factor "
         f"{one.log_bayes_factor:.1f}" for one in diagnosis.position_noise)
@@ -266,6 +269,8 @@ def _rounded(value: float, sd: float) -> str:
 
 def place_in_words(place: Place) -> str:
     """Describe a place in words; of two blocks, both."""
+    if place.words:
+        return place.name
     numbers = [(place.ring, place.slot), *([place.other] if any(place.other) else [])]
     labels = place.labels or ("",) * len(numbers)
     blocks = [block_in_words(ring, slot, label)

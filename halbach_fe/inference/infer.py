@@ -18,20 +18,27 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
     Beside,
     OpenTerms,
+    amplitude_columns,
     joined,
     of_the_first,
     readings_of_field,
 )
 from halbach_fe.inference.overlap import overlaps
 from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
-from halbach_fe.inference.result import InferenceResult, InstrumentTerms, MapPose, Prediction
+from halbach_fe.inference.result import (
+    Amplitudes,
+    InferenceResult,
+    InstrumentTerms,
+    MapPose,
+    Prediction,
+)
 from halbach_fe.inference.same_magnet import distribution_of
 from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.instrument import turn_of
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.block_variation import study_prior, with_variations
+from halbach_fe.response.block_variation import study_prior, with_others
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
@@ -140,6 +147,8 @@ def infer(
     place: _Place | None = None
     share = 1.0
     at = _Estimate.of(magnet, session) if len(open_terms) else None
+    of_instruments = [one for one in magnet.study.uncertain if one.is_of_instrument]
+    field = field_function(magnet, session.within("instrument")) if of_instruments else None
     uncertain = any(one.study.noise is not None and any(one.study.noise.position_sd_m or ())
                     for one in maps)
     estimated: tuple[MagnetBlock, ...] | None = None
@@ -161,14 +170,20 @@ def infer(
         elif at is not None:
             vectors = solved.moved(at, maps, readings)
         model = readings.projected(vectors, session.folder)
-        varying = len(model.parameters) - len(magnet.parameter_names)
-        magnet_prior = prior or (with_variations(of_blocks.gaussian, varying) if of_blocks
-                                 else study_prior(magnet, varying))
+        others = len(model.parameters) - len(magnet.parameter_names)
+        magnet_prior = prior or (with_others(of_blocks.gaussian, magnet, others) if of_blocks
+                                 else study_prior(magnet, others))
         matrix: Rows = model.matrix
         whole_prior = magnet_prior
+        if field is not None:
+            matrix = Beside(matrix, amplitude_columns(
+                with_instruments(magnet.study, maps), field if at is None else at.field, maps,
+                readings))
+            whole_prior = joined(whole_prior, np.zeros(len(of_instruments)),
+                                 np.ones(len(of_instruments)))
         if at is not None:
-            matrix = Beside(model.matrix, open_terms.columns(at.field, maps, readings))
-            whole_prior = joined(magnet_prior, -total, open_terms.sd)
+            matrix = Beside(matrix, open_terms.columns(at.field, maps, readings))
+            whole_prior = joined(whole_prior, -total, open_terms.sd)
         residual = readings.values - model.offset
         # one noise for all updates: what they find is compared by its probability
         error = model.error if error is None else error
@@ -179,8 +194,9 @@ def infer(
             matrix, residual[training], errors.subset(training), whole_prior,
             np.flatnonzero(training))
         whole = update.distribution
-        values, change = np.split(whole.mean, [len(model.parameters)])
-        sd = whole.sd_of(np.hstack([np.zeros((len(change), len(model.parameters))),
+        values, _, change = np.split(
+            whole.mean, np.cumsum([len(model.parameters), len(of_instruments)]))
+        sd = whole.sd_of(np.hstack([np.zeros((len(change), len(whole.mean) - len(change))),
                                     open_terms.counted]))
         if at is not None:
             here = _Place(maps, total, at, change, values - model.nominal,
@@ -220,7 +236,7 @@ def infer(
             f"{update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
     posterior = whole
-    if len(open_terms):
+    if len(open_terms) or of_instruments:
         magnet_prior, posterior = of_the_first([whole_prior, whole], len(model.parameters))
     if magnet.is_nonlinear and not linearized_only:
         _check_linearization(magnet, readings.observation, session, model, posterior.mean,
@@ -242,8 +258,25 @@ def infer(
         terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
                               at_rest, _poses(open_terms, maps, whole))
         if len(open_terms) else None,
+        amplitudes=_amplitudes(magnet.study, whole, len(model.parameters)),
         overlaps=overlaps(matrix, residual, errors, whole_prior, readings),
         noise_blocks=estimated)
+
+
+def _amplitudes(study: Study, posterior: Gaussian, parameters: int) -> Amplitudes | None:
+    """Return what an update found of the uncertain amplitudes of a study.
+
+    Those of the magnet are the last of its ``parameters``, those of instruments come after these.
+    """
+    found = sorted(study.uncertain, key=lambda one: one.is_of_instrument)
+    if not found:
+        return None
+    last = parameters + sum(one.is_of_instrument for one in found)
+    own = slice(last - len(found), last)
+    scale = np.array([one.sd for one in found])
+    rows = np.eye(len(posterior.mean))[own]
+    return Amplitudes(tuple(one.name for one in found), scale * posterior.mean[own],
+                      scale * posterior.sd_of(rows), scale)
 
 
 @dataclass(frozen=True)
@@ -441,12 +474,15 @@ def _check_linearization(
 ) -> None:
     """Warn if the linearization of the iron changes readings of the posterior mean noticeably."""
     own = replace(session, folder=session.folder / "posterior")
+    mean = mean[:len(magnet.parameter_names)]
     if choose_route(magnet, observation.points) == "moments":
         updated = Magnet(magnet.study, with_magnetizations(magnet, mean))
         true = observation.apply(solve_nominal(updated, observation.points, own))
     else:
         true = newton_readings(magnet, observation, own, mean[None])[0]
-    worst = float((np.abs(model.offset + model.matrix @ mean - true) / sigma).max())
+    others = np.zeros(len(model.parameters) - len(mean))
+    linear = model.offset + model.matrix @ np.append(mean, others)
+    worst = float((np.abs(linear - true) / sigma).max())
     if worst > LINEAR_ENOUGH:
         warnings.warn(
             "The iron is linearized about the nominal magnet, which changes a reading of the "

@@ -12,16 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
+import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.inference.readings import Readings
 from halbach_fe.measurement.campaign import ONLY_MAP, Map, with_pivots
-from halbach_fe.measurement.field_map import is_total_field, points_of
+from halbach_fe.measurement.field_map import is_total_field, points_of, refuse_total_field
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     map_time,
+    remove_nonlinear_part,
     sensor_matrix,
     sensor_positions,
     turn_of,
@@ -42,7 +44,9 @@ from halbach_fe.measurement.instrument_terms import (
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.linear_gaussian import Rows
+from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
+from halbach_fe.study.uncertain import shifted
 
 
 @dataclass(frozen=True)
@@ -184,6 +188,57 @@ def _of_total_field(terms: list[str], sd: Floats) -> tuple[list[str], Floats]:
         elif kind in ("crosstalk", "sensor"):
             sd[number] = 0.0
     return found, sd
+
+
+AMPLITUDE_STEP = 1e-3
+"""Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
+laws are linear to 1e-6 over it."""
+
+
+def amplitude_columns(
+    study: Study, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
+) -> Floats:
+    """Return the derivatives (readings, amplitudes) in T by what is uncertain of the instruments.
+
+    They are per standard deviation, see `halbach_fe.study.uncertain.Uncertain`, of what a reading
+    shows less what is subtracted from it.
+
+    Parameters
+    ----------
+    study : Study
+        With the instruments as they are estimated.
+    field : callable
+        See `OpenTerms.columns`.
+    maps : sequence of Map
+    readings : Readings
+    """
+    uncertain = [one for one in study.uncertain if one.is_of_instrument]
+    sides = [[shifted(study, one, sign * AMPLITUDE_STEP * one.sd) for sign in (1, -1)]
+             for one in uncertain]
+    found = []
+    for number, one in enumerate(maps):
+        if uncertain:
+            refuse_total_field(one.data, "`uncertain` of an instrument")
+        data = in_si_and_magnet_axes(one.study.instrument, one.data)
+        points = points_of(data)
+        if one.is_validation:
+            found.append(np.zeros((len(uncertain), len(points), 3)))
+            continue
+        before = sensor_positions(one.study.instrument, points)
+        at_sensors, gradient = field_at_sensors(field, before)
+
+        def off(other: Study, number: int = number, data: xr.Dataset = data,
+                points: Floats = points, before: Floats = before,
+                at_sensors: Floats = at_sensors, gradient: Floats = gradient) -> Floats:
+            """Return what the sensors show, less the values that are read."""
+            own = other.of_map(number).instrument if other.maps else other.instrument
+            away = sensor_positions(own, points) - before
+            return seen(sensor_matrix(own), at_sensors + np.einsum(
+                "nscj,nsj->nsc", gradient, away)) - np.nan_to_num(remove_nonlinear_part(own, data))
+
+        found.append(np.array([(off(more) - off(less)) / (2 * AMPLITUDE_STEP)
+                               for more, less in sides]).reshape(-1, len(points), 3))
+    return readings.observation.read(np.concatenate(found, axis=1)).T
 
 
 def readings_of_field(

@@ -176,6 +176,24 @@ class InstrumentTerms:
 
 
 @dataclass(frozen=True)
+class Amplitudes:
+    """Uncertain amplitudes that were estimated together with the magnetizations.
+
+    Attributes
+    ----------
+    names : tuple of str
+        As in the tables ``[[uncertain]]`` of the study: those of the magnet, then of instruments.
+    change, sd, prior_sd : ndarray, shape (amplitudes,)
+        Change from what the study says, and standard deviations after and before.
+    """
+
+    names: tuple[str, ...]
+    change: Floats
+    sd: Floats
+    prior_sd: Floats
+
+
+@dataclass(frozen=True)
 class Overlap:
     """How one map agrees with what an update by another map alone predicts.
 
@@ -306,6 +324,9 @@ class InferenceResult(ShownInNotebook):
         `halbach_fe.stats.linear_gaussian.LinearPosterior`.
     terms : InstrumentTerms or None
         Terms of the instruments that were estimated with the magnetizations; None if all are known.
+    amplitudes : Amplitudes or None
+        Uncertain amplitudes of the study, see `halbach_fe.study.uncertain.Uncertain`; None if there
+        are none.
     overlaps : tuple of Overlap
         How maps agree where they overlap.
     noise_blocks : tuple of MagnetBlock or None
@@ -348,6 +369,7 @@ class InferenceResult(ShownInNotebook):
     measured_blocks: tuple[str, ...] | None = None
     left_out: float = 0.0
     terms: InstrumentTerms | None = None
+    amplitudes: Amplitudes | None = None
     overlaps: tuple[Overlap, ...] = ()
     noise_blocks: tuple[MagnetBlock, ...] | None = None
     stray_field: StrayField | None = None
@@ -369,6 +391,23 @@ class InferenceResult(ShownInNotebook):
     def study(self) -> Study:
         """The study that was updated."""
         return self.magnet.study
+
+    @property
+    def of_blocks(self) -> InferenceResult:
+        """The result without the uncertain amplitudes of the magnet among its parameters.
+
+        The error bars of the blocks contain them. It serves what moves blocks from slot to slot.
+        """
+        if not self.study.uncertain_of_magnet:
+            return self
+        count = len(self.response.parameters) - len(self.study.uncertain_of_magnet)
+        prior, posterior = (Gaussian(each.mean[:count], np.asarray(each.root)[:count])
+                            for each in (self.prior, self.posterior))
+        response = replace(
+            self.response, matrix=self.response.whole[:, :count],
+            parameters=self.response.parameters[:count], nominal=self.response.nominal[:count])
+        return replace(self, magnet=self.magnet.with_(uncertain=()), prior=prior,
+                       posterior=posterior, response=response)
 
     @property
     def magnetizations(self) -> xr.Dataset:

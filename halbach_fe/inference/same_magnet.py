@@ -37,7 +37,7 @@ def check_same_magnet(
         If any key that describes the magnet differs, or data behind such a key have changed.
     """
     own = magnet.nominal_magnetization
-    if magnet.study.prior.variation_sd:  # amplitudes of variations are 0 in the nominal magnet
+    if magnet.study.prior.variation_sd or magnet.study.uncertain_of_magnet:  # amplitudes are 0
         own = np.concatenate([own, np.zeros(max(0, len(nominal) - len(own)))])
     key = next(iter(differences(magnet_description(magnet.study), magnet_description(study))), None)
     if key is None and (own.shape != nominal.shape
@@ -90,7 +90,8 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
         raise MeasurementError(must_be(
             name, f"study {magnet.name}", "a Gaussian", f"a {type(distribution).__name__}"))
     variations = Variations.of(magnet)
-    expected = len(magnet.nominal_magnetization) + (len(variations.names) if variations else 0)
+    expected = (len(magnet.nominal_magnetization) + (len(variations.names) if variations else 0)
+                + len(magnet.study.uncertain_of_magnet))
     if len(distribution.mean) != expected:
         raise MeasurementError(must_be(
             name, f"study {magnet.name}", f"of the {expected} parameters of its magnet",

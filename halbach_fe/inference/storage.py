@@ -179,6 +179,11 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
             for name, change, sd, prior_sd in zip(
                 update.terms.names, update.terms.change, update.terms.sd, update.terms.prior_sd,
                 strict=True)},
+        "uncertain": None if update.amplitudes is None else {
+            name: {"change": float(change), "sd": float(sd), "prior_sd": float(prior_sd)}
+            for name, change, sd, prior_sd in zip(
+                update.amplitudes.names, update.amplitudes.change, update.amplitudes.sd,
+                update.amplitudes.prior_sd, strict=True)},
         "poses": None if update.terms is None else {
             pose.name: {key: value for key, value in asdict(pose).items() if key != "name"}
             for pose in update.terms.poses},

@@ -367,6 +367,15 @@ def refuse_open_instruments(study: Study, verb: str) -> None:
             "State the instrument that halbach-fe infer found (study.updated.toml) without it."))
 
 
+def refuse_uncertain(study: Study, verb: str) -> None:
+    """Raise a StudyError if amplitudes are to be estimated, where that cannot be."""
+    if study.uncertain:
+        raise StudyError(must_be(
+            "`uncertain`", f"study {study.name}", f"left out, for {verb}", "a table",
+            "Remove the tables [[uncertain]]: the amplitudes are then exactly what the study "
+            "says."))
+
+
 def _seen_from(study: Study, first: Map) -> Floats:
     """Return the middle (3,) in m of the first map on a stage, in the coordinates of another."""
     one, other = first.study.instrument, study.instrument

@@ -25,12 +25,13 @@ COLOURS = (POSTERIOR, SECOND, MEASURED, PUBLISHED, PRIOR)
 
 
 def term_table(result: InferenceResult) -> list[dict[str, str]]:
-    """Return rows of text: what the update says about the instruments; none if all are known."""
-    if result.terms is None:
-        return []
+    """Return rows of text: what the update says about the instruments, and about uncertain
+    amplitudes; none if all are known.
+    """
     rows = []
-    for name, change, sd, prior_sd in zip(result.terms.names, result.terms.change, result.terms.sd,
-                                          result.terms.prior_sd, strict=True):
+    terms = [row for found in (result.terms, result.amplitudes) if found is not None
+             for row in zip(found.names, found.change, found.sd, found.prior_sd, strict=True)]
+    for name, change, sd, prior_sd in terms:
         owner, _, term = name.rpartition(".")
         what, _, unit = term.rpartition("_")
         shown, factor = UNITS.get(unit, ("%", 100.0))

@@ -43,7 +43,11 @@ REMEDIES = {
     "block_flipped": "the block of {} is the wrong way round or wrongly magnetized: turn it, or "
                      "replace it by one that is not",
     "block_missing": "put the missing block of {} in",
-    "blocks_swapped": "exchange the blocks of {}"}
+    "block_put_in_wrongly": "turn the block back: {}",
+    "blocks_swapped": "exchange the blocks of {}",
+    "rings_swapped": "exchange {}",
+    "rings_turned": "turn back {}",
+    "rings_upside_down": "turn {} over"}
 """What to do at the magnet about an effect that is an error of assembly, by the effect's name."""
 
 

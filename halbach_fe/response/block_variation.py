@@ -25,6 +25,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
+from halbach_fe.response.uncertain_amplitudes import with_amplitudes
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
 
 if TYPE_CHECKING:
@@ -189,11 +190,20 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
 
 
 def study_prior(magnet: Magnet, count: int) -> Gaussian:
-    """Return the study's prior of all parameters in A/m, ``count`` of which are variations."""
+    """Return the study's prior of all parameters in A/m, ``count`` of which are no magnetizations.
+
+    These are the amplitudes of variations, followed by uncertain amplitudes of the magnet.
+    """
     settings = magnet.study.prior
-    return with_variations(nominal_prior(
+    return with_others(nominal_prior(
         magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
-        settings.direction_sd_deg, settings.common_mode_sd), count)
+        settings.direction_sd_deg, settings.common_mode_sd), magnet, count)
+
+
+def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:
+    """Return a prior of magnetizations, and ``count`` other parameters, see `study_prior`."""
+    return with_amplitudes(with_variations(
+        prior, count - len(magnet.study.uncertain_of_magnet)), magnet)
 
 
 def with_variations(prior: Gaussian, count: int) -> Gaussian:

@@ -17,6 +17,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.block_variation import Variations
+from halbach_fe.response.uncertain_amplitudes import shared_deviations, vacuum_changes
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
 from halbach_fe.study.materials import MU_0
 
@@ -46,16 +47,23 @@ class Deviations:
     def count(self) -> int:
         """The number of parameters."""
         varying = 0 if self.variations is None else len(self.variations.names)
-        return len(self.magnet.parameter_names) + varying
+        return (len(self.magnet.parameter_names) + varying
+                + len(self.magnet.study.uncertain_of_magnet))
 
     def field(self, deviations: Floats, points: Floats) -> Floats:
         """Return B (n, 3) in T at points (n, 3) in m outside of the blocks.
 
         ``deviations`` (parameters,) are those of the magnetizations in A/m, followed by the
-        amplitudes of variations.
+        amplitudes of variations and of what is uncertain.
         """
-        uniform, amplitudes = np.split(deviations, [len(self.magnet.parameter_names)])
+        first = len(self.magnet.parameter_names)
+        last = self.count - len(self.magnet.study.uncertain_of_magnet)
+        uniform, amplitudes, uncertain = np.split(deviations, [first, last])
+        if uncertain.any():
+            uniform = uniform - shared_deviations(self.magnet) @ uncertain
         found = field_of(with_magnetizations(self.magnet, uniform), points)
+        if uncertain.any():
+            found = found + np.tensordot(uncertain, vacuum_changes(self.magnet, points), 1)
         if self.variations is not None:
             found = found + self.variations.field(amplitudes, points)
         return found
@@ -88,9 +96,13 @@ class Deviations:
                  for block, unit in zip(self.magnet.blocks, unit_fields(
                      self.magnet.blocks, points), strict=True)]
         matrix = np.concatenate(found, axis=2).reshape(3 * len(points), -1)
-        if self.variations is None:
-            return matrix
-        return np.hstack([matrix, self.variations.fields(points).reshape(3 * len(points), -1)])
+        columns = [matrix]
+        if self.variations is not None:
+            columns.append(self.variations.fields(points).reshape(3 * len(points), -1))
+        if self.magnet.study.uncertain_of_magnet:
+            changes = vacuum_changes(self.magnet, points).reshape(-1, 3 * len(points))
+            columns.append(changes.T - matrix @ shared_deviations(self.magnet))
+        return np.hstack(columns)
 
 
 def with_magnetizations(magnet: Magnet, values: Floats) -> tuple[MagnetBlock, ...]:

@@ -34,6 +34,11 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import Variations
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.uncertain_amplitudes import (
+    amplitude_names,
+    field_changes,
+    shared_deviations,
+)
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.formulation_choice import (
@@ -207,12 +212,15 @@ def response_matrix(
     built = _read(path, key)
     if built is not None:
         return built
+    changes = np.zeros((0, len(observation)))
+    if magnet.study.uncertain_of_magnet:
+        changes = observation.apply(field_changes(magnet, observation.points, session))
     if similar is not None and _serves(similar, magnet, observation.points, session):
-        built = _of_similar(magnet, similar, observation, session, _beside(path, key))
+        built = _of_similar(magnet, similar, observation, session, _beside(path, key), changes)
     if built is None:
         parts = finite_element_part(magnet, observation.points, session)
         error = reading_errors(magnet, observation, parts, error_bar_session(session))
-        built = _assemble(magnet, observation, parts, error, _beside(path, key))
+        built = _assemble(magnet, observation, parts, error, _beside(path, key), changes)
         check_superposition(built.superposition_error, parts.superposition_tolerance)
     _write(path, key, built)
     return built
@@ -231,40 +239,51 @@ def _serves(similar: Magnet, magnet: Magnet, points: Floats, session: Session) -
 
 
 def _of_similar(
-    magnet: Magnet, similar: Magnet, observation: Observation, session: Session, path: Path
+    magnet: Magnet, similar: Magnet, observation: Observation, session: Session, path: Path,
+    changes: Floats
 ) -> Response | None:
-    """Return the response with columns of a similar magnet, None if they do not suffice."""
+    """Return the response with columns of a similar magnet, None if they do not suffice.
+
+    ``path`` and ``changes`` are those of `_assemble`.
+    """
     own = session.within("similar")
     parts = finite_element_part(similar, observation.points, own)
     error = reading_errors(similar, observation, parts, error_bar_session(own))
     nominal = finite_element_part(magnet, observation.points, session, columns=False).nominal
     built = _assemble(magnet, observation, replace(
         parts, nominal=nominal, along_nominal=nominal, sources=magnet.blocks, for_deviations=True),
-        error, path)
+        error, path, changes)
     return replace(built, of_similar=True) if (
         built.superposition_error <= SIMILAR_TOLERANCE) else None
 
 
 def _assemble(
-    magnet: Magnet, observation: Observation, parts: ElementFields, error: Floats, path: Path
+    magnet: Magnet, observation: Observation, parts: ElementFields, error: Floats, path: Path,
+    changes: Floats
 ) -> Response:
     """Return the response from its finite-element part.
 
     ``error`` (readings,) in T is the error bar of the finite elements. A large matrix is stored at
-    ``path``.
+    ``path``. ``changes`` (amplitudes, readings) in T are those of uncertain amplitudes.
     """
     blocks, dimension = magnet.blocks, magnet.dimension
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
 
     variations = Variations.of(magnet)
     names = magnet.parameter_names + (variations.names if variations else ())
+    names += amplitude_names(magnet)
+    shared = shared_deviations(magnet) if len(changes) else np.zeros((0, 0))
     shape = len(observation), len(names)
 
     def rows() -> Iterator[Floats]:
         for part in row_slices(*shape, len(observation)):
             matrix, total[part], magnitude[part] = _rows(magnet, observation, parts, part)
-            yield matrix if variations is None else np.hstack([
-                matrix, variations.readings(observation, part)])
+            columns = [matrix]
+            if variations is not None:
+                columns.append(variations.readings(observation, part))
+            if len(changes):
+                columns.append(changes[:, part].T - matrix @ shared)
+            yield matrix if len(columns) == 1 else np.hstack(columns)
 
     matrix = _whole(rows(), shape) if 8 * np.prod(shape) <= LOADED_BYTES else StoredMatrix.of(
         rows(), shape, path)
@@ -362,6 +381,9 @@ def _key(
     if magnet.study.prior.variation_sd:
         relevant["variation"] = [magnet.study.prior.variation_sd,
                                  magnet.study.prior.variation_length_m]
+    if magnet.study.uncertain_of_magnet:
+        relevant["uncertain"] = [one.model_dump(mode="json")
+                                 for one in magnet.study.uncertain_of_magnet]
     digest = hashlib.sha256(json.dumps(relevant, sort_keys=True).encode())
     curve = magnet.curve  # the study may only name the steel, whose data may change
     if curve is not None:

@@ -33,6 +33,7 @@ from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationS
 from halbach_fe.study.shim_tray import ShimTray
 from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
+from halbach_fe.study.uncertain import Uncertain, check_uncertain
 
 MAGNET_KEYS = {"dimension", "array", "iron_ring", "iron"}
 """Keys of a study that describe its magnet: blocks and iron."""
@@ -54,6 +55,7 @@ class Study(StudyModel):
     instrument: Instrument = Instrument()
     instrument_sd: InstrumentSd = InstrumentSd()
     maps: tuple[MapSettings, ...] = ()
+    uncertain: tuple[Uncertain, ...] = ()
     mesh: MeshSettings
     open_boundary: OpenBoundary = OpenBoundary()
     solver: SolverSettings = SolverSettings()
@@ -110,6 +112,7 @@ class Study(StudyModel):
         if self.prior.variation_sd and (self.dimension == 2 or self.iron_ring or self.iron):
             raise ValueError("prior.variation_sd needs a 3D study without iron")
         self._check_maps()
+        check_uncertain(self)
         held_out, regions = self.inference.held_out, self.noise.regions if self.noise else ()
         by_component = {
             "noise.regions": any(set(region.components) != set(COMPONENTS) for region in regions),
@@ -169,7 +172,13 @@ class Study(StudyModel):
         own = {key: getattr(one, key) for key in (
             "instrument", "instrument_sd", "noise", "inference") if getattr(one, key) is not None}
         values = {name: getattr(self, name) for name in type(self).model_fields}
-        return type(self).model_validate(values | own | {"maps": ()})
+        of_magnet = tuple(each for each in self.uncertain if not each.is_of_instrument)
+        return type(self).model_validate(values | own | {"maps": (), "uncertain": of_magnet})
+
+    @property
+    def uncertain_of_magnet(self) -> tuple[Uncertain, ...]:
+        """Uncertain amplitudes of the magnet, which are parameters of its posterior."""
+        return tuple(one for one in self.uncertain if not one.is_of_instrument)
 
     def with_tables(self, tables: Mapping[str, Mapping[str, Any]]) -> Study:
         """Return the study with other tables of some of its maps, by the names of the maps."""
@@ -199,6 +208,8 @@ def magnet_description(study: Study) -> dict[str, Any]:
     if study.prior.variation_sd:
         found["prior"] = {"variation_sd": study.prior.variation_sd,
                           "variation_length_m": study.prior.variation_length_m}
+    if study.uncertain_of_magnet:  # parameters too
+        found["uncertain"] = [one.model_dump(mode="json") for one in study.uncertain_of_magnet]
     return found
 
 

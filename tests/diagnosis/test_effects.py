@@ -27,6 +27,9 @@ TIME = np.linspace(0, 1, len(POINTS))
 EFFECTS = {effect.name: effect for effect in catalogue()}
 SOLVED = {"iron_ring", "iron_saturation", "knee", "recoil_permeability",
           "recoil_permeability_across"}
+EQUAL = {"rings_swapped"}
+"""Changes nothing in a magnet of equal rings; see test_assembly.py."""
+
 STEP = 0.05
 """Of the amplitudes' standard deviations: as far as most effects are linear."""
 
@@ -50,7 +53,7 @@ def nominal():
                          lambda study: field_of(build_magnet(study).blocks, POINTS))
 
 
-@pytest.mark.parametrize("name", sorted(EFFECTS.keys() - SOLVED))
+@pytest.mark.parametrize("name", sorted(EFFECTS.keys() - SOLVED - EQUAL))
 def test_signatures_are_derivatives(name, nominal):
     effect = EFFECTS[name]
     places = effect.places(STUDY)
@@ -116,7 +119,9 @@ def test_changes_of_magnetizations_have_the_signature_in_vacuum(nominal):
     found = {name: effect for name, effect in EFFECTS.items()
              if any(effect.magnetization_change(nominal, place) is not None
                     for place in effect.places(STUDY)[:1])}
-    assert set(found) == {"block_missing", "block_flipped", "blocks_swapped", "block_demagnetized"}
+    assert set(found) == {
+        "block_missing", "block_flipped", "blocks_swapped", "block_demagnetized",
+        "block_put_in_wrongly", "rings_swapped", "rings_turned", "rings_upside_down"}
     for effect in found.values():
         place = effect.places(STUDY)[5]
         field = sum(nominal.field_with(block, change) for block, change in

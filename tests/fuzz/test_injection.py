@@ -53,6 +53,10 @@ FIELDS = {
     "maps.stage": lambda text: {"maps": [{"name": "a", "file": "map.csv", "stage": text}]},
     "shim_tray.magnets.name": lambda text: {"shim_tray": tray(name=text, remanence_T=1.0)},
     "shim_tray.magnets.material": lambda text: {"shim_tray": tray(material=text)},
+    "uncertain.name": lambda text: {"uncertain": [
+        {"name": text, "sd": 0.1, "change": {"array.remanence_T": 1.0}}]},
+    "uncertain.change": lambda text: {"uncertain": [
+        {"name": "a", "sd": 0.1, "change": {text: 1.0}}]},
     "array.ring.material": lambda text: {"array__ring": [{"material": text}]},
 }
 """All free text of a study, with what makes a study of it; names of files have tests below."""
@@ -76,7 +80,7 @@ def test_there_is_no_other_text():
         "Study.name", "Study.description", "NoiseRegion.name", "Prior.types", "SteelCurve.name",
         "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file", "MapSettings.name",
         "MapSettings.file", "MapSettings.probe", "MapSettings.stage", "ShimMagnet.name",
-        "ShimMagnet.material"}
+        "ShimMagnet.material", "Uncertain.name", "Uncertain.change"}
 
 
 def hostile_studies():
@@ -112,7 +116,7 @@ def test_nothing_of_a_study_becomes_code_of_getdp(staged):
             content = content.replace(f"study {study.name},", "study dipole,")
             assert content == harmless[name], (field, text)
     assert taken == {"name", "description", "noise.regions.name", "prior.types", "maps.name",
-                     "maps.probe", "maps.stage", "shim_tray.magnets.name"}
+                     "maps.probe", "maps.stage", "shim_tray.magnets.name", "uncertain.name"}
     assert refused == set(FIELDS)
     for payload in ("}; Exit; Group {", "../../../etc/passwd", "a\nb", "<< 7*7 >>"):
         with pytest.raises(StudyError):

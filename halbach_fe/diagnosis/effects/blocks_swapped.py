@@ -7,18 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.assembly import SHORTLIST, brought_along
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, place_of, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
-
-SHORTLIST = 40
-"""Number of pairs whose signatures are computed.
-
-All pairs, of which there can be tens of thousands, are ranked by an estimate of their evidence.
-"""
 
 
 class BlocksSwappedEffect(Effect):
@@ -97,10 +92,13 @@ class BlocksSwappedEffect(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`."""
-        here = place.ring, place.slot
+        here, magnet = (place.ring, place.slot), build_magnet(study)
+        one, other = (magnet.blocks[magnet.number_of(*slot)] for slot in (here, place.other))
         return with_exceptions(study, [
-            BlockException(ring=here[0], slot=here[1], mounted_from=place.other),
-            BlockException(ring=place.other[0], slot=place.other[1], mounted_from=here)])
+            BlockException(ring=here[0], slot=here[1], mounted_from=place.other,
+                           **brought_along(one, other)),
+            BlockException(ring=place.other[0], slot=place.other[1], mounted_from=here,
+                           **brought_along(other, one))])
 
 
 def _kind(block: MagnetBlock) -> tuple[float, float]:

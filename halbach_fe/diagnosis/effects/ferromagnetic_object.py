@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
@@ -53,8 +54,10 @@ class FerromagneticObjectEffect(Effect):
         outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
         angles = 2 * np.pi * np.arange(12) / 12
         axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights if abs(z) > half + 0.1]
-        return axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
-                       for r, z in ends + outside for a in angles]
+        found = axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
+                        for r, z in ends + outside for a in angles]
+        inside = magnet.contains(np.array([place.at_m for place in found]))
+        return [place for place, within in zip(found, inside, strict=True) if not within]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         """See `Effect.signature`."""
@@ -71,7 +74,18 @@ class FerromagneticObjectEffect(Effect):
         return np.array([*fields, *slopes])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        """See `Effect.apply`."""
+        """See `Effect.apply`.
+
+        Raises
+        ------
+        StudyError
+            If the object is inside a block or iron, where there is no room for it: what a dipole
+            there explains is an error of that block.
+        """
+        if build_magnet(study).contains(_at(place, values)[None]).any():
+            raise StudyError(must_be(
+                "the ferromagnetic object", f"study {study.name}", "outside of blocks and iron",
+                f"{place.name}, inside"))
         x, y, z = map(float, values[:3])
         position_x, position_y, position_z = _at(place, values).tolist()
         dipole = PointDipole(position_m=(position_x, position_y, position_z), moment_A_m2=(x, y, z))

@@ -1,0 +1,232 @@
+"""Errors of assembly: whole blocks, rings and layers in wrong orientations, slots and places."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.errors import StudyError
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.search import (
+    NominalSolver,
+    apply_effects,
+    identify_effects,
+    score_hypotheses,
+)
+from halbach_fe.geometry.fitting_turns import turns_in_slot
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.mounting import mountings
+from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.study.reader import parse_study
+from tests.conftest import circle
+from tests.diagnosis.campaign import drawn, field
+from tests.support.cuboids import DOCUMENT, NOISE_T
+
+EFFECTS = {effect.name: effect for effect in catalogue()}
+RIVALS = [EFFECTS[name] for name in (
+    "background", "block_demagnetized", "block_displaced", "block_flipped", "block_missing",
+    "block_put_in_wrongly", "block_turned", "blocks_swapped", "ferromagnetic_object", "gain_x",
+    "mapper_translation", "ring_shifted", "ring_shifted_along", "ring_twisted", "rings_swapped",
+    "rings_turned", "rings_upside_down")]
+POINTS = np.vstack([circle(0.065, 12, z, 0.1) for z in np.linspace(-0.15, 0.15, 11)])
+
+QUADRUPOLE = {"multipole_order": 2, "rings": 4, "ring_length_m": 0.045}
+STEPPED = {"rings": 3, "remanence_T": 1.2, "ring": [
+    {"remanence_T": remanence} for remanence in (1.2, 1.12, 1.2)]}
+
+SKEW = QUADRUPOLE | {"first_magnetization_angle_deg": 225.0}
+"""Its easy axes are 45 deg from the radius in the middle of a pole: turned over, it is another."""
+
+SIDE_M, RINGS, CUBES = 0.025, 4, 12
+
+
+def cubes():
+    """Centres (n, 3) in m and angles (n,) in rad of the easy axes of rings of cubes."""
+    angle = np.tile(2 * np.pi * np.arange(CUBES) / CUBES, RINGS)
+    z = np.repeat(0.04 * (np.arange(RINGS) - (RINGS - 1) / 2), CUBES)
+    return np.column_stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), z]), 2 * angle
+
+
+def mri():
+    """A study of rings of free cubes, along their easy axes."""
+    centres, angles = cubes()
+    x, y, z = centres.T.tolist()
+    count = len(angles)
+    size = [SIDE_M] * count
+    return parse_study(DOCUMENT | {"name": "mri", "array": {"free_blocks": {
+        "name": [f"c{k}" for k in range(count)], "shape": ["cuboid"] * count, "x_m": x, "y_m": y,
+        "z_m": z, "rotation_z_deg": np.degrees(angles).tolist(), "size_x_m": size,
+        "size_y_m": size, "size_z_m": size, "remanence_T": [1.3] * count}}})
+
+
+def field_of_cubes(polarizations, points, moved=0.0):
+    """B (n, 3) in T by magpylib; ``moved`` (cubes,) in m along z."""
+    centres, angles = cubes()
+    total = np.zeros(points.shape)
+    z = moved + np.zeros(len(angles))
+    for centre, angle, polarization, shift in zip(centres, angles, polarizations, z, strict=True):
+        turn = Rotation.from_euler("z", angle)
+        total += magpylib.magnet.Cuboid(
+            position=centre + np.array([0, 0, shift]), dimension=[SIDE_M] * 3, orientation=turn,
+            polarization=turn.inv().apply(polarization)).getB(points)
+    return total
+
+
+def selected(study, true, session, generator):
+    """Effects that are selected in the first round of a diagnosis."""
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    result = infer(build_magnet(study), shown, session)
+    search = score_hypotheses(study, (), result, result.prior.mean, Campaign.of(study, shown),
+                              NominalSolver(session), RIVALS, (), {})
+    return identify_effects(study, search)
+
+
+def names_of(found):
+    """Effects with their places."""
+    return [(one.hypothesis.effect.name, one.place.name) for one in found]
+
+
+def test_a_cube_a_quarter_turn_wrong(session, generator):
+    """In full: the diagnosis, and the study that it proposes."""
+    study = mri()
+    polarizations = drawn(study, generator)
+    polarizations[16] = Rotation.from_euler("z", 90, degrees=True).apply(polarizations[16])
+    true = field_of_cubes(polarizations, POINTS)
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    found = diagnose(study, shown, session, effects=RIVALS)
+    assert names_of(found.identified) == [("block_put_in_wrongly", "c16, a quarter turn about z")]
+    assert found.converged
+    assert found.unknown is None
+    assert found.after.prior_conflict < found.after.conflict_limit
+
+
+def test_nothing_is_wrong(session, generator):
+    """The negative control of all cases here."""
+    study = mri()
+    assert not selected(study, field_of_cubes(drawn(study, generator), POINTS), session, generator)
+
+
+def test_a_layer_along_the_axis(session, generator):
+    study = mri()
+    moved = np.where(np.arange(RINGS * CUBES) // CUBES == 1, 5e-4, 0.0)
+    true = field_of_cubes(drawn(study, generator), POINTS, moved)
+    found = selected(study, true, session, generator)
+    assert names_of(found) == [("ring_shifted_along", "r02")]
+    (layer,) = found
+    assert abs(layer.values[0] - 5e-4) < 3.5 * layer.sd[0] < 5e-4
+
+
+def test_a_dipole_inside_a_body_is_no_object():
+    study, effect = mri(), EFFECTS["ferromagnetic_object"]
+    places = np.array([place.at_m for place in effect.places(study)])
+    assert not build_magnet(study).contains(places).any()
+    x, y, z = cubes()[0][16].tolist()
+    with pytest.raises(StudyError, match="outside of blocks and iron"):
+        effect.apply(study, Place(at_m=(x, y, z)), [0.0, 1.0, 0.0])
+    beside = Place(at_m=(x, y, z + 0.55 * SIDE_M))  # the control: 1 mm above the cube
+    assert effect.apply(study, beside, [0.0, 1.0, 0.0]).external.dipoles
+    outside = Place(at_m=(x, y, z + 0.6 * SIDE_M))  # and from there its place may not go inside
+    with pytest.raises(StudyError, match="outside of blocks and iron"):
+        effect.apply(study, outside, [0.0, 1.0, 0.0, 0.0, 0.0, -0.2 * SIDE_M])
+
+
+@pytest.mark.parametrize(("size", "count"), [
+    ((0.02, 0.02, 0.02), 5), ((0.02, 0.02, 0.03), 3), ((0.02, 0.025, 0.03), 1),
+    ((0.02, 0.0201, 0.0199), 5), ((0.02, 0.021, 0.03), 1)])
+def test_orientations_in_which_a_body_fits(size, count):
+    """Of a cuboid along its easy axis these are as many as the directions of its equal edges, and
+    the opposite one; edges that differ by half a per cent are equal, by 5 % they are not.
+    """
+    table = {key: [value] for key, value in zip(
+        ("size_x_m", "size_y_m", "size_z_m"), size, strict=True)} | {
+            "name": ["a"], "shape": ["cuboid"], "x_m": [0.1], "y_m": [0.0], "z_m": [0.0],
+            "remanence_T": [1.0], "rotation_z_deg": [30.0]}
+    study = parse_study(DOCUMENT | {"array": {"free_blocks": table}})
+    (block,) = build_magnet(study).blocks
+    turns = np.array(turns_in_slot(block))
+    assert len(turns) == count
+    directions = turns @ np.array(block.easy_axis)
+    assert len(np.unique(directions.round(6), axis=0)) == count
+    assert np.linalg.norm(directions - np.array(block.easy_axis), axis=1).min() > 1
+
+
+def turned(polarizations, ring, angle_deg, slots, axis="z"):
+    """Polarizations after a ring of 12 is turned, each block to another slot."""
+    found = polarizations.copy()
+    turn = Rotation.from_euler(axis, angle_deg, degrees=True)
+    for slot, source in enumerate(slots):
+        found[12 * ring + slot] = turn.apply(polarizations[12 * ring + source])
+    return found
+
+
+def test_equal_moves_are_one():
+    """A ring of a regular order that is upside down is one that is turned, unless the directions
+    of its blocks are those of no slot (the control); if two equal rings are exchanged, nothing
+    changes. Of 4 rings and 2 halves, each has 5 other directions of a quadrupole of 12 slots.
+    """
+    for array, counts in ((QUADRUPOLE, (0, 30, 0)), (SKEW, (0, 30, 36))):
+        study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | array})
+        mean = build_magnet(study).nominal_magnetization
+        found = [len(EFFECTS[name].shortlist(study, mean, np.eye(len(mean)), 0 * mean))
+                 for name in ("rings_swapped", "rings_turned", "rings_upside_down")]
+        assert tuple(found) == counts
+
+
+def half_a_turn(polarizations, study):
+    """One block of ring 2 is turned about its radius."""
+    found, block = polarizations.copy(), build_magnet(study).blocks[13]
+    radius = Rotation.from_euler("z", block.angle_deg, degrees=True).apply([1.0, 0, 0])
+    found[13] = Rotation.from_rotvec(np.pi * radius).apply(polarizations[13])
+    return found
+
+
+def exchanged(polarizations, study):
+    """Rings 2 and 3 are exchanged."""
+    return polarizations.reshape(-1, 12, 3)[[0, 2, 1]].reshape(-1, 3)
+
+
+def by_a_slot(polarizations, study):
+    """Ring 1 is turned by a slot."""
+    return turned(polarizations, 0, 30.0, np.roll(np.arange(12), 1))
+
+
+def upside_down(polarizations, study):
+    """Ring 3 is turned over about the y axis, where slot 1 is; a quadrupole is then reversed."""
+    return turned(polarizations, 2, 180.0, -np.arange(12) % 12, "y")
+
+
+CASES = [
+    (QUADRUPOLE, half_a_turn, "block_put_in_wrongly", "r02s02, half a turn about its radius"),
+    (STEPPED, exchanged, "rings_swapped", "ring 2 and ring 3"),
+    (QUADRUPOLE, by_a_slot, "rings_turned", "ring 1 by +1 slot"),
+    (SKEW, upside_down, "rings_upside_down", "ring 3 about 90° from x")]
+
+
+@pytest.mark.parametrize(("array", "change", "name", "place"), CASES)
+def test_assembly_of_rings(array, change, name, place, session, generator):
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | array})
+    polarizations = change(drawn(study, generator), study)
+    found = selected(study, field(study, polarizations, POINTS), session, generator)
+    assert names_of(found) == [(name, place)]
+    # the study that is written has the blocks in these places, with what they are known to have
+    before = build_magnet(study).nominal_magnetization.reshape(-1, 3)
+    after = build_magnet(apply_effects(study, found))
+    expected = change(before, study)
+    assert after.nominal_magnetization.reshape(-1, 3) == pytest.approx(expected, abs=1.0)
+    mounted = [matrix @ before[number] for number, matrix in mountings(after)]
+    assert np.array(mounted) == pytest.approx(expected, abs=1.0)
+
+
+def test_exchanged_blocks_bring_their_remanence_along():
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | STEPPED})
+    effect = EFFECTS["blocks_swapped"]
+    before = build_magnet(study)
+    after = build_magnet(effect.apply(study, Place(1, 2, other=(2, 5)), [1.0]))
+    assert [after.blocks[number].remanence for number in (1, 16)] == [1.12, 1.2]
+    assert [before.blocks[number].remanence for number in (1, 16)] == [1.2, 1.12]

@@ -1,0 +1,214 @@
+"""Diagnosed amplitudes stay uncertain in the study, and are estimated with the blocks."""
+
+from __future__ import annotations
+
+import magpylib
+import numpy as np
+import pytest
+import tomlkit
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.api import shim
+from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.summary import STUDY_FILE, write_study
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.inference.storage import read_posterior, write_inference
+from halbach_fe.measurement.field_map import field_map
+from halbach_fe.response.magnetic_axis import magnetic_axis
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.materials import MU_0
+from halbach_fe.study.reader import parse_study, read_study
+from halbach_fe.study.uncertain import number_changes, shifted
+from tests.conftest import circle
+from tests.diagnosis.campaign import drawn, field
+from tests.support.cuboids import DOCUMENT, NOISE_T
+
+QUADRUPOLE = {"multipole_order": 2, "rings": 4, "ring_length_m": 0.045}
+SHORT = {"rings": 2, "ring_length_m": 0.08, "inner_radius_m": 0.09, "block": {
+    "shape": "cuboid", "width_m": 0.035}}
+PRECISE = 0.003
+"""Tolerance of the blocks of a magnet with a twisted ring, whose blocks imitate a twist."""
+
+MAGNETS = {"dipole": {}, "quadrupole": QUADRUPOLE}
+POINTS = np.vstack([circle(radius, 12, z, 0.1) for radius in (0.03, 0.06)
+                    for z in np.linspace(-0.15, 0.15, 9)])
+TILT_RAD, TWIST_RAD, MORE_T = 3e-3, 0.02, 0.03
+
+
+def hidden(study, name, polarizations):
+    """B (n, 3) in T that a map shows at `POINTS`, and the polarizations, with a hidden effect."""
+    if name == "mapper_tilt_x":
+        turn = Rotation.from_rotvec([TILT_RAD, 0.0, 0.0])
+        return turn.inv().apply(field(study, polarizations, turn.apply(POINTS))), polarizations
+    turn = Rotation.from_rotvec([0.0, 0.0, TWIST_RAD])
+    first = np.array([block.ring == 1 for block in build_magnet(study).blocks])[:, None]
+    own = polarizations * first
+    true = field(study, polarizations - own, POINTS) + turn.apply(
+        field(study, own, turn.inv().apply(POINTS)))
+    return true, np.where(first, turn.apply(polarizations), polarizations)
+
+
+def update(study, shown, polarizations, session):
+    """Chi-squared per parameter of all blocks against the truth, and the result."""
+    magnet = build_magnet(study)
+    result = infer(magnet, shown, session)
+    count = len(magnet.parameter_names)
+    off = polarizations.ravel() / MU_0 - result.posterior.mean[:count]
+    covariance = result.posterior.covariance[:count, :count]
+    return float(off @ np.linalg.solve(covariance, off)) / count, result
+
+
+def check_axis(result, true_study, polarizations, session):
+    """Compare roll, and centre or slope, with those of the true magnetizations, by their bars."""
+    size = polarizations.size
+    true = magnetic_axis(build_magnet(true_study), session.within("true"), Gaussian(
+        polarizations.ravel() / MU_0, np.zeros((size, 1))))
+    found = magnetic_axis(result.magnet, session.within("found"), result.posterior)
+    off = []
+    # the roll is that from the nominal field, which must be one: that of an object 27 mm away from
+    # where it is turns the nominal field by 0.08 mrad, four error bars
+    if all(getattr(true_study, key) == getattr(result.study, key) for key in ("array", "external")):
+        off.append((found.roll_rad - true.roll_rad) / found.roll_sd_rad)
+    off += list((np.array(found.centre_m) - true.centre_m) / found.centre_sd_m)
+    if found.slope_rad:
+        off += list((np.array(found.slope_rad) - true.slope_rad) / found.slope_sd_rad)
+    assert np.abs(off).max() < 3.5  # 0.3 % of six normal numbers
+
+
+@pytest.mark.parametrize("magnet", ["dipole", "quadrupole"])
+def test_the_update_after_a_diagnosis_is_no_surer_than_it_may_be(
+        magnet, session, tmp_path, generator):
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | MAGNETS[magnet]})
+    polarizations = drawn(study, generator)
+    turn = Rotation.from_rotvec([TILT_RAD, 0.0, 0.0])
+    true = turn.inv().apply(field(study, polarizations, turn.apply(POINTS)))
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    effects = [effect for effect in catalogue()
+               if effect.name in ("mapper_tilt_x", "gain_x", "offset_z")]
+    found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
+    (tilt,) = found.identified
+    assert tilt.hypothesis.effect.name == "mapper_tilt_x"
+    write_study(tomlkit.dumps(study.model_dump(mode="json", exclude_none=True)), study, found,
+                tmp_path)
+    again = read_study(tmp_path / STUDY_FILE)
+    assert again == found.study  # the file says the same
+    chi2, result = update(again, shown, polarizations, session.within("update"))
+    exact, _ = update(again.with_(uncertain=()), shown, polarizations, session.within("exact"))
+    least = 4 * np.sqrt(2 / polarizations.size)  # four standard deviations of chi-squared
+    assert abs(chi2 - 1) < least
+    assert exact > 1 + least  # the control: the amplitude as an exact number
+    check_axis(result, study, polarizations, session)
+    # its prior, and not what these readings say of it, is in the study: they are used again
+    (sd,) = result.amplitudes.sd
+    assert sd == pytest.approx(tilt.sd[0], rel=0.05)  # 2 % are the wide prior's, about another mean
+    assert result.amplitudes.prior_sd[0] > 3 * sd
+    assert abs(tilt.values[0] + result.amplitudes.change[0] - TILT_RAD) < 3.5 * sd
+
+
+def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator):
+    """A ring is twisted by one standard deviation, and all remanences are larger by one."""
+    twist = {"ring": 1, "twist_deg": 0.0}
+    study = parse_study(DOCUMENT | {
+        "array": DOCUMENT["array"] | SHORT | {"exceptions": [twist]},
+        "prior": {"magnitude_sd": PRECISE, "direction_sd_deg": np.degrees(PRECISE)},
+        "uncertain": [
+            {"name": "twist_rad", "sd": TWIST_RAD,
+             "change": {"array.exceptions[1].twist_deg": float(np.degrees(1.0))}},
+            {"name": "remanence_T", "sd": MORE_T, "change": {"array.remanence_T": 1.0}}]})
+    blocks = build_magnet(study).blocks
+    drawn_T = np.array([block.easy_axis for block in blocks]) * (blocks[0].remanence + MORE_T)
+    drawn_T += PRECISE * blocks[0].remanence * generator.standard_normal(drawn_T.shape)
+    turn = Rotation.from_rotvec([0.0, 0.0, TWIST_RAD])
+    first = np.array([block.ring == 1 for block in blocks])[:, None]
+    true = field(study, drawn_T * ~first, POINTS) + turn.apply(
+        field(study, drawn_T * first, turn.inv().apply(POINTS)))
+    drawn_T = np.where(first, turn.apply(drawn_T), drawn_T)
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    chi2, result = update(study, shown, drawn_T, session.within("update"))
+    exact, _ = update(study.with_(uncertain=()), shown, drawn_T, session.within("exact"))
+    least = 4 * np.sqrt(2 / drawn_T.size)
+    assert abs(chi2 - 1) < least
+    assert exact > 1 + least
+    found = result.amplitudes
+    assert found.names == ("twist_rad", "remanence_T")
+    assert (np.abs(found.change - [TWIST_RAD, MORE_T]) < 3.5 * found.sd).all()
+    assert (found.sd < 0.3 * found.prior_sd).all()
+    # what the file of the posterior holds serves other commands, with the twist in it
+    twisted = study.with_(uncertain=(), array__exceptions=[
+        twist | {"twist_deg": float(np.degrees(TWIST_RAD))}])
+    check_axis(result, twisted, drawn_T, session)
+    write_inference(result, session.folder)
+    stored = read_posterior(result.magnet, session.folder / "posterior.h5")["posterior"]
+    np.testing.assert_allclose(stored.covariance, result.posterior.covariance, rtol=1e-9)
+    alone = result.of_blocks  # for what moves blocks
+    assert alone.posterior.covariance == pytest.approx(
+        result.posterior.covariance[:drawn_T.size, :drawn_T.size], rel=1e-9)
+    assert shim(result, session.within("shim"), swaps=1, turns=0).before.orders
+    with pytest.raises(MeasurementError, match="uncertain"):
+        read_posterior(build_magnet(study.with_(uncertain=())), session.folder / "posterior.h5")
+
+
+def test_the_place_of_an_object_has_a_bar(session, generator):
+    document = DOCUMENT | {"array": DOCUMENT["array"] | SHORT}
+    study = parse_study(document)
+    polarizations = drawn(study, generator)
+    at_m, moment = np.array([0.05, 0.19, 0.16]), np.array([0.0, 8.0, 4.0])
+    true = field(study, polarizations, POINTS) + magpylib.misc.Dipole(
+        position=at_m, moment=moment).getB(POINTS)
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    effects = [effect for effect in catalogue()
+               if effect.name in ("ferromagnetic_object", "gain_x")]
+    found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
+    assert [one.hypothesis.effect.name for one in found.identified] == ["ferromagnetic_object"]
+    assert len(found.study.uncertain) == 6  # moment and place
+    chi2, result = update(found.study, shown, polarizations, session.within("update"))
+    assert abs(chi2 - 1) < 4 * np.sqrt(2 / polarizations.size)
+    amplitudes = result.amplitudes
+    (dipole,) = found.study.external.dipoles
+    off = np.concatenate([dipole.moment_A_m2 - moment, dipole.position_m - at_m])
+    assert (np.abs(off + amplitudes.change) < 3.5 * amplitudes.sd).all()
+    # the readings say half of the moment, and three quarters of the place
+    assert (amplitudes.sd < 0.6 * amplitudes.prior_sd).all()
+    beside = study.with_(external__dipoles=[
+        {"position_m": at_m.tolist(), "moment_A_m2": moment.tolist()}])  # its field counts too
+    check_axis(result, beside, polarizations, session)
+
+
+def test_all_laws_of_an_instrument_can_be_uncertain(session, generator):
+    """Each by itself, at values that the readings show: they are found where they are."""
+    names = {"offset_T[1]": 2e-4, "planar_hall_per_T[2]": 5e-3, "quadratic_per_T[1]": 3e-3,
+             "radius_offset_m": 1e-4, "z_scale": 1e-3, "gain[3]": 5e-3, "translation_m[1]": 3e-4}
+    study = parse_study(DOCUMENT)
+    true = field(study, drawn(study, generator), POINTS)
+    read = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    for name, sd in names.items():
+        one = study.with_(uncertain=[{"name": name, "sd": sd, "change": {f"instrument.{name}": 1}}])
+        off = shifted(one, one.uncertain[0], 0.5 * sd)  # an instrument that is not as good
+        found = infer(build_magnet(off.with_(uncertain=one.uncertain)), read,
+                      session.within(name)).amplitudes
+        assert abs(found.change[0] + 0.5 * sd) < 3.5 * found.sd[0]
+        assert found.sd[0] < 0.5 * sd, name
+
+
+@pytest.mark.parametrize(("changes", "sentence"), [
+    ({"array.remanance_T": 1.0}, "which must be a number with a fraction"),
+    ({"array.rings": 1.0}, "which must be a number with a fraction"),
+    ({"array.exceptions[2].twist_deg": 1.0}, "which must be a number with a fraction"),
+    ({"array.remanence_T": 1.0, "instrument.gain[1]": 1.0}, "both the magnet and an instrument")])
+def test_names_that_a_study_does_not_have(changes, sentence):
+    array = DOCUMENT["array"] | {"exceptions": [{"ring": 1}]}
+    with pytest.raises(StudyError, match=sentence):
+        parse_study(DOCUMENT | {"array": array,
+                                "uncertain": [{"name": "a", "sd": 1.0, "change": changes}]})
+
+
+def test_changes_of_numbers():
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | {"exceptions": [{"ring": 1}]}})
+    other = study.with_(array__remanence_T=1.25, instrument__gain=(0.0, 0.01, 0.0))
+    changes = number_changes(study, other)
+    assert changes == pytest.approx({"array.remanence_T": 0.05, "instrument.gain[2]": 0.01})
+    with pytest.raises(ValueError, match="rings differs"):
+        number_changes(study, study.with_(array__rings=2, array__exceptions=()))
