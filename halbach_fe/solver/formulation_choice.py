@@ -143,10 +143,12 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
     """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
 
     It serves points that move little by little. The blocks are solved for once where that does not
-    depend on the points, and the field of many blocks is summed by expansions.
+    depend on the points, and the field of many blocks is summed by expansions. That of a
+    cross-section does not depend on z.
     """
     def solved(points: Floats) -> Floats:
-        return solve_nominal(magnet, points, session)
+        plane = points * [1.0, 1.0, 0.0] if magnet.dimension == 2 else points
+        return solve_nominal(magnet, plane, session)
 
     auto = magnet.study.solver.route == "auto" and not magnet.has_losses
     if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) != "moments" or (
