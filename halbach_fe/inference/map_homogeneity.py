@@ -65,10 +65,11 @@ OPEN = 0.2
 """Deviation of |B| that readings leave open, relative to the one that they show, above which they
 do not carry it: how much of it is left then depends on the prior of the amplitudes."""
 
-WIDE = 0.1
+WIDE = 0.05
 """Width of the 95 % range of the rms deviation, relative to it, from which a held-out part does not
-carry it if the whole map does. Of maps of cuboids ranges of 1 to 10 % held the truth; a part of a
-60th has 38 to 42 %, most of which is the prior of the amplitudes, and may exclude the truth."""
+carry it if the whole map does. Of maps of cuboids a 20th of the scan lines had 1 %; a 30th or 40th
+had 8 to 10 %, with estimates up to 5 % too low, and a 60th 38 to 42 %: that is the prior of the
+amplitudes rather than the readings."""
 
 SEEN = 0.1
 """Part of the readings' sensitivity from which the field along a direction is measured: above the

@@ -76,11 +76,13 @@ def _of_the_solver(result: InferenceResult) -> str:
     """Say that the solver's error dominates the error bars, and what lowers it; else nothing."""
     if result.solver_over_noise < 1:
         return ""
+    keys = finer_in_words(result.magnet, result.observation.points)
+    falls = f"It falls with {keys}." if keys else (
+        "No key of the mesh lowers it: the grid of the iron is fixed on this route.")
     return (" The model's own error dominates: the solver is off by up to "
             f"{flux_density(float(result.response.error.max()))}, rms "
             f"{decimals(result.solver_over_noise, 2)} times the noise of the readings, and the "
-            "error bars include it. It falls with "
-            f"{finer_in_words(result.magnet, result.observation.points)}.")
+            f"error bars include it. {falls}")
 
 
 def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:

@@ -130,11 +130,11 @@ def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
 
 
 def test_a_held_out_part_that_is_too_small(generator, tmp_path, errors):
-    """Two scan lines of 81 do not carry the deviation; the control holds five out."""
+    """Every 40th scan line does not carry the deviation; the control holds every 20th out."""
     data = measured(generator, errors)
     small, large = (homogeneity(build_magnet(study().with_(
         inference={"held_out": {"scan_lines_every": every}})), Session.open(tmp_path), REGION,
-        data=data) for every in (60, 20))
+        data=data) for every in (40, 20))
     assert list(small.of_map) == [MAP]
     assert "too few to tell" in " ".join(small.map_remarks)
     assert "; a fit to the readings alone has" in answer(small).said
