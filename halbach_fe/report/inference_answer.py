@@ -115,8 +115,12 @@ def _largest_field(result: InferenceResult) -> str:
         else f"B along ({_numbers(along, '.4f')})"
     moved = np.abs(place - 1e3 * result.observation.positions[most]).max() > 1e-3
     where = f"({_numbers(place.round(3), '.5g')}) mm{' of the magnet' if moved else ''}"
-    return ("The strongest component of the updated field at the map's positions, "
-            f"{component} at {where}, is "
+    what = ("The strongest component of the updated field at the map's positions, "
+            f"{component} at {where}, is ")
+    if result.observation.of_total_field[most]:
+        what = ("The updated field is strongest, of the map's positions, where |B| at "
+                f"{where} is ")
+    return (f"{what}"
             f"{with_error(1e3 * abs(field.mean[most]), 1e3 * field.sd[most])} mT.")
 
 
