@@ -307,7 +307,9 @@ def multipole_models(
         _check_air(magnet, radius, observations[-1].points)
     bare = magnet.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(concatenate, observations), session)
-    models, left_out, first = [], [], 0
+    models: list[MultipoleModel] = []
+    left_out: list[str] = []
+    first = 0
     for (orders, radius, z), observation in zip(wanted, observations, strict=True):
         part = slice(first, first + len(observation))
         first = part.stop
