@@ -10,7 +10,8 @@ the updated magnet that of the map shows how much the update explains.
 
 Of a map that lacks components the uniform field along these is unknown, and with it |B|. If the
 main field is along components that it has, the size of these is |B| to first order, and is what is
-told; otherwise nothing is. Neither is what the readings leave open for the most part.
+told; otherwise nothing is. Neither is what the readings leave open for the most part, nor a
+held-out part that contradicts the whole map or tells much less than it.
 """
 
 from __future__ import annotations
@@ -63,6 +64,12 @@ readings are too far apart for the field between them, or noisier than stated.""
 OPEN = 0.2
 """Deviation of |B| that readings leave open, relative to the one that they show, above which they
 do not carry it: how much of it is left then depends on the prior of the amplitudes."""
+
+WIDE = 0.05
+"""Width of the 95 % range of the rms deviation, relative to it, from which a held-out part does not
+carry it if the whole map does. Of maps of cuboids a 20th of the scan lines had 1 %; a 30th or 40th
+had 8 to 10 %, with estimates up to 5 % too low, and a 60th 38 to 42 %: that is the prior of the
+amplitudes rather than the readings."""
 
 SEEN = 0.1
 """Part of the readings' sensitivity from which the field along a direction is measured: above the
@@ -119,7 +126,29 @@ def map_homogeneity(
             found[name] = known
         if remark and (name == MAP or known is None):
             remarks.append(f"{what} {remark}")
+    if MAP in found and HELD_OUT_PART in found:
+        remark = not_carried(found[HELD_OUT_PART], found[MAP])
+        if remark:
+            del found[HELD_OUT_PART]
+            remarks.append(remark)
     return found, noises[MAP], tuple(remarks)
+
+
+def not_carried(part: Homogeneity, whole: Homogeneity) -> str:
+    """Say why the fit of a held-out part does not count beside that of the whole map, or nothing.
+
+    Its range either excludes what the whole map shows, or is `WIDE` where the whole map's is not.
+    """
+    (low, _, high), (least, _, most) = part.rms_range_ppm, whole.rms_range_ppm
+    has = (f"Its held-out part by itself has {part.rms_ppm:.0f} ppm rms (95 %: {low:.0f} to "
+           f"{high:.0f})")
+    if not low <= whole.rms_ppm <= high:
+        return (f"{has}, which contradicts the {whole.rms_ppm:.0f} ppm of the whole map: its "
+                "readings are too few to tell it, or differ from the others. It is left out.")
+    if high - low > WIDE * part.rms_ppm and most - least <= WIDE * whole.rms_ppm:
+        return (f"{has}, which its readings are too few to tell, unlike the whole map. It is left "
+                "out.")
+    return ""
 
 
 def _check_within(readings: Readings, model: HomogeneityModel) -> None:

@@ -76,11 +76,13 @@ def _of_the_solver(result: InferenceResult) -> str:
     """Say that the solver's error dominates the error bars, and what lowers it; else nothing."""
     if result.solver_over_noise < 1:
         return ""
+    keys = finer_in_words(result.magnet, result.observation.points)
+    falls = f"It falls with {keys}." if keys else (
+        "No key of the mesh lowers it: the grid of the iron is fixed on this route.")
     return (" The model's own error dominates: the solver is off by up to "
             f"{flux_density(float(result.response.error.max()))}, rms "
             f"{decimals(result.solver_over_noise, 2)} times the noise of the readings, and the "
-            "error bars include it. It falls with "
-            f"{finer_in_words(result.magnet, result.observation.points)}.")
+            f"error bars include it. {falls}")
 
 
 def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
@@ -113,8 +115,12 @@ def _largest_field(result: InferenceResult) -> str:
         else f"B along ({_numbers(along, '.4f')})"
     moved = np.abs(place - 1e3 * result.observation.positions[most]).max() > 1e-3
     where = f"({_numbers(place.round(3), '.5g')}) mm{' of the magnet' if moved else ''}"
-    return ("The strongest component of the updated field at the map's positions, "
-            f"{component} at {where}, is "
+    what = ("The strongest component of the updated field at the map's positions, "
+            f"{component} at {where}, is ")
+    if result.observation.of_total_field[most]:
+        what = ("The updated field is strongest, of the map's positions, where |B| at "
+                f"{where} is ")
+    return (f"{what}"
             f"{with_error(1e3 * abs(field.mean[most]), 1e3 * field.sd[most])} mT.")
 
 

@@ -190,12 +190,15 @@ def answer(
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
-    if any(lacks_main(list(magnets.values())[-1]) for _, magnets in tables):
+    lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
+    if all(lacking):
         return Answer(
             question, said, "Only as absolute numbers: the tables are in units of 1e-4 of a main "
             "multipole that cancels, as along an undulator, and so is any limit in such units.",
             "Ask on a circle where there is a main field: set Z to the middle of a pole.",
             "halbach-fe multipoles STUDY --at-z-m Z -o DIR", sound=False)
+    if any(lacking):
+        said += " Where there is no main multipole, units of 1e-4 of it mean nothing."
     if not measured:
         return Answer(
             question, said, "Yes, for the magnet as ordered, not as it was built: ± is what the "

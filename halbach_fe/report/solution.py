@@ -36,8 +36,7 @@ from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, is_fourier, relative
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution
-from halbach_fe.solver.formulation_choice import FINENESS, choose_route
-from halbach_fe.study.solver import CELLS_PER_SIDE
+from halbach_fe.solver.formulation_choice import finer_in_words
 from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
@@ -68,6 +67,7 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
     reading = ("a Fourier coefficient of B_r on a circle" if is_fourier(solution.magnet.study)
                else "a component of B")
     fine = error <= (sigma or ROUGH * high)
+    finer = finer_in_words(solution.magnet, solution.points)
     compared = ("" if not sigma else "Yes: the error is below the noise of the readings, "
                 f"{flux_density(sigma)}. " if fine else
                 f"Yes, to that error. It is {decimals(error / sigma, 2)} times the noise of the "
@@ -80,17 +80,10 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
         f"{compared}{of_blocks}",
         "Check that error with several meshes."
         if fine else
-        f"See how the error falls with the mesh, then {_finer(solution)}.",
+        f"See how the error falls with the mesh, then take {finer}."
+        if finer else "Check that error with several meshes. No key of the mesh lowers it: the "
+        "grid of the iron is fixed on this route.",
         "halbach-fe verify STUDY -o DIR", error <= ROUGH * high)
-
-
-def _finer(solution: Solution) -> str:
-    """Say which key of the mesh makes the field more exact on the route that computed it."""
-    key = FINENESS.get(choose_route(solution.magnet, solution.points), "block_size_m")
-    if key == "cells_per_side":
-        cells = solution.magnet.study.mesh.cells_per_side or CELLS_PER_SIDE
-        return f"enlarge mesh.{key} (now {cells})"
-    return f"refine mesh.{key}"
 
 
 def _after_an_exact_field(solution: Solution) -> tuple[str, str]:

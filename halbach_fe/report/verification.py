@@ -51,8 +51,7 @@ from halbach_fe.response.mesh_convergence import (
     STEPS,
     Verification,
 )
-from halbach_fe.solver.formulation_choice import FINENESS
-from halbach_fe.study.solver import CELLS_PER_SIDE
+from halbach_fe.solver.formulation_choice import finer_in_words
 
 COLOURS = (THIRD, PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
 MARKERS = ("v", "^", "o", ".", "s", "x")
@@ -112,11 +111,9 @@ def answer(found: Verification) -> Answer:
              "Yes: the field converges. The estimate takes it that elements of half the size "
              f"divide the change from mesh to mesh by {2**found.order:.2g} (order "
              f"{found.order:.1f}), no more than these meshes show.")
-    key = FINENESS.get(found.route, "block_size_m")
-    change = (f"larger (now {found.magnet.study.mesh.cells_per_side or CELLS_PER_SIDE})"
-              if key == "cells_per_side" else
-              f"smaller (elements are now {1e3 * found.element_size_m:.3g} mm)")
-    finer = (f"Make mesh.{key} {change}, and verify again.", "halbach-fe verify STUDY -o DIR")
+    keys_of_route = finer_in_words(found.magnet, found.points)
+    finer = (f"Take {keys_of_route}, and verify again.",
+             "halbach-fe verify STUDY -o DIR") if keys_of_route else measure
     keys = _boundary_keys(found)
     if keys and _boundary_part(found) > error / 2:
         finer = ("Most of the error is that the computed region ends too near. Make "

@@ -32,7 +32,7 @@ class Deviations:
     Attributes
     ----------
     main, main_sd : float
-        Mean of |B| in T and its standard deviation.
+        Mean of |B| in T and its standard deviation, including the solver's error.
     mean : ndarray, shape (k,)
         Means of the values whose squares sum to the mean square deviation, in ppm.
     root : ndarray, shape (k, q)
@@ -118,7 +118,8 @@ class DeviationModel:
         """
         relative = mean[1:] / mean[0]
         return Deviations(
-            float(mean[0]), float(np.linalg.norm(root[0])), PPM * relative,
+            float(mean[0]), float(np.hypot(np.linalg.norm(root[0]), self.error[0])),
+            PPM * relative,
             PPM / mean[0] * (root[1:] - np.outer(relative, root[0])),
             PPM / mean[0] * self.error[1:])
 

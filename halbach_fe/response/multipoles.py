@@ -14,6 +14,7 @@ Laplace equation again. Alternatively, they are the coefficients of B_r on the c
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
@@ -23,7 +24,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
@@ -113,10 +114,11 @@ class Multipoles:
     orders : tuple of int, length k
         Orders of the unwanted multipoles.
     main, main_sd : float
-        Mean and standard deviation of |C_N| in T, or in T m if integrated along z.
+        Mean of |C_N| in T, or in T m if integrated along z, and its standard deviation, including
+        the solver's error.
     roll, roll_sd : float
-        Mean and standard deviation of the angle in rad by which the main multipole is turned about
-        z from that of the nominal magnet.
+        The same of the angle in rad by which the main multipole is turned about z from that of the
+        nominal magnet.
     mean : ndarray, shape (2 k,)
         Means of b_n of all orders, followed by those of a_n, in units of 1e-4 of the main one.
     root : ndarray, shape (2 k, q)
@@ -254,10 +256,12 @@ class MultipoleModel:
         across = (np.conj(mean[0]) * root[0]).imag / strength**2
         relative = mean[1:] / strength
         own = (root[1:] - np.outer(relative, along)) / strength
+        error = float(self.error[0])
         return Multipoles(
-            self.orders, strength, float(np.linalg.norm(along)),
+            self.orders, strength, float(np.hypot(np.linalg.norm(along), error)),
             # in axes turned by theta, C_N becomes C_N exp(i N theta)
-            float(-np.angle(mean[0])) / self.main, float(np.linalg.norm(across)) / self.main,
+            float(-np.angle(mean[0])) / self.main,
+            float(np.hypot(np.linalg.norm(across), error / strength)) / self.main,
             UNITS * np.concatenate([relative.real, relative.imag]),
             UNITS * np.vstack([own.real, own.imag]),
             UNITS * np.tile(self.error[1:] / strength, 2))
@@ -284,7 +288,16 @@ def multipole_model(magnet: Magnet, reference: MultipoleReference,
 def multipole_models(
     magnet: Magnet, references: Sequence[MultipoleReference], session: Session
 ) -> list[MultipoleModel]:
-    """Return the `multipole_model` of several references, which share the solves."""
+    """Return the `multipole_model` of several references, which share the solves.
+
+    Those at which the main multipole of the nominal magnet vanishes are left out, unless it does at
+    all of them.
+
+    Warns
+    -----
+    HalbachWarning
+        If one is left out.
+    """
     main = magnet.array.multipole_order
     wanted, observations = [], []
     for reference in references:
@@ -294,7 +307,9 @@ def multipole_models(
         _check_air(magnet, radius, observations[-1].points)
     bare = magnet.with_(instrument=Instrument())
     model = response_matrix(bare, reduce(concatenate, observations), session)
-    models, first = [], 0
+    models: list[MultipoleModel] = []
+    left_out: list[str] = []
+    first = 0
     for (orders, radius, z), observation in zip(wanted, observations, strict=True):
         part = slice(first, first + len(observation))
         first = part.stop
@@ -304,12 +319,23 @@ def multipole_models(
             far = beyond(magnet, magnet.field_reach)
             matrix[0, :len(far)] += far  # variations inside blocks have next to no field there
         index = np.array([main, *orders]) - 1
-        turn = _turn(magnet, matrix[main - 1], model)
+        try:
+            turn = _turn(magnet, matrix[main - 1], model)
+        except StudyError:
+            if len(left_out) == len(references) - 1:
+                raise
+            left_out.append("The field integrated along z" if integrated
+                            else f"The circle at z = {1e3 * (z or 0.0):.4g} mm")
+            continue
         phases = np.exp(-1j * turn * (index + 1))
         models.append(MultipoleModel(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
             phases * _complexes(model.offset[part])[index], model.error[part][index],
             model.nominal, -turn))
+    for place in left_out:
+        warnings.warn(
+            f"{place} has no multipole of order {main}, which cancels there: its table, in units "
+            "of 1e-4 of that, is left out.", HalbachWarning, stacklevel=2)
     return models
 
 

@@ -36,6 +36,7 @@ from halbach_fe.solver.magnetostatics import (
     solve_sources,
     solve_tangent,
 )
+from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.reciprocal_columns import reciprocal_gradients, saves_solves
 from halbach_fe.solver.separate_blocks import (
     applies,
@@ -78,9 +79,6 @@ out what blocks and iron answer to each other."""
 MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
 """Kind of mesh by route, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`."""
-
-FINENESS = {"moments": "cells_per_side", "azimuthal_modes": "meridian_size_m"}
-"""Key of ``mesh`` by which a route becomes more exact; on all others it is ``block_size_m``."""
 
 BOUNDARY_NEAR = 0.5
 """Fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
@@ -352,17 +350,25 @@ def _solve_nominal(magnet: Magnet, points: Floats, session: Session, route: str)
 
 
 def finer_in_words(magnet: Magnet, points: Floats) -> str:
-    """Return the keys that lower the solver's error at points (n, 3) in m, with their values."""
+    """Return the keys that lower the solver's error at points (n, 3) in m, with their values.
+
+    They follow from the route: ``cells_per_side`` divides permeable blocks on the route
+    ``moments``, ``meridian_size_m`` is of the half-plane of azimuthal modes, and ``block_size_m``
+    of the rest. There is none where only iron is left to the route ``moments``, whose grid of the
+    iron is fixed.
+    """
     mesh, route = magnet.study.mesh, choose_route(magnet, points)
-    elements = f"a smaller mesh.block_size_m (now {1e3 * mesh.block_size_m:.3g} mm)"
-    if route != "moments":
-        return elements
-    cells = f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})"
-    modes = (magnet.study.solver.route == "auto" and not magnet.has_losses
-             and bool(few_modes_suffice(magnet, points).any()))
-    if not magnet.iron and not modes:
-        return cells
-    return f"{cells}{' and' if modes else ' and, for the iron,'} {elements}"
+    if route not in ("moments", "azimuthal_modes"):
+        return f"a smaller mesh.block_size_m (now {1e3 * mesh.block_size_m:.3g} mm)"
+    keys = []
+    if route == "moments" and (magnet.has_losses or any(
+            block.recoil_permeability != 1.0 or not block.isotropic for block in magnet.blocks)):
+        keys.append(f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})")
+    if route == "azimuthal_modes" or (
+            magnet.study.solver.route == "auto" and not magnet.has_losses
+            and bool(few_modes_suffice(magnet, points).any())):
+        keys.append(f"a smaller mesh.meridian_size_m (now {1e3 * meridian_size(magnet):.3g} mm)")
+    return " and ".join(keys)
 
 
 def formulation_of(magnet: Magnet, route: str) -> Formulation:

@@ -78,8 +78,25 @@ def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
     study.write_text(tomlkit.dumps(document))
     command = ["multipoles", study, "--reference-radius-m", "0.03", "-o", tmp_path / "out"]
     assert "ask on circles at poles: --at-z-m Z" in run(capsys, *command, code=3)
+    # as advised: in a pole there is a main field, and the table that has none is left out
+    run(capsys, *command, "--at-z-m", "0.04", "--json")
+    said = page(tmp_path / "out" / "multipoles.html")
+    assert "The largest unwanted multipole" in said
+    assert "Of the field integrated along z" not in said
+    assert {row["where"] for row in rows_of(tmp_path / "out" / "multipoles.csv", "prior")} == {
+        "local"}
+    tolerance = ["tolerance", *command[1:-1], tmp_path / "tolerance"]
+    assert "--at-z-m Z" in run(capsys, *tolerance, code=3)
     document["array"]["ring"] = [{}, {"first_magnetization_angle_deg": angle}]
     study.write_text(tomlkit.dumps(document))
+    if cancels:  # to its tolerances: units of it are refused, and the advice holds
+        refused = run(capsys, *tolerance, code=3)
+        assert "above 0.01 of what the blocks could make together" in refused
+        run(capsys, *tolerance, "--at-z-m", "0.04", "--json")
+        run(capsys, *command, "--at-z-m", "0.04", "--json")
+        said = page(tmp_path / "out" / "multipoles.html")
+        assert "units of 1e-4 of it mean nothing" in said
+        assert "Only as absolute numbers" not in said
     run(capsys, *command, "--json")
     said = page(tmp_path / "out" / "multipoles.html")
     assert ("there is no main multipole, of order 1, but for errors" in said) == cancels

@@ -18,7 +18,7 @@ from halbach_fe.api import plan, shim, sort, tolerance
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.design.exchange_search import Assignment, Slots
-from halbach_fe.design.objective import check_objective
+from halbach_fe.design.objective import check_objective, objective_of
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.inference.infer import infer
@@ -408,3 +408,14 @@ def test_exchanges_are_those_of_the_values(search, generator):
         assert now.square <= np.sort(tries)[len(tries) // 10]
     else:
         assert now.square == pytest.approx(min(tries))
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_mean_field_that_cancels_has_no_ppm(order, session):
+    """In a quadrupole B turns round within the region; the dipole is the control."""
+    magnet = build_magnet(parse_study(changed(DOCUMENT, array__multipole_order=order)))
+    if order == 1:
+        assert objective_of(magnet, None, session).nominal_main > 0
+        return
+    with pytest.raises(StudyError, match="leave the table out to ask for multipoles"):
+        objective_of(magnet, None, session)

@@ -10,11 +10,18 @@ import pytest
 from halbach_fe.api import homogeneity
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR
+from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR, not_carried
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
+from halbach_fe.report.homogeneity import answer
 from halbach_fe.report.result_files import write_report
-from halbach_fe.response.homogeneity import Region, real_harmonics, region_points, sphere_points
+from halbach_fe.response.homogeneity import (
+    Homogeneity,
+    Region,
+    real_harmonics,
+    region_points,
+    sphere_points,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.response.test_magnetic_axis import true_field
@@ -120,6 +127,41 @@ def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
     assert found.map_misfit > POOR
     write_report(found, tmp_path / "page")
     assert "times the stated noise" in (tmp_path / "page" / "homogeneity.html").read_text()
+
+
+def test_a_held_out_part_that_is_too_small(generator, tmp_path, errors):
+    """Every 40th scan line does not carry the deviation; the control holds every 20th out."""
+    data = measured(generator, errors)
+    small, large = (homogeneity(build_magnet(study().with_(
+        inference={"held_out": {"scan_lines_every": every}})), Session.open(tmp_path), REGION,
+        data=data) for every in (40, 20))
+    assert list(small.of_map) == [MAP]
+    assert "too few to tell" in " ".join(small.map_remarks)
+    assert "; a fit to the readings alone has" in answer(small).said
+    assert list(large.of_map) == [MAP, HELD_OUT_PART]
+    assert not large.map_remarks
+    # what is left is the whole map's fit, which holds the truth
+    points, weights, _ = region_points(small.magnet, REGION)
+    size = np.linalg.norm(true_field(1, points, errors=errors), axis=1)
+    rms = 1e6 * float(np.sqrt(weights @ (size / (weights @ size) - 1)**2))
+    low, _, high = small.of_map[MAP].rms_range_ppm
+    assert low - (high - low) / 2 < rms < high + (high - low) / 2  # twice the 95 % range
+
+
+@pytest.mark.parametrize(("part", "whole", "reason"), [
+    # the numbers of a map of which every 40th scan line was held out
+    ((46_284, 51_190, 62_583), (66_206, 66_216, 66_226), "contradicts"),
+    ((50_284, 58_190, 67_583), (66_206, 66_216, 66_226), "too few"),
+    ((64_500, 66_000, 67_500), (66_206, 66_216, 66_226), ""),
+    # both are as wide: it tells no less than the whole map
+    ((50_284, 58_190, 67_583), (52_206, 60_216, 68_226), ""),
+])
+def test_what_a_held_out_part_may_contradict(part, whole, reason):
+    def known(of):
+        return Homogeneity(0.2, 1e-6, np.array([1.0, 0, 0]), 1e-6, of[1], 4 * of[1], of, of, ())
+
+    said = not_carried(known(part), known(whole))
+    assert reason in said if reason else not said
 
 
 def test_solid_harmonics_are_harmonic_fields(generator):

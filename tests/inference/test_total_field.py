@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import re
 
 import magpylib
 import numpy as np
@@ -103,6 +104,10 @@ def test_blocks_are_learnt_from_the_magnitude(order, generator, session):
     # few combinations are open, so that all errors go together: up to 3 of their bars
     assert np.sqrt(np.mean((error / update.posterior.sd_of(columns))**2)) < 3
     assert "All readings are |B|" in answer(update).trust
+    said = re.search(r"\|B\| at \(.*?\) mm is ([0-9.]+)", answer(update).said)
+    # what lies across the nominal field adds to |B| in second order
+    assert float(said[1]) == pytest.approx(1e3 * size.max(), rel=1e-3)
+    assert "strongest component" not in answer(update).said
 
 
 def test_the_nominal_direction_does_not_suffice(generator, session):

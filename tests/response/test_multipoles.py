@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -268,3 +269,21 @@ def test_references_solved_together(session):
         assert (one.orders, one.z, one.integrated) == (alone.orders, alone.z, alone.integrated)
     assert together[0].integrated
     assert not together[1].integrated
+
+
+def test_the_main_multipole_has_the_solver_s_error(session):
+    """As the unwanted ones have; the control is the same model without an error."""
+    model = multipole_model(build_magnet(study_of()), MultipoleReference(0.06, ORDERS), session)
+    size = len(model.nominal)
+    exact = Gaussian(model.nominal, np.zeros((size, 1)))
+    off = replace(model, error=np.full(len(model.error), 3e-4))
+    assert model.of(exact).main_sd < 1e-12
+    known = off.of(exact)
+    assert known.main_sd == pytest.approx(3e-4)
+    assert known.roll_sd == pytest.approx(3e-4 / known.main)  # of a dipole
+    assert known.sd == pytest.approx(UNITS * 3e-4 / known.main)
+    # beside what the blocks leave open
+    root = np.zeros((size, 1))
+    root[:, 0] = 1e-3 * model.nominal
+    assert off.of(Gaussian(model.nominal, root)).main_sd == pytest.approx(
+        np.hypot(1e-3 * known.main, 3e-4))
