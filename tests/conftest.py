@@ -63,7 +63,9 @@ LONGEST = [
     "cli/test_killed.py", "geometry/test_symmetry.py", "design/test_shimming.py",
     "design/test_ring_design.py", "diagnosis/test_sealed_cases.py",
     "diagnosis/test_unlisted_causes.py", "design/test_homogeneity_objective.py",
-    "synthetic/test_hidden_effects.py",
+    "synthetic/test_hidden_effects.py", "diagnosis/test_assembly.py",
+    "diagnosis/test_uncertain_effects.py", "diagnosis/test_rule_of_evidence.py",
+    "inference/test_total_field.py", "inference/test_registration.py",
 ]
 """Files that take half a minute or more of processor time, the longest first."""
 
