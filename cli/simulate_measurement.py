@@ -16,7 +16,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes
+from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -93,8 +93,9 @@ def run(arguments: argparse.Namespace) -> int:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
                                      arguments.hide_random, elements, progress, placed)
     written = write_campaign(campaign, arguments.output)
-    # the files are in the units and along the axes that the study states, the page is in m and T
-    readings, held_out = (None if data is None else in_si_and_magnet_axes(study.instrument, data)
+    # the files are in the units and along the axes that the study states, unless another unit is
+    # hidden in them; the page is in m and T
+    readings, held_out = (None if data is None else by_stated_units(study.instrument, data)
                           for data in (campaign.readings, campaign.held_out))
     assert readings is not None
     write_campaign_page(study, readings, held_out, campaign.blocks,

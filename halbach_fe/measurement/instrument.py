@@ -71,6 +71,13 @@ def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Datase
         has said which component the map holds.
     """
     refuse_undirected(data)
+    read = by_stated_units(instrument, data)
+    check_magnitudes(read)
+    return read
+
+
+def by_stated_units(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
+    """Convert a map like `in_si_and_magnet_axes`, however large its numbers are."""
     points = to_magnet_axes(instrument.position_axes, points_of(data)) * instrument.length_unit_m
     unit = instrument.flux_density_unit_T
     field = to_magnet_axes(instrument.field_axes, data["B_T"].values) * unit
@@ -81,9 +88,7 @@ def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Datase
         sigma = to_magnet_axes(instrument.field_axes, data["sigma_T"].values) * unit
         sigma *= to_magnet_axes(instrument.field_axes, np.ones(sigma.shape))  # axes have signs
         read = read.assign(sigma_T=data["sigma_T"].copy(data=sigma))
-    read = read.assign({name: data[name] * unit for name in TOTAL_COLUMNS if name in data})
-    check_magnitudes(read)
-    return read
+    return read.assign({name: data[name] * unit for name in TOTAL_COLUMNS if name in data})
 
 
 def to_magnet_axes(axes: Axes, columns: Floats) -> Floats:

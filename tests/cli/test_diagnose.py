@@ -197,7 +197,8 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
     assert main(["infer", written, "-o", str(tmp_path / "again"), "--json", "--measurements",
                  str(data)]) == 0
     conflict = json.loads(capsys.readouterr().out)["prior_conflict"]
-    assert conflict == pytest.approx(after["training", "all"]["chi2_per_reading"], rel=1e-9)
+    # infer estimates the sag again, with its prior about the value found: it moves by next to nothing
+    assert conflict == pytest.approx(after["training", "all"]["chi2_per_reading"], rel=1e-6)
 
 
 def test_nothing_is_missing(study, tmp_path, capsys):
@@ -290,7 +291,8 @@ def test_a_misread_map_with_outliers(study, tmp_path, capsys):
 @pytest.mark.parametrize(("change", "code", "said"), [
     ({"study": "inner_radius_m = 50"}, 3, "millimetres"),
     ({"map": "x_m,y_m,z_m,Bx_T\n0,0,0,many\n"}, 4, "must be a finite number"),
-    ({"map": "x_m,y_m,z_m,Bx_T\n0.07,0,0,0.1\n"}, 4, "inside magnet or iron"),
+    ({"map": "x_m,y_m,z_m,Bx_T\n0.07,0,0.02,0.1\n"}, 4, "inside magnet or iron"),
+    ({"map": "x_m,y_m,z_m,Bx_T\n0.07,0,0,0.1\n"}, 4, "which touch there"),
     ({"blocks": "serial,type\n"}, 4, "blocks.csv"),
     ({"held-out": None}, 4, "readable file")])
 def test_bad_input(study, tmp_path, capsys, change, code, said):
@@ -348,7 +350,7 @@ def test_the_documentation_says_what_is_in_the_file():
     update = SimpleNamespace(
         study=study, parts=("training",), maps=("map",), regions=("all",), is_campaign=False,
         prior_conflict=1.0, conflict_limit=2.0, held_out_conflict="",
-        readings=np.zeros(1), prediction_posterior=SimpleNamespace(mean=np.ones(1)),
+        readings=np.zeros(1), field=SimpleNamespace(strongest=None), prediction_posterior=SimpleNamespace(mean=np.ones(1)),
         observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
         before=update, after=update, gross_errors=(), poses=(), outliers=(), identified=(),
