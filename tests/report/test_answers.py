@@ -53,6 +53,7 @@ from halbach_fe.report.words import (
     share_in_words,
     with_error,
 )
+from halbach_fe.response.homogeneity import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -201,6 +202,27 @@ def of_homogeneity(given):
     found = hf.homogeneity(given.magnet, given.session, degrees=2)
     known = found.by_name["prior"]
     return homogeneity.answer(found), [f"{ppm(known.rms_ppm)} ppm rms", "exact", "as ordered"]
+
+
+@pytest.mark.parametrize("free", [True, False])
+def test_only_rings_are_sent_to_the_design_of_rings(tmp_path, session, free):
+    """`halbach-fe design` refuses free blocks: the advice is another one, and it works."""
+    blocks = {"name": ["a"], "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [-0.05],
+              "size_x_m": [0.02], "size_y_m": [0.02], "size_z_m": [0.02],
+              "remanence_x_T": [0.0], "remanence_y_T": [0.0], "remanence_z_T": [1.3]}
+    document = changed(MAGNET)
+    if free:
+        document["array"] = {"free_blocks": blocks}
+        del document["prior"]["types"]
+    study = tmp_path / "study.toml"
+    study.write_text(tomlkit.dumps(document))
+    magnet = build_magnet(hf.read_study(study))
+    said = homogeneity.answer(hf.homogeneity(magnet, session, Region.sphere(0.01), degrees=2))
+    assert ("design" in said.command) != free
+    if free:
+        words = shlex.split(said.command.replace("STUDY", str(study)).replace(
+            " R ", " 0.005 ").replace("DIR", str(tmp_path / "out")))
+        assert main(words[1:]) == 0
 
 
 def of_forces(given):
