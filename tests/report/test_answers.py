@@ -709,6 +709,10 @@ def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path
     assert "Moves 2, 3 and 4 gain only together" in paired
     assert "Moves 5 and 6 gain only together" in paired
     still = replace(found, steps=(), within=None)
+    assert shimming.answer(still, given.updated).said.startswith("No move is worthwhile: of ")
+    # without any move allowed, nothing is known of moves
+    untried = shimming.answer(replace(still, tried=dict.fromkeys(still.tried, 0)), given.updated)
+    assert untried.said.startswith("No move was tried: the unwanted multipoles are ")
     vague = replace(still, before=replace(found.before, mean=0.1 * found.before.root[:, 0],
                                           root=found.before.root))
     assert "which is most of it" in shimming.answer(vague, given.updated).said
