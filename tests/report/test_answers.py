@@ -258,9 +258,11 @@ def test_the_block_that_loses_most_is_named(given):
     assert most["share_beyond_knee"] > 0
     assert f"of which {100 * most['share_beyond_knee']:.3g} % is past the knee" in hot.said
     assert hot.concern.startswith("At 140")
+    assert "remanence counts as that at 20\u00a0°C" in hot.trust
     cold, _ = said(20.0)
     assert "loses most" not in cold.said
     assert cold.concern == ""
+    assert "remanence counts" not in cold.trust
 
 
 def of_plan(given):
