@@ -158,8 +158,9 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     wanted = count or magnet.study.plan.points or len(baseline)
     if wanted > len(candidates):
         raise StudyError(
-            f"Input `plan.points` of study {magnet.name} must be at most the number of candidates, "
-            f"{len(candidates)}; instead it is {wanted}. Add `plan.candidates`.")
+            f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
+            f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
+            "fewer, or add `plan.candidates`.")
     check_points(magnet, baseline)
     check_points(magnet, candidates, "plan.candidates")
     if magnet.study.homogeneity is not None:

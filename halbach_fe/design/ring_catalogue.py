@@ -196,24 +196,36 @@ def design_of(study: Study) -> Design:
     StudyError
         If it has none, or what it asks for is not known here.
     """
-    def refuse(what: str, expected: str, received: str, hint: str = "") -> StudyError:
-        return StudyError(must_be(what, f"study {study.name}", expected, received, hint))
-
+    if (reason := obstacle(study)) is not None:
+        what, *sentence = reason
+        raise StudyError(must_be(what, f"study {study.name}", *sentence))
     if study.design is None:
-        raise refuse("`design`", "a table with the rings to choose from", "nothing",
-                     "Add [design], see docs/design.md.")
-    if study.dimension == 2:
-        raise refuse("`dimension`", "3, for a design of rings", "2")
-    if study.iron_ring or study.iron or study.external.neighbours:
-        raise refuse("`design`", "of a magnet without iron and neighbours", "one with them",
-                     "Leave them out of the search, and look at the result with them.")
-    if study.array.free_blocks is not None or study.array.exceptions:
-        raise refuse("`array`", "of rings without exceptions, for a design",
-                     "one with free blocks or exceptions", "Leave them out.")
-    if study.array.of_ring(1).multipole_order != 1:
-        raise refuse("`array.multipole_order`", "1: the field of a design is homogeneous",
-                     str(study.array.of_ring(1).multipole_order))
+        raise StudyError(must_be(
+            "`design`", f"study {study.name}", "a table with the rings to choose from", "nothing",
+            "Add [design], see docs/design.md."))
     return study.design
+
+
+def obstacle(study: Study) -> tuple[str, str, str, str] | None:
+    """Return why no rings can be designed for a magnet: key, expected, received, what to do.
+
+    None if a table [design] is all that is needed.
+    """
+    array = study.array
+    if study.dimension == 2:
+        return "`dimension`", "3, for a design of rings", "2", ""
+    if study.iron_ring or study.iron or study.external.neighbours:
+        return ("`design`", "of a magnet without iron and neighbours", "one with them",
+                "Leave them out of the search, and look at the result with them.")
+    if array.free_blocks is not None or array.exceptions:
+        return ("`array`", "of rings without exceptions, for a design",
+                "one with free blocks or exceptions",
+                "Write a study of rings (halbach-fe new) with [design]." if array.free_blocks
+                else "Leave them out.")
+    if array.of_ring(1).multipole_order != 1:
+        return ("`array.multipole_order`", "1: the field of a design is homogeneous",
+                str(array.of_ring(1).multipole_order), "")
+    return None
 
 
 def tables_of(study: Study, z_m: Floats, chosen: Sequence[Option]) -> list[Ring]:

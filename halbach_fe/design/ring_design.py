@@ -25,6 +25,7 @@ from halbach_fe.design.radius_programs import moved_radii
 from halbach_fe.design.ring_catalogue import (
     Catalogue,
     Option,
+    design_of,
     designed,
     fields_with_images,
     tables_of,
@@ -159,6 +160,7 @@ def design_rings(
     (2, True)
     """
     check_number("seed", "design_rings", seed, 0, whole=True)
+    design_of(study)  # refuses other magnets, whose array has no rings
     region = region or default_region(build_magnet(study))
     catalogue = Catalogue.of(study, region, _density(study))
     design, generator = catalogue.design, np.random.default_rng(seed)

@@ -222,10 +222,11 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
             f"The measured blocks of type {', '.join(odd)} do not look normally distributed "
             f"(Anderson-Darling, p < {NOT_NORMAL:g} after Holm), but the prior assumes that they "
             "are: give ring and slot of every block.", HalbachWarning, stacklevel=2)
-    doubts = (*_temperature_doubts(magnet, table), *_mean_doubts(magnet, members))
+    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
+    doubts = (*_temperature_doubts(magnet, table), *_mean_doubts(magnet, members),
+              *(_noise_doubts(magnet, gaussian, nominal) if placed else ()))
     for doubt in doubts:
         warnings.warn(doubt, HalbachWarning, stacklevel=2)
-    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     return MeasuredPrior(gaussian, nominal, placed, types, doubts)
 
 
@@ -265,6 +266,23 @@ def _mean_doubts(magnet: Magnet, members: dict[str, Floats]) -> list[str]:
             f"says, {abs(mean) / sd:.0f} times the {100 * sd:.2g} % that its [prior] allows: are "
             "remanence_T, the temperature and the unit of the moments right, and is it the table "
             "of this magnet?"]
+
+
+def _noise_doubts(magnet: Magnet, gaussian: Gaussian, nominal: Floats) -> list[str]:
+    """Return a sentence if the table leaves the blocks less known than the study without it.
+
+    The table takes the place of the study's own deviations, so that a sigma in another unit would
+    spoil what is known, and not only add nothing.
+    """
+    own, across = magnet.study.prior, magnet.dimension - 1
+    stated = float(np.linalg.norm((own.magnitude_sd, own.common_mode_sd,
+                                   *across * (np.radians(own.direction_sd_deg),))))
+    known = float(np.sqrt(np.square(gaussian.sd).sum() / np.square(nominal).sum()))
+    if known <= MANY_SD * stated:
+        return []
+    return [f"With this table each block is known to {100 * known:.2g} % only, where the study "
+            f"alone states {100 * stated:.2g} %: is sigma_A_m2 in A m^2? If the coil is so "
+            "uncertain, leave the table out."]
 
 
 def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:

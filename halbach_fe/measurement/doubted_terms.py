@@ -130,17 +130,19 @@ def doubts_in_words(found: Sequence[Term]) -> str:
 def words_of(name: str) -> tuple[str, str]:
     """Return the words and the SI unit of a term of `instrument_terms.NAMES`, or of a stage.
 
+    A probe of |B| has terms without an axis: ``gain``, ``offset_T``, ``drift_T``.
     The name of a map, stage or probe may stand before it: ``fringe.gain_x``.
     """
     owner, _, term = name.rpartition(".")
     kind, *axes = term.replace("stage_shift", "shift").split("_")
-    unit = axes.pop() if axes[-1] in UNITS else ""
-    first, last = axes[0], axes[-1]
+    unit = axes.pop() if axes and axes[-1] in UNITS else ""
+    first, last = (axes[0], axes[-1]) if axes else ("", "")
+    of = f"B{first}" if first else "|B|"
     said = {"translation": f"place along {first}", "rotation": f"turn about {first}",
             "shift": f"place along {first} of the stage",
-            "crosstalk": f"turn of the B{first[0]} sensor towards {last[-1]}",
-            "gain": f"gain of B{first}", "offset": f"offset of B{first}",
-            "drift": f"drift of B{first}", "sensor": f"place of the B{first} sensor along {last}"}
+            "crosstalk": f"turn of the B{first[:1]} sensor towards {last[-1:]}",
+            "gain": f"gain of {of}", "offset": f"offset of {of}",
+            "drift": f"drift of {of}", "sensor": f"place of the B{first} sensor along {last}"}
     return (said[kind] + (f" ({owner})" if owner else ""),
             "rad" if kind == "crosstalk" else unit)
 

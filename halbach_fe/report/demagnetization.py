@@ -92,13 +92,17 @@ def answer(found: DemagnetizationMap) -> Answer:
     cold = " It loses magnetization at room temperature already." if (
         found.limit_temperature(SHARES[-1]) < min(ROOM_C, temperature)) else ""
     at = f"at {temperature:g}\u00a0°C"
+    reference = found.material.reference_temperature_C
+    cooler = "" if temperature == reference else (
+        f" The study's remanence counts as that at {reference:g}\u00a0°C.")
     return Answer(
         "Do the blocks keep their magnetization?",
         f"{'No' if lost > 0 else 'Yes'}: {at}, {start}.{losing} The smallest margin "
         f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{cold}",
         "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
         "within some per cent. The very edges of blocks are worse than any cell (the option "
-        f"--across makes them smaller); shares of the volume hardly depend on that.{nonlinear}",
+        f"--across makes them smaller); shares of the volume hardly depend on that.{nonlinear}"
+        f"{cooler}",
         *(("Choose a grade of a higher coercivity for these blocks (the table on the page says "
            "which), or keep the magnet cooler. If it is built already, a measurement shows what "
            "it has lost.",

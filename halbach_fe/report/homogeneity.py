@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from halbach_fe.api import HomogeneityResult
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
@@ -34,6 +35,7 @@ from halbach_fe.report.page import (
 from halbach_fe.report.stray_field import stray_pictures, stray_section
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
+from halbach_fe.study.model import Study
 
 CONVENTION = (
     "B_n = sum (r/R)^l P_lm(cos theta) (a_lm cos(m phi) + b_lm sin(m phi)) about the centre, B_n "
@@ -89,12 +91,7 @@ def answer(found: HomogeneityResult) -> Answer:
         return of_a_conflict(question, f"{text}.", found.disagreement)
     better: tuple[str, str] | None = None
     if best.rms_ppm > TOO_LARGE_FOR_A_TRAY:
-        stated = found.magnet.study.design is not None
-        better = (
-            f"A deviation of {1e-4 * best.rms_ppm:.2g} % is that of the rings, not of their errors:"
-            f" look for better rings{'' if stated else ', by a table [design] in the study'}, or "
-            "for a smaller region. Small magnets in a tray cannot make up for it.",
-            "halbach-fe design STUDY -o DIR")
+        better = _better_design(found.magnet.study, best.rms_ppm)
     if name != "prior" and better:
         return Answer(question, f"{text}.", f"{agreement(found.disagreement)} {trust}", *better,
                       small)
@@ -112,6 +109,19 @@ def answer(found: HomogeneityResult) -> Answer:
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
         f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
         *(better or measure), small)
+
+
+def _better_design(study: Study, rms_ppm: float) -> tuple[str, str]:
+    """Say what to do about the deviation of a magnet as designed, and the command for it."""
+    part = f"A deviation of {1e-4 * rms_ppm:.2g} % is that of the "
+    tray = "Small magnets in a tray cannot make up for it."
+    if obstacle(study) is not None:  # halbach-fe design would refuse this magnet
+        return (f"{part}magnet as designed, not of its errors: move its blocks, or look at a "
+                f"smaller region: set R, its radius. {tray}",
+                "halbach-fe homogeneity STUDY --sphere-m R -o DIR")
+    stated = "" if study.design is not None else ", by a table [design] in the study"
+    return (f"{part}rings, not of their errors: look for better rings{stated}, or for a smaller "
+            f"region. {tray}", "halbach-fe design STUDY -o DIR")
 
 
 def _of_map(found: HomogeneityResult) -> str:

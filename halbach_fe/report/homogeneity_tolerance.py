@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
+from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, solver_error_text
@@ -89,7 +90,8 @@ def homogeneity_tolerance_answer(found: HomogeneityTolerance) -> Answer:
             ("Look for a better design first: perfect blocks would leave "
              f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured "
              "blocks can use their errors against it, but takes only a part of it away.",
-             "halbach-fe design STUDY -o DIR")
+             "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
+             "halbach-fe sort STUDY BLOCKS -o DIR")
             if found.ordered.rms_ppm > OF_THE_DESIGN * half else
             ("Measure the blocks before assembly, and see what sorting them into the slots that "
              "they fit gains.",

@@ -192,11 +192,7 @@ def answer(
     question = "Which unwanted multipoles does the field have?"
     lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
     if all(lacking):
-        return Answer(
-            question, said, "Only as absolute numbers: the tables are in units of 1e-4 of a main "
-            "multipole that cancels, as along an undulator, and so is any limit in such units.",
-            "Ask on a circle where there is a main field: set Z to the middle of a pole.",
-            "halbach-fe multipoles STUDY --at-z-m Z -o DIR", sound=False)
+        return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY")
     if any(lacking):
         said += " Where there is no main multipole, units of 1e-4 of it mean nothing."
     if not measured:
@@ -228,6 +224,18 @@ def multipole_rows(magnets: Mapping[str, Multipoles]) -> list[dict[str, str]]:
 def _size_sd(known: Multipoles) -> Floats:
     """Return standard deviations (k,) of |c_n| in units: rms over normal and skew part."""
     return np.asarray(np.hypot(*known.sd.reshape(2, -1)) / np.sqrt(2))
+
+
+def of_no_main(question: str, said: str, trust: str, command: str) -> Answer:
+    """Return an answer in units of a main multipole that `lacks_main`; ``trust`` begins its trust.
+
+    ``command`` is that of the answer, a verb of halbach-fe with its inputs.
+    """
+    return Answer(
+        question, said, f"{trust}: the tables are in units of 1e-4 of a main multipole that "
+        "cancels, as along an undulator, and so is any limit in such units.",
+        "Ask on a circle where there is a main field: set Z to the middle of a pole.",
+        f"halbach-fe {command} --at-z-m Z -o DIR", sound=False)
 
 
 def lacks_main(known: Multipoles) -> bool:

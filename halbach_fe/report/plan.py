@@ -274,6 +274,7 @@ def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     draw_cross_section(left, magnet)
     shown = _draw_points(left, plan, lambda points: 1e3 * points[:, :2])
     reach = 1.15e3 * float(np.hypot(*np.vstack([plan.candidates, plan.baseline])[:, :2].T).max())
+    reach = reach or 1.15e3 * magnet.bore_radius  # of positions on the axis alone
     left.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x in mm",
              ylabel="y in mm")
     for axis in others:

@@ -19,8 +19,10 @@ from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
+    lacks_main,
     main_in_words,
     multipole_figure,
+    of_no_main,
     reference_summary,
     reference_text,
 )
@@ -216,8 +218,9 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
             said = (f"With {moves} of blocks {said}{_first_moves(shim)}{_together(shim)}"
                     f"{_remainder(shim)}")
     else:
-        said = (f"No move is worthwhile{_of_possible(shim)}. Leave it as it is: {what} {before} "
-                f"{unit}, including the uncertainty{_unknown_part(shim)}.")
+        said = ((f"No move is worthwhile{_of_possible(shim)}. Leave it as it is: "
+                 if any(shim.tried.values()) else "No move was tried: ")
+                + f"{what} {before} {unit}, including the uncertainty{_unknown_part(shim)}.")
     if shim.within is not None and shim.limit is not None:
         first, last = map(probability, shim.within)
         limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
@@ -230,6 +233,8 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         return Answer(question, said, f"No. Model and measurement disagree. {result.disagreement}",
                       "Find out what the study lacks before any block is moved.",
                       "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
+    if shim.fields is None and lacks_main(shim.before):
+        return of_no_main(question, said, "Not in these units", "shim STUDY --measurements MAP")
     make = ("Make the moves in their order, measure again, and update study.shimmed.toml."
             if shim.shimmed_study else "Make the moves in their order, and measure again.")
     if reason_against(shim, result):

@@ -11,14 +11,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.files import atomic, write_text
+from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.sorting import SortedBlocks, types_in_words
 from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
+    lacks_main,
     main_in_words,
     multipole_figure,
+    of_no_main,
     reference_summary,
     reference_text,
 )
@@ -153,6 +156,9 @@ def answer(found: SortedBlocks) -> Answer:
     question = "Which block goes into which slot?"
     left = ("" if not found.left_over else f" {counted(found.left_over, 'block')} "
             f"{'is' if found.left_over == 1 else 'are'} left over.")
+    if not isinstance(found.model, DeviationModel) and lacks_main(found.numbered):
+        return of_no_main(question, f"Not known: {what} {text(own)} {unit}.", "Not in these units",
+                          "sort STUDY BLOCKS")
     turned = ("" if not found.turned else f" {counted(found.turned, 'block')} "
               f"{'is' if found.turned == 1 else 'are'} turned in the slot, as sort.csv says.")
     if found.has_choice and not _chose(found):
@@ -211,7 +217,8 @@ def _ordered(found: SortedBlocks) -> str:
     return (f" With all blocks as ordered the deviation would be "
             f"{ppm(float(np.linalg.norm(values)))} ppm rms, by the design of the rings: sorting "
             "uses the errors of blocks against it. If what is left is too much, look for another "
-            "design (halbach-fe design) before you assemble this one.")
+            f"design{'' if obstacle(found.study) else ' (halbach-fe design)'} before you assemble "
+            "this one.")
 
 
 def _uncertainty(found: SortedBlocks) -> float:

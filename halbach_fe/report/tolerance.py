@@ -20,7 +20,13 @@ from halbach_fe.report.homogeneity_tolerance import (
     tolerances_in_words,
     write_homogeneity_tolerance,
 )
-from halbach_fe.report.multipoles import main_in_words, reference_summary, reference_text
+from halbach_fe.report.multipoles import (
+    lacks_main,
+    main_in_words,
+    of_no_main,
+    reference_summary,
+    reference_text,
+)
 from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
@@ -118,13 +124,16 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
+    question = "Which multipoles do the tolerances of the blocks make?"
+    if lacks_main(found.known):
+        return of_no_main(question, said, "Not in these units", "tolerance STUDY")
     step = (("Measure the blocks before assembly, and see what sorting them into the slots that "
              "they fit gains.",
              "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
             ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR"))
     return Answer(
-        "Which multipoles do the tolerances of the blocks make?", said,
+        question, said,
         f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
         f"{whole(len(found.sizes))} magnets were drawn.", *step)
 

@@ -636,7 +636,7 @@ def region_points(
     if region.contains(middles).any():  # the points below may miss blocks in a large region
         raise StudyError(must_be("the region", f"study {magnet.name}", "in air",
                                  f"{region.text}, which contains blocks",
-                                 "Choose a smaller region. Was it meant in millimetres?"))
+                                 _advice(magnet, region)))
     reach = max(region.half_axes_m) / magnet.bore_radius
     resolved = MOST_DEGREES if reach >= 1 else min(
         MOST_DEGREES, int(np.ceil(np.log(HIGHER_DEGREES) / np.log(reach))))
@@ -650,8 +650,15 @@ def region_points(
         raise StudyError(must_be(
             "the region", f"study {magnet.name}", "in air",
             f"{region.text}, of which the point ({x:.4g}, {y:.4g}, {z:.4g}) mm is inside magnet or "
-            "iron", "Choose a smaller region, or check the study's radii."))
+            "iron", _advice(magnet, region)))
     return points, weights, surface_degree
+
+
+def _advice(magnet: Magnet, region: Region) -> str:
+    """Say how a region that contains material gets into air: not smaller about a block's inside."""
+    if magnet.contains(np.array([region.centre_m], float)).any():
+        return "Move its centre into air: --centre-m X Y Z beside --sphere-m R."
+    return "Choose a smaller region, or check the study's radii."
 
 
 def homogeneity_model(

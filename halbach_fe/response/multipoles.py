@@ -602,7 +602,8 @@ def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
             "--reference-radius-m", f"study {magnet.name}",
             f"from {LEAST_RADIUS * bore:g} to {MOST_RADIUS * bore:.4g} m, as the blocks' inner "
             f"radius is {bore:g} m", f"{radius:g}",
-            "Was it meant in millimetres?" if radius >= bore else ""))
+            "Was it meant in millimetres?" if radius / 1000 <= MOST_RADIUS * bore < radius / 10
+            else "Choose a smaller one." if radius > bore else ""))
     return radius
 
 

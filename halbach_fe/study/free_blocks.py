@@ -162,7 +162,10 @@ class FreeBlocks(StudyModel):
         for column in COLUMNS:
             values = getattr(self, column)
             needed = column in ("name", "shape", "x_m", "y_m", "z_m")
-            if len(values) != len(self) and (values or needed):
+            if needed and not values:
+                raise ValueError(f"there is no column {column}: add it, as every block needs name, "
+                                 "shape, x_m, y_m and z_m")
+            if len(values) != len(self) and values:
                 raise ValueError(f"column {column} has {len(values)} rows, and there are "
                                  f"{len(self)} names of blocks")
         if bool(self.ring) != bool(self.slot):

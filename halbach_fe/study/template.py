@@ -18,12 +18,17 @@ from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, with_free_blocks
+from halbach_fe.study.types import MIN_LENGTH_M
 
 TEMPLATE = "new_study.toml.j2"
 
 LATITUDES, ANGLES = 9, 16
 """Number of latitudes, and of points on each, of a sphere that is measured: they determine the
 spherical harmonics up to degree 8."""
+
+
+AROUND = 1.2
+"""Radius of the points about a magnet without a bore, relative to that of the magnet."""
 
 
 @dataclass(frozen=True)
@@ -66,30 +71,39 @@ def new_study(name: str, magnet: MagnetTemplate, folder: Path = Path()) -> str:
     StudyError
         If no valid study has these values.
     """
-    table = None
+    table, bored = None, True
     if magnet.free_blocks is not None:
         table = free_blocks_of_file(folder / magnet.free_blocks)
         inner, outer = table.radii_m
-        magnet = replace(magnet, inner_radius_m=float(f"{inner:.4g}"),
-                         outer_radius_m=float(f"{outer:.4g}"))
+        bored = inner > MIN_LENGTH_M
+        magnet = replace(magnet, outer_radius_m=float(f"{outer:.4g}"), inner_radius_m=float(
+            f"{inner if bored else outer / 4:.4g}"))  # of no bore: a scale of the mesh alone
     elif magnet.inner_radii_m:
         magnet = replace(magnet, rings=len(magnet.inner_radii_m),
                          inner_radius_m=min(magnet.inner_radii_m))
+    half = _half_length(magnet, table)
+    around = 0.0  # radius of the points about a magnet that has no bore to measure in
+    if table is not None and not bored and magnet.dsv_m is None:
+        around = AROUND * float(np.hypot(magnet.outer_radius_m, half or 0.0))
+    points = around or (magnet.dsv_m or 0.0) / 2
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe.study", "."), undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     text = environment.get_template(TEMPLATE).render(
-        name=_name(name), magnet=magnet, table=table, half=_half_length(magnet, table),
-        sphere=[] if magnet.dsv_m is None else _sphere(magnet.dsv_m / 2))
+        name=_name(name), magnet=magnet, table=table, half=half, around=around,
+        sphere=_sphere(points, flat=half is None and around > 0) if points else [])
     parse_new_study(text, folder)
     return text
 
 
-def _sphere(radius: float) -> list[str]:
-    """Return points on a sphere about the origin as TOML, a line for each of Gauss' latitudes."""
+def _sphere(radius: float, flat: bool = False) -> list[str]:
+    """Return points on a sphere about the origin as TOML, a line for each of Gauss' latitudes.
+
+    If ``flat``, of a cross-section, they are those of the equator alone.
+    """
     angle = 2 * np.pi * np.arange(ANGLES) / ANGLES
     lines = []
-    for height in np.polynomial.legendre.leggauss(LATITUDES)[0]:
+    for height in np.polynomial.legendre.leggauss(1 if flat else LATITUDES)[0]:
         across = radius * np.sqrt(1 - height**2)
         lines.append(", ".join(f"[{x:.5g}, {y:.5g}, {radius * height:.5g}]" for x, y in zip(
             (across * np.cos(angle)).round(9) + 0.0, (across * np.sin(angle)).round(9) + 0.0,

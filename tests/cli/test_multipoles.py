@@ -102,6 +102,15 @@ def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
     assert ("there is no main multipole, of order 1, but for errors" in said) == cancels
     assert ("Only as absolute numbers" in said) == cancels
     assert ("µT m itself" in said.replace("\u00a0", " ")) == cancels
+    # the other commands that state such units (sort takes only blocks that are alike)
+    options = [*command[1:-2], "--json", "-o"]
+    run(capsys, "tolerance", *options, tmp_path / "drawn")
+    run(capsys, "simulate-measurement", study, "-o", tmp_path / "campaign", "--json")
+    campaign = tmp_path / "campaign"
+    run(capsys, "shim", *options[:-1], "--measurements", campaign / "map.csv",
+        "-o", tmp_path / "shimmed")
+    for name in ("drawn/tolerance", "shimmed/shim"):
+        assert ("Not in these units" in page(tmp_path / f"{name}.html")) == cancels, name
 
 
 def rows_of(path, magnet):

@@ -86,6 +86,26 @@ def test_command_writes_rings_of_their_own_and_free_blocks(tmp_path, capsys):
         assert not (tmp_path / "wrong.toml").exists()
 
 
+@pytest.mark.parametrize("solid", [True, False])
+@pytest.mark.parametrize(("places", "bore"), [
+    ([(0, 0)], False), ([(0, 0.012), (0, -0.012)], False), ([(0.04, 0), (-0.04, 0)], True)])
+def test_free_blocks_without_a_bore_are_measured_around_the_magnet(tmp_path, places, bore, solid):
+    """A single block, poles that reach past the axis, and two poles that leave a bore."""
+    table, path = tmp_path / "blocks.csv", tmp_path / "study.toml"
+    table.write_text("name,shape,x_m,y_m,z_m,size_x_m,size_y_m,size_z_m,remanence_T\n" + "".join(
+        f"b{i},cuboid,{x},{y},0,0.04,0.02,{0.02 if solid else ''},1.3\n"
+        for i, (x, y) in enumerate(places)))
+    assert main(["new", str(path), "--free-blocks", str(table)]) == 0
+    study = read_study(path)
+    magnet, points = build_magnet(study), points_from(study.observation.positions)
+    assert not magnet.contains(points).any()
+    assert study.homogeneity is None
+    # with a bore circles within it, else points beyond the farthest corner
+    corner = np.hypot(*np.add(np.abs(places[0]), (0.02, 0.01)))
+    assert (np.hypot(*points[:, :2].T).max() < 0.02) if bore else (
+        np.linalg.norm(points, axis=1).min() > corner)
+
+
 CUBES = ["--cube-m", "0.012", "--radius-m", "0.136", "--blocks-per-ring", "24"]
 
 

@@ -221,7 +221,12 @@ def test_impossible_designs_are_refused(changes, region, message, session):
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"design": None}, "the rings to choose from"), ({"dimension": 2}, "dimension"),
+    ({"design": None}, "the rings to choose from"),
+    ({"array": {"free_blocks": {
+        "name": ["a"], "shape": ["cuboid"], "x_m": [0.06], "y_m": [0.0], "z_m": [0.0],
+        "size_x_m": [0.01], "size_y_m": [0.01], "size_z_m": [0.01], "remanence_T": [1.3]}}},
+     r"free blocks or exceptions.*halbach-fe new"),
+    ({"dimension": 2}, "dimension"),
     ({"iron_ring": {"inner_radius_m": 0.1, "outer_radius_m": 0.12,
                     "relative_permeability": 1000.0}}, "without iron"),
     ({"array": DOCUMENT["array"] | {"multipole_order": 2}}, "multipole_order"),

@@ -440,7 +440,8 @@ def test_moves_that_a_study_cannot_say():
 
 
 @pytest.mark.parametrize(("reference", "said"), [
-    (MultipoleReference(0.2), "as the blocks' inner radius is"),
+    (MultipoleReference(0.2), "as the blocks' inner radius is.* 0.2. Choose a smaller one.$"),
+    (MultipoleReference(1e3 * RADIUS), "Was it meant in millimetres"),
     (MultipoleReference(RADIUS, (1,)), "unwanted multipoles")])
 def test_references_that_make_no_sense(session, reference, said):
     with pytest.raises(StudyError, match=said):

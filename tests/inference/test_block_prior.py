@@ -220,6 +220,9 @@ def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, 
     with pytest.warns(HalbachWarning, match=r"on average (29|3\d) % stronger"):
         assert len(prior(1.3 * truth).doubts) == 1
     assert prior(1.03 * truth).doubts == ()
+    moments = np.linalg.norm(table_of(study, slots, truth, rings).moment, axis=1)
+    with pytest.warns(HalbachWarning, match=r"known to \d+ % only, where the study alone states "):
+        assert "Not yet" in answer(prior(truth, sigma=moments / 2)).trust
     assert prior(1.3 * truth, vacuum_dipole(prior__common_mode_sd=0.2)).doubts == ()
 
 

@@ -53,6 +53,7 @@ from halbach_fe.report.words import (
     share_in_words,
     with_error,
 )
+from halbach_fe.response.homogeneity import Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -203,6 +204,27 @@ def of_homogeneity(given):
     return homogeneity.answer(found), [f"{ppm(known.rms_ppm)} ppm rms", "exact", "as ordered"]
 
 
+@pytest.mark.parametrize("free", [True, False])
+def test_only_rings_are_sent_to_the_design_of_rings(tmp_path, session, free):
+    """`halbach-fe design` refuses free blocks: the advice is another one, and it works."""
+    blocks = {"name": ["a"], "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [-0.05],
+              "size_x_m": [0.02], "size_y_m": [0.02], "size_z_m": [0.02],
+              "remanence_x_T": [0.0], "remanence_y_T": [0.0], "remanence_z_T": [1.3]}
+    document = changed(MAGNET)
+    if free:
+        document["array"] = {"free_blocks": blocks}
+        del document["prior"]["types"]
+    study = tmp_path / "study.toml"
+    study.write_text(tomlkit.dumps(document))
+    magnet = build_magnet(hf.read_study(study))
+    said = homogeneity.answer(hf.homogeneity(magnet, session, Region.sphere(0.01), degrees=2))
+    assert ("design" in said.command) != free
+    if free:
+        words = shlex.split(said.command.replace("STUDY", str(study)).replace(
+            " R ", " 0.005 ").replace("DIR", str(tmp_path / "out")))
+        assert main(words[1:]) == 0
+
+
 def of_forces(given):
     found = hf.forces(given.magnet, given.session)
     return forces.answer(found), [f"{decimals(found.in_place.magnitude.max())}\u00a0N", "of 16",
@@ -236,9 +258,11 @@ def test_the_block_that_loses_most_is_named(given):
     assert most["share_beyond_knee"] > 0
     assert f"of which {100 * most['share_beyond_knee']:.3g} % is past the knee" in hot.said
     assert hot.concern.startswith("At 140")
+    assert "remanence counts as that at 20\u00a0°C" in hot.trust
     cold, _ = said(20.0)
     assert "loses most" not in cold.said
     assert cold.concern == ""
+    assert "remanence counts" not in cold.trust
 
 
 def of_plan(given):
@@ -687,6 +711,10 @@ def test_shim_says_how_few_moves_suffice_and_what_is_uncertainty(given, tmp_path
     assert "Moves 2, 3 and 4 gain only together" in paired
     assert "Moves 5 and 6 gain only together" in paired
     still = replace(found, steps=(), within=None)
+    assert shimming.answer(still, given.updated).said.startswith("No move is worthwhile: of ")
+    # without any move allowed, nothing is known of moves
+    untried = shimming.answer(replace(still, tried=dict.fromkeys(still.tried, 0)), given.updated)
+    assert untried.said.startswith("No move was tried: the unwanted multipoles are ")
     vague = replace(still, before=replace(found.before, mean=0.1 * found.before.root[:, 0],
                                           root=found.before.root))
     assert "which is most of it" in shimming.answer(vague, given.updated).said

@@ -265,6 +265,8 @@ def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path):
 
 @pytest.mark.parametrize(("options", "sentence"), [
     (["--sphere-m", "0.025"], "must be in air"),
+    (["--sphere-m", "0.025"], "Choose a smaller region, or"),
+    (["--sphere-m", "0.002", "--centre-m", "0.026", "0", "0.015"], "Move its centre into air"),
     (["--centre-m", "0", "0", "1"], "must be beside a region"),
     (["--sphere-m", "0.005", "--centre-m", "0", "0", "10"], "where there is some field"),
     (["--cylinder-m", "0.005", "100"], "where there is some field"),

@@ -114,7 +114,7 @@ def test_hdf5_of_other_programs(tmp_path):
     (CSV, "name;shape;x_m\na;cuboid;0,1\n", "names that semicolons separate. Separate columns by"),
     (CSV, "# nothing\n", "a header, and 1 to 1000000 blocks; instead received 0"),
     (CSV, "name,shape\n", "a header, and 1 to 1000000 blocks; instead received 0"),
-    (",z_m", ",rotation_x_deg", "column z_m has 0 rows")])
+    (",z_m", ",rotation_x_deg", "there is no column z_m: add it")])
 def test_refusals(blocks, old, new, said):
     """Also through the study, whose file the sentence names too."""
     assert old in CSV
