@@ -544,14 +544,9 @@ class InferenceResult(ShownInNotebook):
         """Sentences about `doubts`, a factor of the readings, and readings that are not like the
         model, if model and readings disagree; nothing if there are none.
         """
-        chosen = ~self.held_out
-        both = self.readings[chosen], self.prediction_prior.mean[chosen]
-        allowed = np.hypot(self.prediction_prior.sd, self.noise.sd)[chosen]
-        far = np.linalg.norm(both[0]) > FAR_FROM_ZERO * np.linalg.norm(allowed)
-        likeness = likeness_of(*both) if self._conflict and far else 1.0
-        said = [doubts_in_words(self.doubts),
-                factor_in_words(factor_of(*both), likeness)
-                if self.doubts or abs(likeness) < UNLIKE else ""]
+        said = [doubts_in_words(self.doubts)]
+        if self._conflict or self.doubts:
+            said.append(self._unlike(~self.held_out, bool(self.doubts)))
         return " ".join(each for each in said if each)
 
     @cached_property
@@ -606,11 +601,23 @@ class InferenceResult(ShownInNotebook):
             chi2 = sum(score.readings * float(score.chi2_posterior or 0.0)
                        for score in of_part) / count
             if chi2 > max(TOO_FAR, 1 + 5 * np.sqrt(2 / count)):
+                unlike = self._unlike(np.array(self.parts) == part) if words else ""
                 return (f"Held-out readings{words} are farther from their predictions than these "
                         f"and the noise allow (chi² per reading is {decimals(chi2)}, where 1 is "
                         "expected): sigma_T is too small, an effect is missing from the model, or "
-                        "these readings are not of this magnet.")
+                        f"these readings are not of this magnet.{unlike and f' {unlike}'}")
         return ""
+
+    def _unlike(self, chosen: NDArray[np.bool_], doubted: bool = True) -> str:
+        """Say that chosen readings, by a mask (n,), are not like the field that the prior predicts
+        or, if ``doubted``, a factor times it; nothing if they are neither.
+        """
+        both = self.readings[chosen], self.prediction_prior.mean[chosen]
+        allowed = np.hypot(self.prediction_prior.sd, self.noise.sd)[chosen]
+        far = np.linalg.norm(both[0]) > FAR_FROM_ZERO * np.linalg.norm(allowed)
+        likeness = likeness_of(*both) if far else 1.0
+        return factor_in_words(factor_of(*both), likeness) \
+            if doubted or abs(likeness) < UNLIKE else ""
 
     @property
     def _conflict(self) -> str:
