@@ -322,7 +322,8 @@ def _labelled(data: xr.Dataset, where: str) -> xr.Dataset:
 
 def _check_names(data: xr.Dataset, where: str) -> None:
     """Raise MeasurementError for units other than m, T and s, and for noise by another name."""
-    units = {"B_T": "T", "sigma_T": "T", "time_s": "s", **dict.fromkeys(POSITION_COLUMNS, "m")}
+    units = {**dict.fromkeys(("B_T", "sigma_T", *TOTAL_COLUMNS), "T"), "time_s": "s",
+             **dict.fromkeys(POSITION_COLUMNS, "m")}
     for name, unit in units.items():
         stated = str(data[name].attrs.get("units", unit)) if name in data.variables else unit
         if stated != unit:

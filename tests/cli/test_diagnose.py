@@ -219,8 +219,10 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert max(found["probabilities"], key=found["probabilities"].get) == "none"
     assert (out / "study.diagnosed.toml").read_text() == STUDY
     page = (out / "diagnosis.html").read_text()
-    assert '<p class="said">Nothing is missing that this map can show:' in page
-    assert "It would have shown the loss of" in page
+    assert '<p class="said">None of what was looked for (' in page
+    assert "others may be missing" in page
+    blocks_chosen = {"block_demagnetized", "block_displaced"} <= {*CHOICE.split(",")}
+    assert ("It would have shown the loss of" in page) == blocks_chosen
     loss = found["limits"]["loss"]  # noise of 3e-5 T, 1 % and 1 deg of the blocks
     assert 0.01 < loss["median"] <= loss["worst"] < 0.5
     assert "before" not in page.split("<body>")[1].split("<h2>Pictures")[0]

@@ -228,6 +228,20 @@ def test_readings_that_no_factor_makes_those_of_the_magnet(generator, tmp_path):
         assert ("times the field" in said) == (data is half)
 
 
+def test_a_held_out_map_that_is_unlike_the_magnet(generator, tmp_path):
+    """A map in mm that is held out; the map that updates is right. Control: a held-out map of 3 %
+    more, which a factor of a unit does not explain.
+    """
+    magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
+    good, other = quadrupole_map(generator, 1.0), quadrupole_map(generator, 1.0)
+    places = points_of(other) + [1e-4, 0, 0]
+    for data, unlike in ((field_map(1e3 * places, other["B_T"].values), True),
+                         (field_map(places, 1.03 * other["B_T"].values), False)):
+        said = infer(magnet, good, Session.open(tmp_path), held_out_map=data).held_out_conflict
+        assert "of the held-out map are farther" in said
+        assert ("not like the field" in said) == unlike
+
+
 def test_likeness_is_a_cosine():
     assert likeness_of(np.array([1.0, 2.0]), np.array([-2.0, -4.0])) == pytest.approx(-1.0)
     assert likeness_of(np.array([1.0, 0.0]), np.array([0.0, 1.0])) == 0.0
