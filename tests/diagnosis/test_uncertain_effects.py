@@ -204,7 +204,8 @@ def test_all_laws_of_an_instrument_can_be_uncertain(session, generator):
 def test_names_that_a_study_does_not_have(changes, sentence):
     array = DOCUMENT["array"] | {"exceptions": [{"ring": 1}]}
     with pytest.raises(StudyError, match=sentence):
-        parse_study(DOCUMENT | {"array": array, "noise": {**DOCUMENT["noise"], "position_sd_m": 1e-5},
+        noise = {**DOCUMENT["noise"], "position_sd_m": 1e-5}
+        parse_study(DOCUMENT | {"array": array, "noise": noise,
                                 "uncertain": [{"name": "a", "sd": 1.0, "change": changes}]})
 
 

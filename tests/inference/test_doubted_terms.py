@@ -234,7 +234,7 @@ def test_a_held_out_map_that_is_unlike_the_magnet(generator, tmp_path):
     """
     magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
     good, other = quadrupole_map(generator, 1.0), quadrupole_map(generator, 1.0)
-    places = points_of(other) + [1e-4, 0, 0]
+    places = points_of(other) + np.array([1e-4, 0, 0])
     for data, unlike in ((field_map(1e3 * places, other["B_T"].values), True),
                          (field_map(places, 1.03 * other["B_T"].values), False)):
         said = infer(magnet, good, Session.open(tmp_path), validation_map=data).held_out_conflict
