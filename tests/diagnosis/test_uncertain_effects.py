@@ -17,6 +17,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.inference import write_inference_report
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.uncertain_amplitudes import shared_deviations
 from halbach_fe.stats.gaussian import Gaussian
@@ -217,6 +218,17 @@ def test_a_standard_deviation_that_no_magnet_can_have_is_named():
     with pytest.raises(StudyError, match=r"`uncertain.sd` of 'radius' .* 1000 .* inner_radius_m"):
         shared_deviations(with_sd(1000.0))
     assert np.isfinite(shared_deviations(with_sd(1e-5))).all()
+
+
+def test_the_page_of_a_magnet_that_alone_is_uncertain(session, generator, tmp_path):
+    """It has the amplitude, and says nothing of instruments, of which none was estimated."""
+    study = parse_study(DOCUMENT | {"uncertain": [
+        {"name": "remanence", "sd": 0.01, "change": {"array.remanence_T": 1.0}}]})
+    shown = field_map(POINTS, field(study, drawn(study, generator), POINTS))
+    write_inference_report(infer(build_magnet(study), shown, session), tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert "remanence" in page
+    assert "has the instruments that were found" not in page
 
 
 def test_changes_of_numbers():
