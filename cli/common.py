@@ -13,6 +13,7 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import sys
 import threading
 import time
@@ -184,7 +185,7 @@ def own_folder(
     written until then name the files of the command line.
     """
     from halbach_fe.core.result_folder import result_folder
-    from halbach_fe.report.answer import MAP_OPTIONS, known_inputs, known_paths
+    from halbach_fe.report.answer import LISTED_MAPS, MAP_OPTIONS, known_inputs, known_paths
 
     inputs = [value for value in (*vars(arguments).values(),
                                   *getattr(arguments, "listed_maps", {}).values())
@@ -195,7 +196,7 @@ def own_folder(
     arguments.at_end.enter_context(result_folder(
         arguments.output, command, study, inputs, named, solving))
     arguments.at_end.enter_context(known_paths({
-        word: path if word == MAP_OPTIONS else _from_here(path)
+        word: path if word in (MAP_OPTIONS, LISTED_MAPS) else _from_here(path)
         for word, path in _paths_of(arguments).items()}))
     arguments.at_end.enter_context(known_inputs(_described(arguments)))
 
@@ -632,7 +633,7 @@ def _paths_of(arguments: argparse.Namespace) -> dict[str, Any]:
     folder names.
     """
     from halbach_fe.core.result_folder import named_inputs
-    from halbach_fe.report.answer import MAP_OPTIONS
+    from halbach_fe.report.answer import LISTED_MAPS, MAP_OPTIONS
 
     given = {word: path for word, path in _given(arguments).items() if path is not None}
     posterior = given.get("POSTERIOR")
@@ -643,7 +644,17 @@ def _paths_of(arguments: argparse.Namespace) -> dict[str, Any]:
 
         options = format_words(arguments)
     return {**{word: path for word, path in behind.items() if word in ("MAP", "BLOCKS")}, **given,
-            "DIR": getattr(arguments, "output", None), MAP_OPTIONS: options}
+            "DIR": getattr(arguments, "output", None), MAP_OPTIONS: options,
+            LISTED_MAPS: _lists_maps(given.get("STUDY"))}
+
+
+def _lists_maps(study: Path | None) -> bool:
+    """Return whether a study file, which a command has read before, has a list of maps."""
+    try:
+        text = study.read_text("utf-8-sig") if study else ""
+    except (OSError, UnicodeDecodeError):  # gone meanwhile
+        return False
+    return re.search(r"^\s*(\[\[\s*maps\s*\]\]|maps\s*=)", text, re.MULTILINE) is not None
 
 
 def _given(arguments: argparse.Namespace) -> dict[str, Path | None]:

@@ -181,9 +181,11 @@ def diagnose(
     data = check_maps(study, data)
     refuse_total_fields(data, validation_map)
     with session.with_cache() as cached:
-        return _diagnose(study, data, cached, blocks,
-                         catalogue() if effects is None else effects, validation_map, say, solver,
-                         floor_T, time_limit_s)
+        found = _diagnose(study, data, cached, blocks,
+                          catalogue() if effects is None else effects, validation_map, say, solver,
+                          floor_T, time_limit_s)
+        return found if effects is None else replace(
+            found, looked_for=tuple(effect.name for effect in effects))
 
 
 def _diagnose(

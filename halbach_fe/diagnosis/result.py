@@ -288,6 +288,8 @@ class Diagnosis(ShownInNotebook):
     floor_T : dict, or None
         The model-free floor of the map by component (``Bx``), if Maxwell's check of it is known; of
         maps that the study lists, by map and component.
+    looked_for : tuple of str, or None
+        Names of the only effects that were looked for; None if these are all of the catalogue.
 
     Examples
     --------
@@ -325,6 +327,7 @@ class Diagnosis(ShownInNotebook):
     uncompared: int | None = None
     suspected: tuple[Suspicion, ...] = ()
     answer: int = 0
+    looked_for: tuple[str, ...] | None = None
 
     @property
     def is_at_rest(self) -> bool:

@@ -53,6 +53,10 @@ FAR = 0.5
 """Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
 block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
 
+ALONG_DEG = 5.0
+"""Angle in degrees within which a moment lies along the nominal one: easy axes of blocks are a few
+degrees off, other axes of a block 90."""
+
 VOLUME_TOLERANCE = 0.1
 """Largest deviation of a measured volume from that of the study's block, relative to the latter.
 The chamfers and tolerances of blocks change it by less."""
@@ -545,7 +549,8 @@ def _check_near(table: BlockTable, deviations: Floats) -> None:
     angle = np.degrees(np.arccos(np.clip((deviations[row, 0] + 1) / ratio, -1, 1)))
     hint = ("Are the moments in the block's own axes as mounted (x radially outward), and is that "
             "its type?")
-    if not 0.03 < np.median(ratios) < 30:
+    if not 0.03 < np.median(ratios) < 30 or (
+            angle < ALONG_DEG and np.ptp(ratios) < FAR * np.median(ratios)):
         hint = "Are moments and volumes in A m^2 and m^3?"
     raise MeasurementError(must_be(
         f"moment of block {table.serial[row]}", table.source,

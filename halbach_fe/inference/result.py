@@ -23,12 +23,14 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import ONLY_MAP
 from halbach_fe.measurement.doubted_terms import (
     ALL_BLOCKS,
+    UNLIKE,
     Term,
     block_doubts,
     doubts,
     doubts_in_words,
     factor_in_words,
     factor_of,
+    likeness_of,
     words_of,
 )
 from halbach_fe.measurement.observation import Observation
@@ -64,6 +66,13 @@ TOO_NEAR = 0.1
 """chi-squared per reading below which the noise or the prior is stated too large, by a factor of
 three. Error bars of the solver that count as noise leave 0.2 in magnets that are known well."""
 
+FAR_FROM_ZERO = 3.0
+"""Size of readings, in units of what prior and noise make of a field that is zero, from which they
+can be compared with the nominal field in shape."""
+
+OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) Run `halbach-fe check` "
+             "for the noise of the map.")
+"""Advice where the noise is stated too large."""
 
 TOO_FAR = 1.3
 """chi-squared per held-out reading, with the covariance of the predictions, up to which there is no
@@ -532,10 +541,12 @@ class InferenceResult(ShownInNotebook):
 
     @property
     def _doubted(self) -> str:
-        """Sentences about `doubts` and a factor of the readings; nothing if there are none."""
-        chosen = ~self.held_out
-        factor = factor_of(self.readings[chosen], self.prediction_prior.mean[chosen])
-        said = [doubts_in_words(self.doubts), factor_in_words(factor) if self.doubts else ""]
+        """Sentences about `doubts`, a factor of the readings, and readings that are not like the
+        model, if model and readings disagree; nothing if there are none.
+        """
+        said = [doubts_in_words(self.doubts)]
+        if self._conflict or self.doubts:
+            said.append(self._unlike(~self.held_out, bool(self.doubts)))
         return " ".join(each for each in said if each)
 
     @cached_property
@@ -571,14 +582,12 @@ class InferenceResult(ShownInNotebook):
         if chi2 < TOO_NEAR and self.solver_over_noise < 1:
             return (f"The readings are {_times_nearer(chi2)} times nearer to the "
                     "model than their noise and the prior allow (chi² per reading is "
-                    f"{chi2:.2g}, where 1 is expected): the study's sigma_T, position_sd_m or prior"
-                    " is too large, so that error bars are too wide. Run `halbach-fe check` for the"
-                    " noise of the map.")
+                    f"{chi2:.2g}, where 1 is expected): sigma_T, position_sd_m or prior is too "
+                    f"large, so that error bars are too wide. {OWN_NOISE}")
         if self.noise_ratio < TOO_NEAR:
             return (f"The updated model is {_times_nearer(self.noise_ratio)} times nearer to the "
-                    "readings than their noise allows: the study's sigma_T or position_sd_m is too "
-                    "large, so that error bars are too wide. Run `halbach-fe check` for the noise "
-                    "of the map.")
+                    "readings than their noise allows: sigma_T or position_sd_m is too "
+                    f"large, so that error bars are too wide. {OWN_NOISE}")
         return ""
 
     @property
@@ -592,11 +601,23 @@ class InferenceResult(ShownInNotebook):
             chi2 = sum(score.readings * float(score.chi2_posterior or 0.0)
                        for score in of_part) / count
             if chi2 > max(TOO_FAR, 1 + 5 * np.sqrt(2 / count)):
+                unlike = self._unlike(np.array(self.parts) == part) if words else ""
                 return (f"Held-out readings{words} are farther from their predictions than these "
                         f"and the noise allow (chi² per reading is {decimals(chi2)}, where 1 is "
                         "expected): sigma_T is too small, an effect is missing from the model, or "
-                        "these readings are not of this magnet.")
+                        f"these readings are not of this magnet.{unlike and f' {unlike}'}")
         return ""
+
+    def _unlike(self, chosen: NDArray[np.bool_], doubted: bool = True) -> str:
+        """Say that chosen readings, by a mask (n,), are not like the field that the prior predicts
+        or, if ``doubted``, a factor times it; nothing if they are neither.
+        """
+        both = self.readings[chosen], self.prediction_prior.mean[chosen]
+        allowed = np.hypot(self.prediction_prior.sd, self.noise.sd)[chosen]
+        far = np.linalg.norm(both[0]) > FAR_FROM_ZERO * np.linalg.norm(allowed)
+        likeness = likeness_of(*both) if far else 1.0
+        return factor_in_words(factor_of(*both), likeness) \
+            if doubted or abs(likeness) < UNLIKE else ""
 
     @property
     def _conflict(self) -> str:

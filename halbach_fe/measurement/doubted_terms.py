@@ -26,6 +26,10 @@ FACTOR_OFF = 0.1
 """Part by which readings must differ in size from the model for their unit to be suspected: blocks
 of another grade are a few per cent off."""
 
+UNLIKE = 0.5
+"""Cosine between readings and model below which no factor relates them: that of exchanged
+components is about 0, and blocks at the edge of what is accepted leave 0.9."""
+
 NEAR_FACTOR = 0.05
 """Part by which a factor may differ from that of a known error: blocks of another batch or
 temperature are a few per cent off."""
@@ -185,8 +189,15 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
                         float(change[block, axis]), float(sd[block, axis]))], sd.size)
 
 
-def factor_in_words(factor: float) -> str:
-    """Say that readings are a factor times the field of the model; nothing if they are not."""
+def factor_in_words(factor: float, likeness: float = 1.0) -> str:
+    """Say that readings are a factor times the field of the model, or that they are not like it.
+
+    ``likeness`` is that of `likeness_of`. Nothing is said of a factor near 1.
+    """
+    if abs(likeness) < UNLIKE:
+        return ("The readings are not like the field of the magnet as it was ordered, by whatever "
+                "factor: look at the names of their components, at their axes, and at the places "
+                "and their unit (mm for m?) in the file first.")
     if abs(factor - 1) < FACTOR_OFF:
         return ""
     known = f" ({words})" if (words := known_factor(factor)) else ""
@@ -199,6 +210,12 @@ def known_factor(factor: float) -> str:
     """Return what error of a file a factor is near to, in words; nothing if none."""
     return next((words for value, words in FACTORS.items()
                  if abs(factor / value - 1) < NEAR_FACTOR), "")
+
+
+def likeness_of(readings: Floats, field: Floats) -> float:
+    """Return the cosine (-1 to 1) between readings (n,) and a field (n,); 1 where one is zero."""
+    size = float(np.linalg.norm(readings) * np.linalg.norm(field))
+    return float(field @ readings) / size if size else 1.0
 
 
 def factor_of(readings: Floats, field: Floats) -> float:

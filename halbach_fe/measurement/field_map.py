@@ -33,6 +33,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
+from halbach_fe.core.numbers import decimals
 from halbach_fe.measurement.clock_times import look_like_clock
 from halbach_fe.measurement.tables import (
     _check_printable,
@@ -61,6 +62,10 @@ FOREIGN = ("A table with other columns, other separators or no header is convert
 MAX_FIELD_T = 10.0
 """Largest flux density in T that is accepted. No permanent magnet reaches it; a larger value is
 probably in mT or G."""
+
+LENGTH_OFF = 0.1
+"""Part by which |B| may differ from the length of the components beside it where they are strong:
+gains of two probes differ by a few per cent, units by factors of 10."""
 
 
 def field_map(
@@ -449,8 +454,7 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
     if "sigma_T" in data:
         sigma = data["sigma_T"].values[~np.isnan(values)]
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
-            raise MeasurementError(must_be("sigma", where, "positive for every reading",
-                                           "a zero, negative or missing value"))
+            raise _no_noise("sigma", where, data["sigma_T"].values, ~np.isnan(values))
     if "time_s" in data and not np.isfinite(data["time_s"].values).all():
         raise MeasurementError(must_be("`time_s`", where, "finite numbers",
                                        "an infinite or missing value"))
@@ -462,6 +466,16 @@ def check_readings(data: xr.Dataset, path: Path | str) -> None:
     if "scan" in data:
         _check_printable(map(str, np.unique(data["scan"].values)), "scan", where)
     _check_duplicates(data, points, where)
+
+
+def _no_noise(name: str, where: str, sigma: Floats, read: NDArray[np.bool_]) -> MeasurementError:
+    """Return the error of noise (n, ...) that is none, by the first such reading of ``read``."""
+    wrong = (read & ~(np.isfinite(sigma) & (sigma > 0))).reshape(len(sigma), -1)
+    row, column = np.argwhere(wrong)[0]
+    return MeasurementError(must_be(
+        f"{name} of reading {row + 1}", where, "positive",
+        f"{sigma.reshape(len(sigma), -1)[row, column]:g}", "Correct it, or remove the columns of "
+        "sigma: the study's [[noise.regions]] then hold."))
 
 
 def _without_total(
@@ -486,8 +500,8 @@ def _without_total(
     if TOTAL_SIGMA_COLUMN in data:
         sigma = data[TOTAL_SIGMA_COLUMN].values[~np.isnan(total)]
         if not (sigma > 0).all() or not np.isfinite(sigma).all():
-            raise MeasurementError(must_be(TOTAL_SIGMA_COLUMN, where, "positive for every reading",
-                                           "a zero, negative or missing value"))
+            raise _no_noise(TOTAL_SIGMA_COLUMN, where, data[TOTAL_SIGMA_COLUMN].values,
+                            ~np.isnan(total))
     if blank.all() and "sigma_T" in data:
         raise MeasurementError(must_be(
             "`sigma_T`", where, f"named {TOTAL_SIGMA_COLUMN} in a map of |B| alone", "sigma_T"))
@@ -498,6 +512,23 @@ def _without_total(
             f"{TOTAL_COLUMN} alone", "Put the rows of |B| into a map of their own; a study can "
             "list both."))
     return blank & np.isnan(total)
+
+
+def _check_length(data: xr.Dataset, where: str) -> None:
+    """Raise MeasurementError if a map's |B| is, where it is strong, not the length of its
+    components: one of both is in another unit, or is not what its name says.
+    """
+    length, total = np.linalg.norm(data["B_T"].values, axis=1), data[TOTAL_COLUMN].values
+    known = np.isfinite(length) & np.isfinite(total) & (length > 0)
+    if not known.any():
+        return
+    strong = known & (length >= np.median(length[known]))
+    times = float(np.median(total[strong] / length[strong]))
+    if abs(times - 1) > LENGTH_OFF:
+        raise MeasurementError(must_be(
+            TOTAL_COLUMN, where, "the length of Bx, By, Bz, in their unit",
+            f"{decimals(times)} times as much", f"Correct the unit or the columns, or remove "
+            f"{TOTAL_COLUMN}: beside components it only tests them."))
 
 
 def check_magnitudes(data: xr.Dataset) -> None:
@@ -523,6 +554,8 @@ def check_magnitudes(data: xr.Dataset) -> None:
             "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
             "study, or convert the map by halbach-fe import-map."))
+    elif TOTAL_COLUMN in data:
+        _check_length(data, where)
     if sigmas is not None:
         sigma = sigmas.values[~np.isnan(values)]
         for extreme in (sigma.max(), sigma.min()):

@@ -22,6 +22,12 @@ STANDS_FOR = {
 MAP_OPTIONS = "options of MAP"
 """Key of the options, a list of words, without which a map in other columns cannot be read."""
 
+LISTED_MAPS = "maps of STUDY"
+"""Key of whether the study lists its maps, so that a command must not name one."""
+
+TAKE_LISTED_MAPS = ("infer", "diagnose", "register")
+"""Commands that take the maps that a study lists."""
+
 _NAMES: ContextVar[Mapping[str, object] | None] = ContextVar("names", default=None)
 
 
@@ -108,7 +114,8 @@ class Answer:
     def with_paths(self, paths: Mapping[str, object]) -> Answer:
         """Return the answer with the paths that are known in place of the words of its command.
 
-        An update with a map gets the table of blocks too, if its path is known.
+        An update with a map gets the table of blocks too, if its path is known. Of a study that
+        lists its maps, `infer`, `diagnose` and `register` take no other.
         """
         def known(word: str) -> str:
             name, slash, rest = word.partition("/")
@@ -123,6 +130,9 @@ class Answer:
         if paths.get("BLOCKS") is not None and "--measurements" in words and not {
                 "--blocks", "NEW_MAP"} & set(words):
             words[words.index("-o"):words.index("-o")] = ["--blocks", "BLOCKS"]
+        if paths.get(LISTED_MAPS) and "MAP" in words and {*TAKE_LISTED_MAPS} & set(words):
+            first = words.index("--measurements")
+            del words[first:first + 2]
         return replace(self, command=" ".join(map(known, words)))
 
     def with_known_paths(self, folder: bool = True) -> Answer:

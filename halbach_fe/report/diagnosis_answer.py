@@ -206,7 +206,9 @@ def _found(diagnosis: Diagnosis) -> list[str]:
         these = "these maps" if several else "this map"
         start = ("Nothing was found so far:" if diagnosis.uncompared is not None else
                  f"Nothing else is missing that {these} can show: with that," if sentences
-                 else f"Nothing is missing that {these} can show:")
+                 else f"Nothing is missing that {these} can show:"
+                 if diagnosis.looked_for is None else
+                 f"None of what was looked for ({', '.join(diagnosis.looked_for)}) is missing:")
         agree = "the maps agree" if several else "the map agrees"
         if diagnosis.after.held_out_conflict:
             start = "Something is missing that was not found: readings that were held out disagree."
@@ -289,7 +291,11 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
         sentences.append(after.too_near)
     nothing = not (diagnosis.identified or diagnosis.suspected or diagnosis.unknown
                    or _fails(diagnosis))
-    if nothing and diagnosis.limits:
+    if diagnosis.looked_for is not None:
+        sentences.append(
+            "Only the effects that were chosen (--effects) were looked for: others may be missing.")
+    if nothing and diagnosis.limits and (diagnosis.looked_for is None or {
+            "block_demagnetized", "block_displaced"} <= {*diagnosis.looked_for}):
         sentences.append(limits_in_words(diagnosis.limits))
     return sentences
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
@@ -103,5 +103,12 @@ def _either_side(
         except StudyError:
             sides.append(study)
     if not between:
-        shifted(study, uncertain, step * uncertain.sd)  # raises the error
+        try:
+            shifted(study, uncertain, step * uncertain.sd)
+        except StudyError as error:
+            raise StudyError(must_be(
+                f"`uncertain.sd` of '{uncertain.name}'", f"study {study.name}",
+                f"small enough that the study can be changed by {step:g} of it",
+                f"{uncertain.sd:g} (in the unit of the key, as m and T)",
+                f"Correct it. The change by that step: {error}")) from None
     return (sides[0], sides[1]), between

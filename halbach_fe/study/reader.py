@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 import types
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -166,9 +167,19 @@ def _sentence(error: ValidationError, where: str) -> str:
         hint = f"Did you mean '{near[0]}'?" if near else ""
         if kind == "union_tag_not_found":
             hint = f"Add the key, as one of {', '.join(map(repr, tags))}."
+    elif kind == "tuple_type" and isinstance(value, dict) and _holds_tables(model, first["loc"]):
+        hint = f"Write [[{key}]] for [{key}], and once more for each further one."
     elif isinstance(value, int | float) and not isinstance(value, bool):
         hint = _unit_hint(key, value, first.get("ctx", {}))
     return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
+
+
+def _holds_tables(model: type[BaseModel] | None, location: tuple[int | str, ...]) -> bool:
+    """Return whether a key of a model is a list of tables."""
+    field = model.model_fields.get(str(location[-1])) if model else None
+    return field is not None and any(
+        isinstance(item, type) and issubclass(item, BaseModel)
+        for item in typing.get_args(field.annotation))
 
 
 def _more(errors: list[Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
@@ -65,11 +66,25 @@ def check_uncertain(study: Study) -> None:
 def _check_number(study: Study, name: str) -> None:
     """Check that a name is that of a number that a study states."""
     value: Any = study
+    hint = ""
     for step in _steps(name):
-        value = dict(_parts(value)).get(step)
+        known = dict(_parts(value))
+        hint = _nearest(step, known)
+        value = known.get(step)
+        if value is None:
+            break
+    if isinstance(value, tuple) and value and isinstance(value[0], float):
+        hint = f"; it has {len(value)} of them, the first of which is '{name}[1]'"
     if not isinstance(value, float):
         raise ValueError(f"uncertain.change names '{name}', which must be a number with a "
-                         "fraction that the study states")
+                         f"fraction that the study states{hint}")
+
+
+def _nearest(step: str | int, known: Mapping[str | int, Any]) -> str:
+    """Return a question about the key of ``known`` that is most like one that is not among them."""
+    keys = [key for key in known if isinstance(key, str)]
+    near = difflib.get_close_matches(str(step), keys, 1) if step not in known else []
+    return f"; did you mean '{near[0]}'?" if near else ""
 
 
 def shifted(study: Study, uncertain: Uncertain, amount: float) -> Study:

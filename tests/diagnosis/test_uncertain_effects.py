@@ -17,7 +17,9 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.inference import write_inference_report
 from halbach_fe.response.magnetic_axis import magnetic_axis
+from halbach_fe.response.uncertain_amplitudes import shared_deviations
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
@@ -194,15 +196,39 @@ def test_all_laws_of_an_instrument_can_be_uncertain(session, generator):
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [
-    ({"array.remanance_T": 1.0}, "which must be a number with a fraction"),
+    ({"array.remanance_T": 1.0}, "number with a fraction .* did you mean 'remanence_T'"),
+    ({"instrument.gain": 1.0}, r"it has 3 of them, the first of which is 'instrument.gain\[1\]'"),
+    ({"noise.position_sd_m": 1.0}, r"which is 'noise.position_sd_m\[1\]'"),
     ({"array.rings": 1.0}, "which must be a number with a fraction"),
     ({"array.exceptions[2].twist_deg": 1.0}, "which must be a number with a fraction"),
     ({"array.remanence_T": 1.0, "instrument.gain[1]": 1.0}, "both the magnet and an instrument")])
 def test_names_that_a_study_does_not_have(changes, sentence):
     array = DOCUMENT["array"] | {"exceptions": [{"ring": 1}]}
     with pytest.raises(StudyError, match=sentence):
-        parse_study(DOCUMENT | {"array": array,
+        noise = {**DOCUMENT["noise"], "position_sd_m": 1e-5}
+        parse_study(DOCUMENT | {"array": array, "noise": noise,
                                 "uncertain": [{"name": "a", "sd": 1.0, "change": changes}]})
+
+
+def test_a_standard_deviation_that_no_magnet_can_have_is_named():
+    """10 m, or 10 mm in another unit, for a radius of decimetres. Control: 10 um."""
+    def with_sd(sd):
+        return build_magnet(parse_study(DOCUMENT | {"uncertain": [
+            {"name": "radius", "sd": sd, "change": {"array.inner_radius_m": 1.0}}]}))
+    with pytest.raises(StudyError, match=r"`uncertain.sd` of 'radius' .* 1000 .* inner_radius_m"):
+        shared_deviations(with_sd(1000.0))
+    assert np.isfinite(shared_deviations(with_sd(1e-5))).all()
+
+
+def test_the_page_of_a_magnet_that_alone_is_uncertain(session, generator, tmp_path):
+    """It has the amplitude, and says nothing of instruments, of which none was estimated."""
+    study = parse_study(DOCUMENT | {"uncertain": [
+        {"name": "remanence", "sd": 0.01, "change": {"array.remanence_T": 1.0}}]})
+    shown = field_map(POINTS, field(study, drawn(study, generator), POINTS))
+    write_inference_report(infer(build_magnet(study), shown, session), tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert "remanence" in page
+    assert "has the instruments that were found" not in page
 
 
 def test_changes_of_numbers():

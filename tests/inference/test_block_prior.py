@@ -195,6 +195,16 @@ def test_rotation_from_block_axes(vacuum_dipole, generator):
                           table_of(study, slots, truth, rings, moment=VOLUME * truth))
 
 
+def test_moments_in_another_unit_are_asked_for_it(vacuum_dipole, generator):
+    """All a factor of 0.16 off along their axes, as polarizations in T: the axes are right."""
+    study = vacuum_dipole()
+    slots, rings, truth = blocks_and_truth(study, generator)
+    moment = 0.16 * VOLUME * in_block_axes(study, slots, truth)
+    with pytest.raises(MeasurementError, match=r"Are moments and volumes in A m\^2 and m\^3"):
+        prior_from_blocks(build_magnet(study),
+                          table_of(study, slots, truth, rings, moment=moment))
+
+
 def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, tmp_path):
     """All blocks 30 % stronger, or all at 80 degrees, is no table to be taken without a word."""
     study = vacuum_dipole()

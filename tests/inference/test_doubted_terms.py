@@ -34,12 +34,14 @@ from halbach_fe.measurement.doubted_terms import (
     doubts_in_words,
     factor_in_words,
     known_factor,
+    likeness_of,
     words_of,
 )
 from halbach_fe.measurement.field_map import (
     directed,
     field_map,
     is_undirected,
+    points_of,
     read_map,
     undirected,
     write_map,
@@ -206,6 +208,46 @@ def test_half_a_field_weakens_the_blocks(generator, tmp_path):
     right = infer(magnet, quadrupole_map(generator, 1.0), Session.open(tmp_path / "j"))
     assert right.doubts == ()
     assert "ordered" not in inference_answer(right).trust
+
+
+def test_readings_that_no_factor_makes_those_of_the_magnet(generator, tmp_path):
+    """Places in mm that are taken for m, and exchanged components: a factor would mislead.
+    Controls: half the field, and a map that is right but for noise ten times as large as stated.
+    """
+    magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
+    good = quadrupole_map(generator, 1.0)
+    in_mm = field_map(1e3 * points_of(good), good["B_T"].values)
+    turned = field_map(points_of(good), good["B_T"].values[:, [1, 2, 0]])
+    noisy = field_map(points_of(good), good["B_T"].values
+                      + 2e-3 * generator.standard_normal((len(points_of(good)), 3)))
+    half = quadrupole_map(generator, 0.5)
+    for data, unlike in ((in_mm, True), (turned, True), (half, False), (noisy, False)):
+        said = infer(magnet, data, Session.open(tmp_path)).disagreement
+        assert "cannot all be right" in said
+        assert ("not like the field" in said) == unlike
+        assert ("times the field" in said) == (data is half)
+
+
+def test_a_held_out_map_that_is_unlike_the_magnet(generator, tmp_path):
+    """A map in mm that is held out; the map that updates is right. Control: a held-out map of 3 %
+    more, which a factor of a unit does not explain.
+    """
+    magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
+    good, other = quadrupole_map(generator, 1.0), quadrupole_map(generator, 1.0)
+    places = points_of(other) + np.array([1e-4, 0, 0])
+    for data, unlike in ((field_map(1e3 * places, other["B_T"].values), True),
+                         (field_map(places, 1.03 * other["B_T"].values), False)):
+        said = infer(magnet, good, Session.open(tmp_path), validation_map=data).held_out_conflict
+        assert "of the held-out map are farther" in said
+        assert ("not like the field" in said) == unlike
+
+
+def test_likeness_is_a_cosine():
+    assert likeness_of(np.array([1.0, 2.0]), np.array([-2.0, -4.0])) == pytest.approx(-1.0)
+    assert likeness_of(np.array([1.0, 0.0]), np.array([0.0, 1.0])) == 0.0
+    assert likeness_of(np.zeros(2), np.ones(2)) == 1.0
+    assert "not like" in factor_in_words(1.0, 0.1)
+    assert factor_in_words(1.0, 0.9) == ""
 
 
 def test_terms_that_infer_finds_are_judged_too(generator, tmp_path):

@@ -144,6 +144,17 @@ def test_hdf5_sigma_for_all_components_at_once(tmp_path):
     assert read_map(tmp_path / "map.h5")["sigma_T"].values[:, 2].tolist() == [1e-4, 2e-4, 3e-4]
 
 
+@pytest.mark.parametrize("name", ["sigma_T", "sigma_By_T"])
+def test_noise_that_is_none_is_named_by_its_row(name, tmp_path):
+    path = tmp_path / "map.csv"
+    path.write_text(f"x_m,y_m,z_m,By_T,{name}\n0,0,0,0.5,1e-4\n0,0,0.1,0.4,-2e-4\n")
+    with pytest.raises(MeasurementError, match=r"sigma of reading 2 of .*received -0\.0002\. "
+                                               r"Correct it, or remove"):
+        read_map(path)
+    path.write_text("x_m,y_m,z_m,By_T\n0,0,0,0.5\n0,0,0.1,0.4\n")  # what is advised
+    assert "sigma_T" not in read_map(path)
+
+
 def test_hdf5_without_readings_is_refused(tmp_path):
     field_map(np.zeros((0, 3)), np.zeros((0, 3))).to_netcdf(tmp_path / "map.h5",
                                                             engine="h5netcdf")

@@ -11,6 +11,7 @@ import xarray as xr
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import (
+    check_magnitudes,
     field_map,
     is_total_field,
     points_of,
@@ -128,6 +129,21 @@ def test_rows_where_the_magnitude_contradicts_the_components(generator):
     wrong[[4, 50, 200]] += 0.01
     assert contradicted_rows(with_total_field(field_map(GRID, field), wrong)) == (5, 51, 201)
     assert contradicted_rows(field_map(GRID, field)) == ()
+
+
+@pytest.mark.parametrize(("times", "said"), [(1e3, "1\u202f000 times"), (0.5, "0.5 times")])
+def test_a_magnitude_that_contradicts_all_rows_is_refused(times, said, generator, tmp_path, capsys):
+    """|B| in mT beside components in T. Control: a gain of 5 % between both."""
+    field = source().getB(GRID) + NOISE_T * generator.standard_normal(GRID.shape)
+    write_map(with_total_field(field_map(GRID, field), times * size_of()), tmp_path / "map.csv")
+    assert main(["check", str(tmp_path / "map.csv")]) == MeasurementError.exit_code
+    sentence = capsys.readouterr().err
+    assert "must be the length of Bx, By, Bz" in sentence
+    assert said in sentence
+    check_magnitudes(with_total_field(field_map(GRID, field), 1.05 * size_of()))
+    one_spike = size_of()
+    one_spike[3] *= 100  # rows are named one by one
+    check_magnitudes(with_total_field(field_map(GRID, field), one_spike))
 
 
 def test_the_check_names_contradictions(generator, tmp_path, capsys):

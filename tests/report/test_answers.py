@@ -43,7 +43,7 @@ from halbach_fe.report import (
     tolerance,
     verification,
 )
-from halbach_fe.report.answer import Answer, known_paths
+from halbach_fe.report.answer import LISTED_MAPS, Answer, known_paths
 from halbach_fe.report.words import (
     bayes_factor,
     decimals,
@@ -442,6 +442,28 @@ def test_the_command_has_the_files_of_the_user(tmp_path):
     found = answer.with_paths({"STUDY": tmp_path / "my study.toml", "DIR": "a b", "POSTERIOR": "p"})
     assert shlex.split(found.command)[2:] == [
         str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
+
+
+@pytest.mark.parametrize("verb", ["infer", "diagnose", "register", "shim"])
+def test_a_study_that_lists_its_maps_gets_no_other(verb):
+    """`infer`, `diagnose` and `register` refuse one beside them; `shim` takes a single map."""
+    answer = Answer("?", "", "", "", f"halbach-fe {verb} STUDY --measurements MAP -o DIR")
+    found = answer.with_paths({"STUDY": "s.toml", LISTED_MAPS: True})
+    assert found.command == (f"halbach-fe {verb} s.toml -o DIR" if verb != "shim" else
+                             "halbach-fe shim s.toml --measurements MAP -o DIR")
+    assert "MAP" in answer.with_paths({LISTED_MAPS: False}).command
+
+
+def test_a_study_file_that_lists_its_maps_is_known(tmp_path):
+    from halbach_fe.cli.common import _lists_maps
+
+    path = tmp_path / "study.toml"
+    for text, lists in (("[[maps]]\nname = 'a'\n", True), ("maps = [{name = 'a'}]", True),
+                        ("# [[maps]]\n[mesh]\n", False)):
+        path.write_text(text)
+        assert _lists_maps(path) == lists
+    assert not _lists_maps(None)
+    assert not _lists_maps(tmp_path / "gone.toml")
 
 
 def test_words_that_stand_for_no_known_path_are_explained():

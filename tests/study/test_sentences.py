@@ -99,6 +99,9 @@ def test_every_kind_of_error_has_a_sentence():
     ({"array__exceptions": [{"ring": 2, "magnetization_factor": 0}]},
      "an exception names ring 2 of an array of"),
     ({"noise": {"regions": [{"name": "a", "sigma_T": 1e300}]}}, "less than or equal to 1"),
+    ({"maps": {"name": "a", "file": "a.csv"}}, "`maps` of study must be a list; instead received a "
+     "table. Write [[maps]] for [maps], and once more for each further one."),
+    ({"instrument": {"gain": {"x": 0.1}}}, "must be a list; instead received a table."),
     ({"maps": [{"name": "a", "file": ""}]}, "`maps[0].file` of study must be a text of 1 or more"),
     ({"demagnetization": {"irreversible": "maybe"}}, "`demagnetization"),
 ])
