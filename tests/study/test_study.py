@@ -387,7 +387,7 @@ def test_no_number_is_nan_or_infinite():
 
 @pytest.mark.parametrize(("change", "said"), [
     ({"array__remanence": 1.2}, "Did you mean `remanence_T`?"),
-    ({"colour": "red"}, "Known keys here: name, "),
+    ({"zzz": "red"}, "Known keys here: name, "),
     ({"iron_ring__relative_permeability": 500.0}, "instead received nothing. Give `iron_ring`"),
     ({"dimension__x": 2}, "`dimension` of changed Study must be a table")])
 def test_with_refuses_keys_and_tables_that_are_not_there(change, said):
