@@ -21,7 +21,7 @@ ROWS = 30
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
-    parser.add_argument("what", choices=("ls", "clear"),
+    parser.add_argument("what", choices=("ls", "clear"), metavar="{ls,clear}",
                         help="list the entries, or remove all of them")
     parser.add_argument("--cache", type=common.path, metavar="DIR",
                         help="folder of the cache (default: $HALBACH_FE_CACHE, then "

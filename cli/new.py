@@ -138,6 +138,15 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
         raise CommandLineError(must_be(
             "--ring-length-m", "the command line", "given with --inner-radii-m", "nothing",
             "Rings that follow each other along z have a length."))
+    if given.get("rings", 1) > 1 and not given.keys() & {"ring_length_m", "cube_m", "free_blocks"}:
+        raise CommandLineError(must_be(
+            "--ring-length-m", "the command line", "given with --rings", "nothing",
+            "Rings that follow each other along z have a length."))
+    edge = given.get("cube_m")
+    if isinstance(edge, float) and radius_m is not None and not edge < 2 * radius_m:
+        raise CommandLineError(must_be(
+            "--cube-m", "the command line", f"less than twice --radius-m, {radius_m:g}, at which "
+            "the cubes have their middles", f"{edge:g}", "Both are in metres."))
     if ("cube_m" in given) != (radius_m is not None):
         raise CommandLineError(must_be(
             "--radius-m", "the command line", "given together with --cube-m", "one of them",

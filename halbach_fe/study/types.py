@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator
 from functools import cache
 from types import NoneType
@@ -161,22 +162,28 @@ class StudyModel(BaseModel):
         Raises
         ------
         StudyError
-            If the result is not valid.
-        TypeError
-            If there is no such key.
+            If there is no such key or table, or the result is not valid.
         """
         values = {name: getattr(self, name) for name in type(self).model_fields}
+        where = f"changed {type(self).__name__}"
         for key, value in changes.items():
             name, nested, rest = key.partition("__")
             if name not in values:
-                raise TypeError(f"{type(self).__name__} has no key {name}")
+                near = difflib.get_close_matches(name, values, 1, 0.5)
+                raise StudyError(must_be(
+                    "name", where, "a key of it", f"`{name}`", f"Did you mean `{near[0]}`?"
+                    if near else f"Known keys here: {', '.join(values)}."))
+            if nested and not isinstance(values[name], StudyModel):
+                raise StudyError(must_be(
+                    f"`{name}`", where, f"a table, for `{key}` to change a key of it",
+                    sentences.received(values[name]),
+                    f"Give `{name}` as a whole."))
             values[name] = values[name].with_(**{rest: value}) if nested else value
         try:
             return type(self).model_validate(values)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             key = ".".join(map(str, first["loc"])) or "the whole"
-            where = f"changed {type(self).__name__}"
             if (ours := sentences.contradiction(first)) is not None:
                 raise StudyError(
                     f"Input `{key}` of {where} must be consistent: {ours}.") from None

@@ -106,6 +106,17 @@ def test_free_blocks_without_a_bore_are_measured_around_the_magnet(tmp_path, pla
         np.linalg.norm(points, axis=1).min() > corner)
 
 
+@pytest.mark.parametrize(("options", "said"), [
+    (["--rings", "3"], "--ring-length-m of the command line must be given with --rings"),
+    (["--cube-m", "12", "--radius-m", "0.07"],
+     "--cube-m of the command line must be less than twice --radius-m, 0.07")])
+def test_a_refused_option_is_named_as_it_was_given(tmp_path, capsys, options, said):
+    """Users of `new` do not know the keys yet, and a radius of -5.93 m was none of theirs."""
+    assert main(["new", str(tmp_path / "wrong.toml"), *options]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "wrong.toml").exists()
+
+
 CUBES = ["--cube-m", "0.012", "--radius-m", "0.136", "--blocks-per-ring", "24"]
 
 

@@ -226,10 +226,17 @@ def test_bdsim_maps_are_read_as_they_are_written(tmp_path):
     np.testing.assert_allclose(points_of(found.data)[order], points, atol=1e-15)
     np.testing.assert_array_equal(found.data["B_T"].values[order], field)
     text = path.read_text()
-    for old, new, asked in (("nx> 2", "nx> 3", "18 points"), ("Fz", "t", "does not change")):
+    assert not found.imported.remarks
+    for old, new, asked in (
+            ("nx> 2", "nx> 3", "18 points"), ("Fz", "t", "does not change"),
+            ("nx> 2\n", "nx> -2\nny> -3\n", "0 points"),
+            ("xmin> -1.0", "xmin> -10.0", "column X .* from -10.0 to 1.0 cm"),  # keys in mm
+            ("zmax> 20.0", "zmax> 0.2", "column Z")):
         path.write_text(text.replace(old, new))
         with pytest.raises(MeasurementError, match=asked):
             import_map(path, DeclaredFormat())
+    path.write_text(text.replace("xyzt", "tzyx"))  # BDSIM would give the readings to other points
+    assert "order" in import_map(path, DeclaredFormat()).imported.remarks[0]
 
 
 @pytest.mark.parametrize(("line", "told"), [

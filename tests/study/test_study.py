@@ -383,3 +383,17 @@ def test_no_number_is_nan_or_infinite():
             TableCurve(kind="table", H_A_per_m=(1.0, 2.0, value), B_T=(0.1, 0.2, 0.3))
         with pytest.raises(ValidationError):
             TableCurve(kind="table", H_A_per_m=(1.0, 2.0, 3.0), B_T=(0.1, 0.2, value))
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"array__remanence": 1.2}, "Did you mean `remanence_T`?"),
+    ({"zzz": "red"}, "Known keys here: name, "),
+    ({"iron_ring__relative_permeability": 500.0}, "instead received nothing. Give `iron_ring`"),
+    ({"dimension__x": 2}, "`dimension` of changed Study must be a table")])
+def test_with_refuses_keys_and_tables_that_are_not_there(change, said):
+    """A slip in a name was a TypeError, or an AttributeError of None."""
+    study = parse_study(DIPOLE, "study file x.toml")
+    with pytest.raises(StudyError) as caught:
+        study.with_(**change)
+    assert said in str(caught.value)
+    assert study.with_(array__remanence_T=1.2).array.remanence_T == 1.2  # the control
