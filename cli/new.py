@@ -138,7 +138,9 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
         raise CommandLineError(must_be(
             "--ring-length-m", "the command line", "given with --inner-radii-m", "nothing",
             "Rings that follow each other along z have a length."))
-    if given.get("rings", 1) > 1 and not given.keys() & {"ring_length_m", "cube_m", "free_blocks"}:
+    rings = given.get("rings")
+    if isinstance(rings, int) and rings > 1 and not given.keys() & {
+            "ring_length_m", "cube_m", "free_blocks"}:
         raise CommandLineError(must_be(
             "--ring-length-m", "the command line", "given with --rings", "nothing",
             "Rings that follow each other along z have a length."))
