@@ -180,7 +180,7 @@ def _unit_hint(key: str, value: float, limits: Mapping[str, Any]) -> str:
 
     ``limits`` are those of pydantic that the value violates, by their names: ge, gt, le or lt.
     """
-    key = key.partition("[")[0] if key.endswith("]") else key
+    key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
     if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
         return "Correct the value."
     for suffix, unit, factor in WRONG_UNITS:
