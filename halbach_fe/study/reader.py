@@ -156,6 +156,9 @@ def _sentence(error: ValidationError, where: str) -> str:
         near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
         hint = (f"Did you mean `{near[0]}`?" if near
                 else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
+        if not near and len(first["loc"]) > 1 and name in Study.model_fields and not isinstance(
+                value, Mapping):
+            hint = f"`{name}` stands at the top of the file, above the first table."
         received = f"`{name}`"
     elif kind == "missing":
         received, hint = "nothing", "Add the key."

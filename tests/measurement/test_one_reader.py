@@ -261,3 +261,31 @@ def test_units_and_variables_of_own_hdf5_are_not_ignored(tmp_path):
         write_map(changed, path)
         with pytest.raises(MeasurementError, match=asked):
             read_map(path)
+
+
+def test_a_header_with_norm_is_used(tmp_path):
+    """COMSOL calls |B| mf.normB: the header is no line of which nothing was used."""
+    head = ("% Model: a.mph\n% Dimension: 3\n% Length unit: mm\n"
+            "% x  y  z  mf.Bx (mT)  mf.normB (mT)\n")
+    rows = "0 0 -10 731 731.1\n0 0 0 730 730.1\n0 0 10 731 731.1\n"
+    assert not any("nothing" in said for said in imported(tmp_path, head + rows).imported.remarks)
+    said = imported(tmp_path, "% divided by a factor of 2\n" + head + rows).imported.remarks
+    assert any("factor of 2" in each for each in said)
+
+
+@pytest.mark.parametrize("unit", ["C", "°C", "degC", "K"])
+def test_a_temperature_is_no_time(tmp_path, unit):
+    table = "x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT],T[{}]\n0,0,0,7,1,1,20\n0,0,10,7,1,1,25\n"
+    stated, bare = (imported(tmp_path, text).imported.remarks
+                    for text in (table.format(unit), table.replace("[{}]", "")))
+    assert not any("times" in said for said in stated)
+    assert any("times" in said for said in bare)
+
+
+def test_noise_of_one_component_alone_says_how_to_state_it(tmp_path):
+    table = "x[mm],y[mm],z[mm],Bx[mT],By[mT],{}\n0,0,0,7,1,0.1\n0,0,10,7,1,0.1\n"
+    with pytest.raises(MeasurementError, match=r"By has none.*name one column sigma"):
+        imported(tmp_path, table.format("std Bx (mT)"))
+    columns = "x[mm],y[mm],z[mm],Bx[mT],By[mT],sigma[mT]"
+    data = imported(tmp_path, table.format("std Bx (mT)"), columns=tuple(columns.split(","))).data
+    np.testing.assert_allclose(data["sigma_T"], 1e-4)

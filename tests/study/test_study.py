@@ -45,6 +45,7 @@ DEMAGNETIZATION = {"remanence_coefficient_per_K": -1.2e-3, "coercivity_coefficie
 @pytest.mark.parametrize(("changes", "said"), [
     ({"array__inner_radius": 0.1}, "Did you mean `inner_radius_m`?"),
     ({"arry": {}}, "Did you mean `array`?"),
+    ({"array__dimension": 2}, "`dimension` stands at the top of the file"),
     ({"array__block": {"shape": "sector", "angular_gap": 1}}, "Did you mean `angular_gap_deg`?"),
     ({"array__inner_radius_m": 104}, "Was it meant in millimetres? Then write 0.104."),
     ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),

@@ -69,7 +69,7 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     return ForeignTable(
         columns, values, where, comments="" if own else comments_of(lines[:start]), texts=texts,
         attributes=attributes_of(lines[:start]) if own else {},
-        remarks=() if own else unused_lines(lines[:start]))
+        remarks=() if own else unused_lines(lines[:start], columns))
 
 
 def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
@@ -78,12 +78,17 @@ def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
     return {part[1]: part[2].strip() for part in found if part and part[0].isprintable()}
 
 
-def unused_lines(preface: Sequence[Line]) -> tuple[str, ...]:
-    """Return sentences about lines that may change the meaning of the numbers below them."""
+def unused_lines(preface: Sequence[Line], columns: Sequence[ColumnName]) -> tuple[str, ...]:
+    """Return sentences about lines that may change the meaning of the numbers below them.
+
+    The header, which has the names of all columns, is used.
+    """
+    names = [re.sub(r"\s", "", column.text) for column in columns if column.text]
     found = [f"Line {number} says '{printable(line.strip(), 80)}', of which nothing was used: "
              "if it is a shift, state it by --origin-m, and what else it says "
              "by other options or in the study."
-             for number, line in preface if MEANING.search(line[:MAX_LINE])]
+             for number, line in preface if MEANING.search(line[:MAX_LINE])
+             and not (names and all(name in re.sub(r"\s", "", line) for name in names))]
     return tuple(found[:MAX_REMARKS])
 
 

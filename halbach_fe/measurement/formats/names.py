@@ -32,6 +32,8 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
 TIME_NAMES = frozenset(("t", "time", "times", "timestamp", "timeofday", "clock", "datetime",
                         "elapsed", "elapsedtime"))
 """Names of columns of times, without spaces and in lower case."""
+TEMPERATURES = frozenset(("c", "degc", "celsius", "k", "kelvin", "f", "degf"))
+"""Units of a column T that is a temperature."""
 NOISE_WORDS = frozenset((
     "sigma", "σ", "sd", "std", "stdev", "stddev", "err", "error", "unc", "uncertainty", "noise"))
 """Words in the name of a column that say that it is a standard deviation."""
@@ -114,8 +116,12 @@ def is_clock(column: ColumnName) -> bool:
 
 
 def is_time(column: ColumnName) -> bool:
-    """Return whether the name of a column is that of a time, with or without a unit."""
-    return _key(_split(column.text)[0]) in TIME_NAMES
+    """Return whether the name of a column is that of a time, with or without a unit.
+
+    T in a unit of temperature is a temperature.
+    """
+    name, unit = _split(column.text)
+    return _key(name) in TIME_NAMES and unit.strip(" °").lower() not in TEMPERATURES
 
 
 def _split(text: str) -> tuple[str, str]:

@@ -216,6 +216,13 @@ def _check_noise(
     if bad.any():
         row, component = np.argwhere(bad)[0]
         value = noise[row, component]
+        if np.isnan(noise[:, component]).all():
+            raise MeasurementError(must_be(
+                "standard deviations", where,
+                f"stated of every component that is read, but B{COMPONENTS[component]} has none",
+                f"those in {stated} alone",
+                "If they hold for all components, name one column sigma in --columns; "
+                "otherwise ignore them by - in their place, and state [noise] in the study."))
         raise MeasurementError(must_be(
             f"standard deviation of B{COMPONENTS[component]} in reading {row + 1}", where,
             f"from {MIN_SIGMA_T:g} to {MAX_SIGMA_T:g} T (from {stated})",
