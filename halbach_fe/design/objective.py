@@ -151,7 +151,7 @@ def objective_of(
     """
     if magnet.study.homogeneity is None:
         model = multipole_model(magnet, reference or MultipoleReference(), session)
-        blocks = float(np.abs(model.matrix[0]).sum() * np.abs(model.nominal).max())
+        blocks = float(np.abs(model.matrix[0] * model.nominal).sum())  # if none cancelled another
         if model.nominal_main < LEAST_MAIN * blocks:
             raise StudyError(must_be(
                 f"the multipole of order {model.main}", f"study {magnet.name}",
