@@ -280,8 +280,9 @@ def _diagnose(
         converged = _has_converged(identified, found)
         this = _Round(number + 1, update, search, judgement, identified,
                       _held_out_misfit(update, search, first[0]))
+        # residuals below the error bars, of mean square 1, tell no round from another
         if not this.gives_way and (
-                best is None or this.misfit <= best.misfit * _chance(first[0])):
+                best is None or this.misfit <= max(best.misfit, 1.0) * _chance(first[0])):
             best = this
         if converged:
             # the model has the old amplitudes; their sd and evidence are those of this round
