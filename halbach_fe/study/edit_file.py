@@ -171,8 +171,10 @@ def _set(table: Keys, name: str, value: object, note: str) -> None:
     if isinstance(value, BaseModel) and not _in_line(table):
         table[name] = _table(value, note)
         return
-    table[name] = _plain(value)
-    _add_note(table[name], note)
+    plain = _plain(value)
+    truth = tomlkit.item(plain) if isinstance(plain, bool) else None  # tables give it back as bool
+    table[name] = plain if truth is None else truth
+    _add_note(table[name] if truth is None else truth, note)
 
 
 def _move_up(table: Keys, old: set[str]) -> None:
