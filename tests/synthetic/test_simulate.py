@@ -189,13 +189,15 @@ def test_refusals_on_the_command_line(campaigns, tmp_path, capsys):
     assert 11 in EXIT_CODES
 
 
-def test_an_instrument_of_the_study(tmp_path, capsys):
-    """The map is in m and T at the study's points; the study would say that it is not."""
+def test_an_instrument_of_the_study(tmp_path):
+    """The map is written in the units that the study states, so that it is read back in m."""
     study = tmp_path / "study.toml"
-    study.write_text(STUDY + "\n[instrument]\nlength_unit_m = 0.001\n")
-    assert main(["simulate-measurement", str(study), "-o", str(tmp_path / "out")]) == 3
-    assert "length_unit_m. Leave [instrument] out." in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    for unit in ("1.0", "0.001"):
+        study.write_text(STUDY + f"\n[instrument]\nlength_unit_m = {unit}\n")
+        assert main(["simulate-measurement", str(study), "-o", str(tmp_path / unit)]) == 0
+    metres, millimetres = (points_of(read_map(tmp_path / unit / "map.csv"))
+                           for unit in ("1.0", "0.001"))
+    np.testing.assert_allclose(millimetres, 1000 * metres, rtol=1e-9)
 
 
 def test_output_that_cannot_be_written(tmp_path, capsys, monkeypatch):
