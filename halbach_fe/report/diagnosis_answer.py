@@ -291,7 +291,7 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
         sentences.append(after.too_near)
     nothing = not (diagnosis.identified or diagnosis.suspected or diagnosis.unknown
                    or _fails(diagnosis))
-    if diagnosis.looked_for is not None:
+    if nothing and diagnosis.looked_for is not None:
         sentences.append(
             "Only the effects that were chosen (--effects) were looked for: others may be missing.")
     if nothing and diagnosis.limits and (diagnosis.looked_for is None or {
