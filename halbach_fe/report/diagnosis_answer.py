@@ -134,7 +134,8 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
                        f"stays as it is, update it with {STUDY_FILE}, the study with what was "
                        "found.")
         return f"{changed} {suspicions}".strip(), infer
-    return "Update the magnet with this map.", f"halbach-fe infer STUDY{maps} -o DIR"
+    these = "these maps" if diagnosis.after.is_campaign else "this map"
+    return f"Update the magnet with {these}.", f"halbach-fe infer STUDY{maps} -o DIR"
 
 
 def _remedies(diagnosis: Diagnosis) -> list[str]:
@@ -208,7 +209,8 @@ def _found(diagnosis: Diagnosis) -> list[str]:
                  f"Nothing else is missing that {these} can show: with that," if sentences
                  else f"Nothing is missing that {these} can show:"
                  if diagnosis.looked_for is None else
-                 f"None of what was looked for ({', '.join(diagnosis.looked_for)}) is missing:")
+                 f"Of what was looked for ({', '.join(diagnosis.looked_for)}) nothing is missing "
+                 f"that {these} can show:")
         agree = "the maps agree" if several else "the map agrees"
         if diagnosis.after.held_out_conflict:
             start = "Something is missing that was not found: readings that were held out disagree."

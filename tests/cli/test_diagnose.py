@@ -220,7 +220,7 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert max(found["probabilities"], key=found["probabilities"].get) == "none"
     assert (out / "study.diagnosed.toml").read_text() == STUDY
     page = (out / "diagnosis.html").read_text()
-    assert '<p class="said">None of what was looked for (' in page
+    assert '<p class="said">Of what was looked for (' in page
     assert "others may be missing" in page
     blocks_chosen = {"block_demagnetized", "block_displaced"} <= {*CHOICE.split(",")}
     assert ("It would have shown the loss of" in page) == blocks_chosen
