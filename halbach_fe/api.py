@@ -35,6 +35,7 @@ from halbach_fe.design.tolerance import (
 )
 from halbach_fe.diagnosis import diagnose as diagnosis_room
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -143,7 +144,7 @@ class HomogeneityResult(ShownInNotebook):
 @alone
 def diagnose(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
-    blocks: BlockTable | None = None, effects: Sequence[str] | None = None,
+    blocks: BlockTable | None = None, effects: Sequence[str | Effect] | None = None,
     validation_map: xr.Dataset | None = None, say: Say = lambda text: None,
     floor_T: Mapping[str, float] | Mapping[str, Mapping[str, float]] | None = None,
     time_limit_s: float | None = None,
@@ -161,8 +162,9 @@ def diagnose(
         Its folder receives a subfolder for each round of solving and searching.
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.
-    effects : sequence of str, optional
-        Names of the candidate effects; by default all effects of the catalogue are candidates.
+    effects : sequence of str or Effect, optional
+        The candidate effects: names of the catalogue, or effects of your own; by default all of
+        the catalogue.
     validation_map : Dataset, optional
         Another map, which is predicted but does not update the model.
     say : callable, optional
@@ -198,13 +200,17 @@ def diagnose(
     if time_limit_s is not None:
         check_number("time_limit_s", "diagnose", time_limit_s, 0)
     effect_by_name = {effect.name: effect for effect in catalogue()}
-    for name in effects or ():
-        if name not in effect_by_name:
+    for effect in effects or ():
+        name = effect if isinstance(effect, str) else effect.name
+        if not isinstance(effect, str):
+            effect_by_name[name] = effect
+        elif name not in effect_by_name:
             near = difflib.get_close_matches(name, effect_by_name, 1, 0.5)
             raise StudyError(must_be("effects", "diagnose", "names of the catalogue", f"'{name}'",
                                      f"Did you mean {near[0]}?" if near else ""))
     chosen = (None if effects is None
-              else [effect_by_name[name] for name in dict.fromkeys(effects)])
+              else [effect_by_name[name] for name in dict.fromkeys(
+                  effect if isinstance(effect, str) else effect.name for effect in effects)])
     return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say,
                                    floor_T=floor_T, time_limit_s=time_limit_s)
 

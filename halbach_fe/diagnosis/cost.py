@@ -112,8 +112,8 @@ def estimate_diagnosis(
         places = campaign.places(effect, study)
         if not places:
             continue
-        ranked = effect.name == "blocks_swapped" or isinstance(effect, AssemblyEffect)
-        signatures += min(len(places), SHORTLIST) if ranked else len(places)
+        signatures += min(len(places), SHORTLIST) if isinstance(
+            effect, AssemblyEffect) else len(places)
         asked = _asked(effect, own, points, places[0])
         if asked:  # all places of an effect need fields of much the same cost
             fields += len(places) * len(asked)
@@ -129,6 +129,8 @@ def _asked(effect: Effect, study: Study, points: Floats, place: Place) -> list[S
     Their meshes are those that suffice for signatures.
     """
     asked: list[Study] = []
+    if effect.kind == "instrument":
+        return asked
 
     def solve(changed: Study) -> Floats:
         if changed != study:  # the field of the study itself is shared by all
@@ -136,7 +138,7 @@ def _asked(effect: Effect, study: Study, points: Floats, place: Place) -> list[S
         return np.zeros((len(points), 3))
 
     nominal = NominalFields(study, points, np.zeros(len(points)), solve)
-    if effect.kind == "instrument" or effect.rough_signature(nominal, place) is None:
+    if effect.rough_signature(nominal, place) is None:
         asked.clear()
         effect.signature(nominal, place)
     return asked

@@ -12,8 +12,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, each_block
-from halbach_fe.diagnosis.effects.block_demagnetized import BlockDemagnetizedEffect
-from halbach_fe.diagnosis.effects.block_displaced import BlockDisplacedEffect
+from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect, BlockDisplacedEffect
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,

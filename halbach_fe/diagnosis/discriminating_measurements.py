@@ -50,6 +50,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.maps import PROBE_KEYS
 from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 
@@ -413,8 +414,8 @@ class _Readings:
         nominal = magnet.nominal
         self.scan, self.magnet, self.part = scan, magnet, part
         self.mapper = ScanFields(
-            nominal.study, scan.points, scan.time, nominal.solve, nominal, part,
-            scan.magnet_rotation, np.eye(3),
+            nominal.study.with_(instrument=Instrument()), scan.points, scan.time, nominal.solve,
+            nominal, part, scan.magnet_rotation, np.eye(3),
             way=np.zeros_like(scan.points) if scan.way is None else scan.way)
         self.sensors = replace(self.mapper, probe_rotation=scan.probe_rotation)
         self.blocks = self._whitened(

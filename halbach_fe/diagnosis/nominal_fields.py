@@ -18,9 +18,16 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.measurement.instrument import (
+    nonlinear_part,
+    sensor_matrix,
+    sensor_positions,
+    with_memory,
+)
 from halbach_fe.solver.exact_block_field import block_gradients, unit_fields
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.study.materials import MU_0
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
 FEW_BLOCKS = 10
@@ -47,6 +54,8 @@ class NominalFields:
     solve_iron : callable, optional
         Function of a study that returns the change (n, 3) in T that its iron makes to the field of
         blocks in vacuum, or None if `solve` takes no longer.
+    stated : ndarray, shape (n, 3), in m, or None
+        The points as the map states them; None if they are where the probe was.
     way : ndarray, shape (n, 3), or None
         Unit vectors along which the stage came to each point, see
         `halbach_fe.measurement.scan_lines.motion`; None if the points are all of a map, in its
@@ -62,6 +71,7 @@ class NominalFields:
     solve: Callable[[Study], Floats]
     solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
+    stated: Floats | None = field(default=None, kw_only=True)
     way: Floats | None = field(default=None, kw_only=True)
     _gradients: dict[int, Floats] = field(default_factory=dict, init=False, repr=False)
 
@@ -192,9 +202,14 @@ class NominalFields:
         return np.asarray(np.cross(axis, self.block_fields[block])
                           - np.einsum("ncj,nj->nc", self.block_gradient(block), around))
 
-    def change_at_displaced_points(self, displacement: Floats) -> Floats:
-        """Return the change of B (n, 3) in T when the points move by ``displacement``.
+    def shown(self, instrument: Instrument) -> Floats:
+        """Return the values (n, 3) in T of the map by an instrument, near where the probe was.
 
-        To first order in ``displacement`` (n, 3) in m, in the field of the nominal magnet.
+        The field is linear about the points.
         """
-        return np.asarray(np.einsum("ncj,nj->nc", self.gradient, displacement))
+        stated = self.points if self.stated is None else self.stated
+        away = sensor_positions(instrument, stated, self.way) - self.points[:, None]
+        field = self.field[:, None] + np.einsum("ncj,nsj->nsc", self.gradient, away)
+        linear = np.einsum("sc,nsc->ns", sensor_matrix(instrument), field)
+        return with_memory(
+            instrument, linear + nonlinear_part(instrument, linear, self.time), self.time)

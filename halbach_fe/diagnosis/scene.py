@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -26,19 +26,11 @@ from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     map_time,
-    nonlinear_part,
     probe_points,
     sensor_matrix,
-    sensor_positions,
-    with_memory,
 )
 from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS
-from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
-
-STEP = 1e-3
-"""Step of the differences by an instrument, in prior standard deviations of an effect: small
-enough for all laws of an instrument to be linear to 1e-6, and far above rounding."""
 
 FieldAt = Callable[[Study, Floats], Floats]
 """Function of a study and points (n, 3) in m that returns B (n, 3) in T of its nominal magnet."""
@@ -198,7 +190,8 @@ class Campaign:
 
         return Scene(self.maps, tuple(NominalFields(
             one.study_of(study), points[one.rows], one.time, solve(one.rows),
-            solve_iron=solve_iron(one.rows), measured_magnetizations=magnetizations)
+            solve_iron=solve_iron(one.rows), measured_magnetizations=magnetizations,
+            stated=one.points)
             for one in self.maps))
 
 
@@ -233,10 +226,8 @@ class Scene:
 
     def signature(self, hypothesis: Hypothesis) -> Floats:
         """Return the change of all values (k, n, 3) in T per unit of each parameter."""
-        effect, place = hypothesis.effect, hypothesis.place
-        if effect.kind == "instrument" and not effect.applied_in_full:
-            return self._by_map(place, partial(_signature_of_instrument, effect, place))
-        return self.seen(hypothesis, lambda nominal: effect.signature(nominal, place))
+        return self.seen(hypothesis, lambda nominal: hypothesis.effect.signature(
+            nominal, hypothesis.place))
 
     def rough_signature(self, hypothesis: Hypothesis) -> Floats | None:
         """Return what all maps show (k, n, 3) in T of `Effect.rough_signature`; None if there is
@@ -256,24 +247,18 @@ class Scene:
         """Return the change (k + r, n, 3) in T per unit of all amplitudes, see
         `Effect.derivative`.
         """
-        effect, place, values = hypothesis.effect, hypothesis.place, amounts.tolist()
-        if effect.kind == "instrument":
-            return np.concatenate([self.signature(hypothesis), self.seen(
-                hypothesis, lambda nominal: effect.refine(nominal, place, values))])
-        return self.seen(hypothesis, lambda nominal: effect.derivative(nominal, place, values))
+        return self.seen(hypothesis, lambda nominal: hypothesis.effect.derivative(
+            nominal, hypothesis.place, amounts.tolist()))
 
     def seen(self, hypothesis: Hypothesis, of: Callable[[NominalFields], Floats]) -> Floats:
         """Return what the maps show of changes (k, n, 3) in T of the field of an effect."""
         if hypothesis.effect.kind == "instrument":  # changes of the values themselves
-            return self._by_map(hypothesis.place, lambda nominal, _: of(nominal))
-        return self._by_map(hypothesis.place, lambda nominal, _: of(nominal) @ _sensors(nominal).T)
+            return self._by_map(hypothesis.place, of)
+        return self._by_map(hypothesis.place, lambda nominal: of(nominal) @ _sensors(nominal).T)
 
-    def _by_map(self, place: Place, of: Callable[[NominalFields, Floats], Floats]) -> Floats:
-        """Return changes (k, n, 3) of the values of all maps; 0 where a place does not act.
-
-        ``of`` takes the fields of a map, and its points (n, 3) in m as it states them.
-        """
-        found = [of(nominal, one.points) if not place.maps or one.name in place.maps else None
+    def _by_map(self, place: Place, of: Callable[[NominalFields], Floats]) -> Floats:
+        """Return changes (k, n, 3) of the values of all maps; 0 where a place does not act."""
+        found = [of(nominal) if not place.maps or one.name in place.maps else None
                  for nominal, one in zip(self.fields, self.maps, strict=True)]
         count = next(len(part) for part in found if part is not None)
         return np.concatenate([np.zeros((count, *nominal.points.shape)) if part is None else part
@@ -301,42 +286,3 @@ def _owners(one: ScannedMap, keys: set[str]) -> list[str]:
     if keys <= set(POSE_KEYS) and one.pose != one.name:
         return [f"stage {one.pose}", f"map {one.name}"]
     return [f"map {one.name}"]
-
-
-def _signature_of_instrument(
-    effect: Effect, place: Place, nominal: NominalFields, stated: Floats
-) -> Floats:
-    """Return the change of a map's values (k, n, 3) in T per unit of each parameter.
-
-    It is the derivative of the law of the instrument, by differences, at the pose that the map
-    has. (`Effect.signature` holds for a mapper along the magnet's axes.)
-
-    Parameters
-    ----------
-    effect, place
-        An effect of the instrument.
-    nominal : NominalFields
-        Of this map.
-    stated : ndarray, shape (n, 3), in m
-        Its points as the map states them.
-    """
-    found = []
-    for number, parameter in enumerate(effect.parameters):
-        step = STEP * parameter.sd
-        values = step * np.eye(len(effect.parameters))[number]
-        more, less = (_shown(effect.apply(nominal.study, place, amounts.tolist()).instrument,
-                             nominal, stated) for amounts in (values, -values))
-        found.append((more - less) / (2 * step))
-    return np.array(found)
-
-
-def _shown(instrument: Instrument, nominal: NominalFields, stated: Floats) -> Floats:
-    """Return the values (n, 3) in T of a map by an instrument, near where the probe was.
-
-    The field is linear about the points of ``nominal``.
-    """
-    away = sensor_positions(instrument, stated) - nominal.points[:, None]
-    field = nominal.field[:, None] + np.einsum("ncj,nsj->nsc", nominal.gradient, away)
-    linear = np.einsum("sc,nsc->ns", sensor_matrix(instrument), field)
-    return with_memory(
-        instrument, linear + nonlinear_part(instrument, linear, nominal.time), nominal.time)

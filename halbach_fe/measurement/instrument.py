@@ -123,10 +123,13 @@ def sensor_model(instrument: Instrument, points: Floats) -> SensorModel:
                        sparse.csr_array(sparse.kron(sparse.eye_array(count), apart)))
 
 
-def sensor_positions(instrument: Instrument, points: Floats) -> Floats:
+def sensor_positions(
+    instrument: Instrument, points: Floats, way: Floats | None = None
+) -> Floats:
     """Return the positions (n, 3, 3) in m of each sensor at the points (n, 3) in m of a map.
 
-    The axes of the result are point of the map, sensor, and coordinate.
+    The axes of the result are point of the map, sensor, and coordinate. ``way`` (n, 3) are the
+    directions in which the stage came to the points; None if these are all, in their order.
     """
     stretched = points * [1 + instrument.radius_scale, 1 + instrument.radius_scale,
                           1 + instrument.z_scale]
@@ -138,7 +141,7 @@ def sensor_positions(instrument: Instrument, points: Floats) -> Floats:
     if instrument.arm_sag_m and np.ptp(z) > 0:
         stretched[:, 1] -= instrument.arm_sag_m * ((z - z.min()) / np.ptp(z)) ** 2
     if instrument.lag_m:
-        stretched -= instrument.lag_m * motion(points)
+        stretched -= instrument.lag_m * (motion(points) if way is None else way)
     sensors = stretched[:, None] + np.array(instrument.sensor_position_m)
     return np.asarray(sensors @ rotation_matrix(instrument.rotation_rad).T
                       + instrument.translation_m)

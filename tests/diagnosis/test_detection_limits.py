@@ -7,8 +7,7 @@ import pytest
 
 from halbach_fe.diagnosis.detection_limits import smallest_amplitude
 from halbach_fe.diagnosis.diagnose import diagnose
-from halbach_fe.diagnosis.effects.block_demagnetized import BlockDemagnetizedEffect
-from halbach_fe.diagnosis.effects.block_displaced import BlockDisplacedEffect
+from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect, BlockDisplacedEffect
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.model_selection import Candidate, log_bayes_factors
 from halbach_fe.diagnosis.summary import limits_in_words

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import halbach_fe as hf
 from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Place
-from halbach_fe.diagnosis.effects.blocks_swapped import BlocksSwappedEffect
+from halbach_fe.diagnosis.effects.assembly import BlocksSwappedEffect
+from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import IdentifiedEffect
@@ -180,3 +181,32 @@ def test_equals_that_take_turns_have_come_to_rest():
     assert not only_equals_took_turns(before, [*before, equal])
     assert not only_equals_took_turns(before, [equal])
     assert not only_equals_took_turns(before, before)
+
+
+class CommonGain(InstrumentEffect):
+    """All sensors have the same relative error, as in docs/how-to/own-effect.md."""
+
+    name = "common_gain"
+    title = "gain of the whole probe"
+    parameters = (Parameter("fraction", "1", 3e-3),)
+
+    def change(self, instrument, values):
+        return {"gain": tuple(gain + values[0] for gain in instrument.gain)}
+
+
+@pytest.mark.parametrize("gain", [0.01, 0.0])
+def test_an_effect_of_ones_own_is_searched_for(session, generator, gain):
+    """Its signature follows from the law of the instrument. Blocks of 0.01 % do not imitate it."""
+    true = field(STUDY, drawn(STUDY, generator, 1e-4), CIRCLES)
+    data = field_map(CIRCLES, (1 + gain) * true + NOISE_T * generator.standard_normal(true.shape))
+    exact = STUDY.with_(prior__magnitude_sd=1e-4, prior__direction_sd_deg=0.006,
+                        prior__common_mode_sd=1e-4)
+    found = hf.diagnose(build_magnet(exact), data, session, effects=[CommonGain(), "drift"])
+    if not gain:  # negative control: without it nothing is found
+        assert found.identified == ()
+        return
+    (identified,) = found.identified
+    assert identified.hypothesis.effect.name == "common_gain"
+    assert identified.values[0] == pytest.approx(0.01, abs=4 * np.hypot(identified.sd[0], 1e-4))
+    assert found.study.instrument.gain == pytest.approx([identified.values[0]] * 3)
+    assert "gain of the whole probe" in " ".join(answer(found).sentences)

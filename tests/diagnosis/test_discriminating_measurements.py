@@ -20,7 +20,6 @@ from halbach_fe.diagnosis.discriminating_measurements import (
 )
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
-from halbach_fe.diagnosis.effects.offset import OffsetEffect
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
@@ -110,17 +109,10 @@ def test_known_twins_are_told_apart(
     assert all(abs(found.gains[name]) < 1 for name in useless)
 
 
-class Copy(OffsetEffect):
-    """Another name for an offset."""
-
-    def __init__(self):
-        super().__init__("y")
-        self.name = "offset_by_another_name"
-
-
 def test_nothing_tells_an_effect_from_itself(case, session, monkeypatch):
     """Negative control."""
-    monkeypatch.setitem(EFFECTS, "offset_by_another_name", Copy())
+    monkeypatch.setitem(EFFECTS, "offset_by_another_name", replace(
+        EFFECTS["offset_y"], name="offset_by_another_name"))
     diagnosis, data = case("offset_y", [2e-4], "offset_by_another_name")
     (found,) = separations(diagnosis, data, session, tuple(EFFECTS.values()))
     assert found.recommended is None

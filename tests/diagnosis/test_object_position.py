@@ -9,7 +9,7 @@ import pytest
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
-from halbach_fe.diagnosis.effects.ferromagnetic_object import FerromagneticObjectEffect
+from halbach_fe.diagnosis.effects.surroundings import FerromagneticObjectEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.measurement.field_map import field_map, points_of

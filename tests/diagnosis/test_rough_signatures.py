@@ -11,8 +11,7 @@ import pytest
 from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Place
-from halbach_fe.diagnosis.effects.inner_radius import InnerRadiusEffect
+from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.solver.exact_block_field import field_of
@@ -21,21 +20,27 @@ from tests.diagnosis.campaign import CIRCLES, NOISE_T, STUDY
 RADIUS_M = 6e-4
 
 
-class SlowInnerRadius(InnerRadiusEffect):
+INNER_RADIUS = next(effect for effect in catalogue() if effect.name == "inner_radius")
+
+
+class SlowInnerRadius(Effect):
     """The inner radius, as if its signature took minutes; it counts how often it is computed."""
 
+    name, title, kind = INNER_RADIUS.name, INNER_RADIUS.title, INNER_RADIUS.kind
+    parameters = INNER_RADIUS.parameters
+    apply = staticmethod(INNER_RADIUS.apply)
     solved = 0
 
     def signature(self, nominal, place):
         self.solved += 1
-        return super().signature(nominal, place)
+        return INNER_RADIUS.signature(nominal, place)
 
     def rough_signature(self, nominal, place):
-        return -7.0 * super().signature(nominal, place) + 1e-4 * nominal.field
+        return -7.0 * INNER_RADIUS.signature(nominal, place) + 1e-4 * nominal.field
 
 
 def map_with(generator, radius_m=0.0, offset_T=0.0):
-    study = InnerRadiusEffect().apply(STUDY, Place(), [radius_m])
+    study = INNER_RADIUS.apply(STUDY, Place(), [radius_m])
     noise = NOISE_T * generator.standard_normal(CIRCLES.shape)
     return field_map(CIRCLES, field_of(build_magnet(study).blocks, CIRCLES) + noise
                      + [offset_T, 0.0, 0.0])

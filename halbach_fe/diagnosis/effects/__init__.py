@@ -1,4 +1,4 @@
-"""The catalogue of effects that the diagnosis searches for, each in a file of its own.
+"""The catalogue of effects that the diagnosis searches for, grouped by what they act on.
 
 An effect is a deviation of the real magnet or mapper from the study: a displaced block, a gain
 error of a sensor, an iron ring that the study does not mention. Another package adds effects by

@@ -1,4 +1,4 @@
-"""Base of effects of assembly: blocks in other slots, or in another orientation.
+"""Effects of assembly: blocks and rings in other slots, or in another orientation.
 
 They are exact: which magnetization every block then has is known, however large the change is.
 """
@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, with_exceptions
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, place_of, with_exceptions
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
+from halbach_fe.geometry.fitting_turns import Move, moves_of_rings, turns_in_slot
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
@@ -27,9 +28,9 @@ evidence."""
 NO_CHANGE = 1e-5
 """Difference of magnetizations below which there is none, as a fraction of the largest one."""
 
-Sources = tuple[tuple[tuple[int, int], ...], Floats]
+Sources = Sequence[tuple[int, int, Floats]]
 """Number from 0 of every slot that changes, and of the slot from which the block that is there
-comes; and the rotation (3, 3) of these blocks."""
+comes; and the rotation (3, 3) of this block."""
 
 
 class AssemblyEffect(Effect):
@@ -77,29 +78,20 @@ class AssemblyEffect(Effect):
     def magnetization_change(
         self, nominal: NominalFields, place: Place
     ) -> Mapping[int, Floats] | None:
-        """See `Effect.magnetization_change`."""
         return _change(self.sources(nominal.magnet, place), nominal.magnetizations)
 
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        """See `Effect.signature`."""
-        change = _change(self.sources(nominal.magnet, place), nominal.magnetizations)
-        return np.sum([nominal.field_with(block, value) for block, value in change.items()],
-                      axis=0)[None]
-
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        """See `Effect.apply`."""
         magnet = build_magnet(study)
-        pairs, turn = self.sources(magnet, place)
         return with_exceptions(study, [
-            _exception(magnet.blocks[to], magnet.blocks[source], turn) for to, source in pairs])
+            _exception(magnet.blocks[to], magnet.blocks[source], turn)
+            for to, source, turn in self.sources(magnet, place)])
 
 
 def _change(sources: Sources, magnetizations: Floats) -> dict[int, Floats]:
     """Return the change (D,) in A/m of the magnetization of every block, by its number."""
-    pairs, turn = sources
     size = magnetizations.shape[1]
     return {to: np.asarray(turn[:size, :size] @ magnetizations[source] - magnetizations[to])
-            for to, source in pairs}
+            for to, source, turn in sources}
 
 
 def _rounded(change: dict[int, Floats], vectors: Floats) -> tuple[tuple[int, ...], ...]:
@@ -131,3 +123,154 @@ def brought_along(to: MagnetBlock, source: MagnetBlock) -> dict[str, Any]:
         return {}
     return {"remanence_T": abs(source.remanence), "recoil_permeability": theirs[1],
             "recoil_permeability_across": theirs[2]}
+
+
+OPPOSITE = -0.999
+"""Cosine below which a turn reverses the magnetization, which is the effect of a reversed block."""
+
+
+class BlockPutInWronglyEffect(AssemblyEffect):
+    """One block is turned by a large angle, so that it fits its slot again."""
+
+    name = "block_put_in_wrongly"
+    title = "block put in the wrong way"
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return [place for block in build_magnet(study).blocks if block.remanence
+                for turn in turns_in_slot(block)
+                if (place := _place(block, np.array(turn))) is not None]
+
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        number = magnet.number_of(place.ring, place.slot)
+        return [(number, number, Rotation.from_rotvec(np.radians(place.at_m)).as_matrix())]
+
+
+def _place(block: MagnetBlock, turn: Floats) -> Place | None:
+    """Return a place whose ``at_m`` are the components of a rotation vector in degrees; None if
+    the turn reverses the magnetization.
+    """
+    easy = np.array(block.easy_axis)
+    if easy @ turn @ easy < OPPOSITE:
+        return None
+    vector = Rotation.from_matrix(turn).as_rotvec(degrees=True)
+    vector *= np.sign(vector[np.abs(vector) > 1e-6][-1]) if abs(
+        np.linalg.norm(vector) - 180) < 1e-6 else 1.0  # half turns of both signs are the same
+    x, y, z = (vector.round(6) + 0.0).tolist()
+    return Place(block.ring, block.slot, at_m=(x, y, z), words=(
+        f"{block.name}, {_angle_in_words(block, vector)}"))
+
+
+def _angle_in_words(block: MagnetBlock, vector: Floats) -> str:
+    """Describe a rotation vector (3,) in degrees of a block."""
+    size = float(np.linalg.norm(vector))
+    angle = next((words for known, words in ((90, "a quarter turn"), (180, "half a turn"))
+                  if abs(size - known) < 0.1), f"by {size:.0f}°")
+    radial = rotation_matrix((0.0, 0.0, np.radians(block.angle_deg))).T @ vector / size
+    for axis, name in zip(np.eye(3), ("its radius", "its azimuthal direction", "z"), strict=True):
+        if abs(abs(axis @ radial) - 1) < 1e-3:
+            return f"{angle} about {'-' if axis @ radial < 0 else ''}{name}"
+    x, y, z = vector / size
+    return f"{angle} about ({x:.3g}, {y:.3g}, {z:.3g})"
+
+
+class BlocksSwappedEffect(AssemblyEffect):
+    """Two blocks are exchanged, and each keeps its magnetization in the axes of its shape.
+
+    The magnetization thus turns by the angle between the shapes in the two slots. Blocks that are
+    oriented along their magnetization are alike but for their errors.
+    """
+
+    name = "blocks_swapped"
+    title = "two blocks that changed places"
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """Return pairs of successive blocks of a ring, as examples; the search uses `shortlist`."""
+        rings: dict[int, list[MagnetBlock]] = {}
+        for block in build_magnet(study).blocks:
+            rings.setdefault(block.ring, []).append(block)
+        return [place_of(block, after) for ring in rings.values()
+                for block, after in zip(ring, ring[1:] + ring[:1], strict=True)
+                if _interchangeable(block, after) and block is not after]
+
+    def shortlist(
+        self, study: Study, mean: Floats, information: Floats, score: Floats
+    ) -> Sequence[Place]:
+        """Return the pairs of the largest estimated evidence, see `Effect.shortlist`.
+
+        The exchange of two blocks changes the magnetizations by a known vector c, so that the log
+        evidence of the exchange is c' score - c' information c / 2. Both terms follow for all pairs
+        at once from the entries of the two blocks.
+        """
+        blocks, size = build_magnet(study).blocks, study.dimension
+        vectors = mean.reshape(len(blocks), size)
+        turns = np.array([block.shape_axes[:size, :size] for block in blocks])
+        own = np.einsum("jba,jb->ja", turns, vectors)
+        # change of the magnetization at place i when it receives the block of place j
+        change = np.einsum("iab,jb->ija", turns, own) - vectors[:, None]
+        weights = information.reshape(len(blocks), size, len(blocks), size)
+        here = np.einsum("ija,iaib,ijb->ij", change, weights, change, optimize=True)
+        cross = np.einsum("ija,iajb,jib->ij", change, weights, change, optimize=True)
+        gain = np.einsum("ija,ia->ij", change, score.reshape(len(blocks), size))
+        evidence = gain + gain.T - (here + here.T + 2 * cross) / 2
+        kinds = {key: number for number, key in enumerate(dict.fromkeys(map(_kind, blocks)))}
+        kind = np.array([kinds[_kind(block)] for block in blocks])
+        there = np.array([block.remanence != 0 for block in blocks])
+        possible = (kind[:, None] == kind) & np.outer(there, there)
+        first, second = np.nonzero(np.triu(possible, 1))
+        best = np.argsort(-evidence[first, second])[:SHORTLIST]
+        return [place_of(blocks[i], blocks[j])
+                for i, j in zip(first[best], second[best], strict=True)]
+
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        pair = magnet.number_of(place.ring, place.slot), magnet.number_of(*place.other)
+        return [(to, source, magnet.blocks[to].carried_from(magnet.blocks[source]))
+                for to, source in (pair, pair[::-1])]
+
+
+def _kind(block: MagnetBlock) -> tuple[float, float]:
+    """Return cross-section and length, which blocks share that could have changed places."""
+    return float(f"{block.area:.6g}"), float(f"{block.z_max - block.z_min:.6g}")
+
+
+def _interchangeable(block: MagnetBlock, other: MagnetBlock) -> bool:
+    """Tell whether two blocks could have changed places: neither is missing, and they are alike."""
+    return bool(block.remanence and other.remanence) and _kind(block) == _kind(other)
+
+
+KINDS = ("exchanged", "turned", "upside down")
+"""Moves of rings, the simplest first."""
+
+
+class RingsMovedEffect(AssemblyEffect):
+    """Whole rings are moved, after which every block fits a slot again."""
+
+    def __init__(self, name: str, title: str, move: str) -> None:
+        self.name = name
+        self.title = title
+        self.move = move
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return [Place(words=words) for words in moves_of_rings(build_magnet(study), self.move)]
+
+    def simpler(self, magnet: Magnet) -> Sequence[Sources]:
+        """See `AssemblyEffect.simpler`: a ring of a regular order that is upside down may be equal
+        to one that is turned, and exchanged halves to turned ones.
+        """
+        kinds = KINDS[:KINDS.index(self.move)]
+        return [_moved(move) for kind in kinds
+                for move in moves_of_rings(magnet, kind).values()]
+
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        return _moved(moves_of_rings(magnet, self.move)[place.words])
+
+
+def _moved(move: Move) -> Sources:
+    """Return which blocks are where after a move of rings."""
+    return [(to, source, np.array(move.turn)) for to, source in move.pairs]
+
+
+EFFECTS = (
+    BlockPutInWronglyEffect(), BlocksSwappedEffect(),
+    RingsMovedEffect("rings_swapped", "two rings or halves that changed places", "exchanged"),
+    RingsMovedEffect("rings_turned", "ring or half turned by slots", "turned"),
+    RingsMovedEffect("rings_upside_down", "ring or half put in upside down", "upside down"))

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,6 +23,10 @@ from halbach_fe.study.array import BlockException
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
+
+STEP = 1e-3
+"""Step of the differences by an instrument, in prior standard deviations of an effect: small
+enough for all laws of an instrument to be linear to 1e-6, and far above rounding."""
 
 
 @dataclass(frozen=True)
@@ -143,17 +147,17 @@ class Effect(ABC):
         Prior odds that the effect is missing, relative to those of other effects.
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    kind: ClassVar[Literal["field", "instrument"]]
+    name: str
+    title: str
+    kind: Literal["field", "instrument"]
     parameters: tuple[Parameter, ...]
-    refinements: ClassVar[tuple[Parameter, ...]] = ()
-    is_binary: ClassVar[bool] = False
-    unique: ClassVar[bool] = False
-    applied_in_full: ClassVar[bool] = False
-    defining: ClassVar[tuple[str, ...]] = ()
-    is_divisible: ClassVar[bool] = True
-    relative_odds: ClassVar[float] = 1.0
+    refinements: tuple[Parameter, ...] = ()
+    is_binary: bool = False
+    unique: bool = False
+    applied_in_full: bool = False
+    defining: tuple[str, ...] = ()
+    is_divisible: bool = True
+    relative_odds: float = 1.0
 
     @property
     def shared(self) -> tuple[int, ...]:
@@ -222,9 +226,16 @@ class Effect(ABC):
         """
         return None
 
-    @abstractmethod
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters."""
+        """Return the change of the readings (k, n, 3) in T per unit of each of the k parameters.
+
+        By default, that by `magnetization_change` in vacuum.
+        """
+        change = self.magnetization_change(nominal, place)
+        if change is None:
+            raise NotImplementedError(f"effect {self.name} has no signature")
+        return np.sum([nominal.field_with(block, vector) for block, vector in change.items()],
+                      axis=0)[None]
 
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
         """Return a signature (k, n, 3) in T that resembles `signature`, and takes far less time.
@@ -276,8 +287,18 @@ class InstrumentEffect(Effect):
 
     kind = "instrument"
 
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        """Return the derivative of the law of the instrument, by differences."""
+        found = []
+        for parameter, unit in zip(self.parameters, np.eye(len(self.parameters)), strict=True):
+            step = STEP * parameter.sd
+            more, less = (nominal.shown(self.apply(
+                nominal.study, place, (sign * step * unit).tolist()).instrument)
+                for sign in (1, -1))
+            found.append((more - less) / (2 * step))
+        return np.array(found)
+
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        """See `Effect.apply`."""
         change = self.change(study.instrument, values)
         return study.with_(instrument=study.instrument.with_(**change))
 

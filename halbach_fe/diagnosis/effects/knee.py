@@ -72,7 +72,6 @@ class KneeEffect(Effect):
     applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
-        """See `Effect.places`."""
         material = study.demagnetization
         if study.dimension == 2 or (material is not None and material.irreversible):
             return []
@@ -115,7 +114,6 @@ class KneeEffect(Effect):
         return [place for place, tried in zip(places, likely.tolist(), strict=True) if tried]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        """See `Effect.signature`."""
         before, cells = nominal.study, _cells(nominal.study, SIGNATURE_CELLS)
         if not nominal.magnet.is_vacuum:  # by the same route, so that both have the same cells
             before = before.with_(solver__route="moments", mesh__cells_per_side=cells)
@@ -123,7 +121,6 @@ class KneeEffect(Effect):
         return (nominal.solve(lost) - nominal.solve(before))[None]
 
     def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
-        """See `Effect.refine`."""
         here = nominal.solve(self.apply(nominal.study, place, values))
         return np.array([
             (nominal.solve(self.apply(nominal.study, place, np.add(
@@ -131,7 +128,6 @@ class KneeEffect(Effect):
             for number, step in enumerate(STEPS)])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        """See `Effect.apply`."""
         _, coercivity, squareness = [*values, 0.0, 0.0][:3]
         law = {"intrinsic_coercivity_A_per_m": _coercivity(place, coercivity),
                "squareness": _squareness(squareness), "irreversible": True}
@@ -146,7 +142,6 @@ class KneeEffect(Effect):
         return study.with_(demagnetization=changed, mesh__cells_per_side=_cells(study))
 
     def reported(self, place: Place, values: Floats, sd: Floats) -> tuple[Floats, Floats]:
-        """See `Effect.reported`."""
         values, sd = values.copy(), sd.copy()
         if len(values) > 1:
             relative, odds = values[1:]

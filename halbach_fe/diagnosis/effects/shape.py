@@ -1,0 +1,180 @@
+"""Effects on the shape of arrays of equal rings, and on where the rings and blocks are, as rows.
+
+The signature of a shape is the difference that it makes to the blocks in vacuum, divided by a step
+within which that is linear. Rings that move keep their shape: their signature is the sum over the
+blocks that move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.diagnosis.effects.base import (
+    Effect,
+    Parameter,
+    Place,
+    blocks_at,
+    changed,
+    each_ring,
+    with_array,
+    with_exceptions,
+    with_remanence,
+)
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.study.array import Array, BlockException
+from halbach_fe.study.model import Study
+
+X, Y, Z = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeRow(Effect):
+    """Keys of the array differ, in all rings alike; ``keys`` returns them by the amplitude."""
+
+    name: str
+    title: str
+    parameters: tuple[Parameter, ...]
+    step: float
+    keys: Callable[[Array, float], dict[str, Any]]
+    dimensions: tuple[int, ...] = (2, 3)
+    kind: Literal["field", "instrument"] = "field"
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return [Place()] if study.array.is_uniform and study.dimension in self.dimensions else []
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        return changed(nominal, self.apply(nominal.study, place, [self.step]))[None] / self.step
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        study = with_remanence(study)
+        return with_array(study, **self.keys(study.array, float(values[0])))
+
+
+@dataclass(frozen=True, eq=False)
+class MoveRow(Effect):
+    """Blocks move as they are.
+
+    ``by_block`` returns the change (k, n, 3) in T per unit of each amplitude that a block, by its
+    number, makes; ``moved`` the exceptions by the amplitudes. Blocks at the place move, or all.
+    """
+
+    name: str
+    title: str
+    parameters: tuple[Parameter, ...]
+    where: Callable[[Study], Sequence[Place]]
+    by_block: Callable[[NominalFields, Place, int], Sequence[Floats]]
+    moved: Callable[[Study, Place, Sequence[float]], Sequence[BlockException]]
+    defining: tuple[str, ...] = ()
+    relative_odds: float = 1.0
+    moves_all: bool = False
+    kind: Literal["field", "instrument"] = "field"
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return self.where(study)
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal, place)
+        return np.sum([self.by_block(nominal, place, number) for number in moving], axis=0)
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        return with_exceptions(study, self.moved(study, place, [float(value) for value in values]))
+
+
+def _narrower(array: Array, gap: float) -> dict[str, Any]:
+    """Leave a gap between neighbours, which of sectors is measured at the mean radius."""
+    block, middle = array.block, (array.inner_radius_m + array.outer_radius_m) / 2
+    key, change = {"sector": ("angular_gap_deg", float(np.degrees(gap / middle))),
+                   "trapezoid": ("side_gap_m", gap)}.get(block.shape, ("width_m", -gap))
+    return {"block": block.with_(**{key: getattr(block, key) + change})}
+
+
+def _longer(array: Array, more: float) -> dict[str, Any]:
+    """Lengthen all rings alike."""
+    assert array.ring_length_m is not None  # in three dimensions a study has a ring length
+    return {"ring_length_m": array.ring_length_m + more / array.rings}
+
+
+def _along(*directions: Floats) -> Callable[[NominalFields, Place, int], list[Floats]]:
+    """Return what a block that moves along each of some directions (3,) changes."""
+    return lambda nominal, place, number: [
+        nominal.block_translation_derivative(number, direction) for direction in directions]
+
+
+def _outwards(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that moves away from the axis."""
+    angle = np.radians(nominal.blocks[number].angle_deg)
+    return _along(np.cos(angle) * X + np.sin(angle) * Y)(nominal, place, number)
+
+
+def _about_z(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that turns about the magnet's axis."""
+    return [nominal.block_rotation_derivative(number, Z, np.zeros(3))]
+
+
+def _apart(rings: int, seam: int, ring: int) -> float:
+    """Return the fraction of the gap above ring ``seam`` by which ring ``ring`` moves along z.
+
+    The outer side of a gap moves away from the middle of the magnet, both of one in the middle.
+    """
+    return (ring > seam) - (0.5 if 2 * seam == rings else 1.0 if 2 * seam < rings else 0.0)
+
+
+def _apart_and_along(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes by a gap, and by a displacement of all blocks along z."""
+    (change,) = _along(Z)(nominal, place, number)
+    return [_apart(nominal.study.array.rings, place.ring, nominal.blocks[number].ring) * change,
+            change]
+
+
+def _gap_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
+    """Return the displacements of the rings that a gap and a common shift move."""
+    rings, (gap, shift) = study.array.rings, values
+    return [BlockException(ring=ring, shift_m=(0.0, 0.0, length)) for ring in range(1, rings + 1)
+            if (length := _apart(rings, place.ring, ring) * gap + shift)]
+
+
+EFFECTS = (
+    ShapeRow("inner_radius", "inner radius of the blocks", (Parameter("difference", "m", 3e-4),),
+             1e-4, lambda array, more: {"inner_radius_m": array.inner_radius_m + more}),
+    ShapeRow("length", "length of the magnet", (Parameter("difference", "m", 1e-3),), 1e-3,
+             _longer, dimensions=(3,)),
+    ShapeRow("azimuthal_gap", "gaps between neighbouring blocks", (Parameter("gap", "m", 2e-4),),
+             1e-4, _narrower),
+    MoveRow("radial_gap", "common radial displacement of the blocks",
+            (Parameter("gap", "m", 2e-4, minimum=0.0),),  # inwards the blocks would overlap
+            lambda study: [Place()], _outwards, lambda study, place, values: [
+                BlockException(displacement_m=(values[0], 0.0, 0.0))]),
+    MoveRow("ring_shifted", "displacement of a ring across the axis",
+            (Parameter("x", "m", 3e-4), Parameter("y", "m", 3e-4)), each_ring, _along(X, Y),
+            lambda study, place, values: [
+                BlockException(ring=place.ring, shift_m=(values[0], values[1], 0.0))]),
+    # blocks of a table at one height are a ring; all rings together are a displaced mapper
+    MoveRow("ring_shifted_along", "displacement of a ring along the axis",
+            (Parameter("z", "m", 3e-4),),
+            lambda study: rings if len(rings := each_ring(study)) > 1 else [], _along(Z),
+            lambda study, place, values: [
+                BlockException(ring=place.ring, shift_m=(0.0, 0.0, values[0]))]),
+    MoveRow("ring_twisted", "rotation of a ring about the axis",
+            (Parameter("angle", "rad", 2e-3),), each_ring, _about_z,
+            lambda study, place, values: [
+                BlockException(ring=place.ring, twist_deg=float(np.degrees(values[0])))]),
+    # Which rings a gap has moved depends on where the others are held. Therefore all of them may
+    # have moved along z as well, which alone is no gap.
+    MoveRow("ring_gap", "gap between two rings",
+            (Parameter("gap", "m", 2e-4), Parameter("shift", "m", 1e-4)),
+            lambda study: [Place(ring) for ring in range(1, study.array.rings)]
+            if study.dimension == 3 and study.array.is_uniform else [], _apart_and_along, _gap_of,
+            defining=("gap",), moves_all=True),
+    # One map of a magnet without iron cannot tell that from a displaced mapper; several maps, iron
+    # or other sources can. A stack of ten rings that is held at one end instead of its middle is
+    # displaced by some tenths of a millimetre. Magnets are assembled once, while every map has a
+    # mapper that was set up for it: hence the odds.
+    MoveRow("magnet_shifted", "all blocks displaced along z together", (Parameter("z", "m", 5e-4),),
+            lambda study: [Place()] if study.dimension == 3 else [], _along(Z),
+            lambda study, place, values: [BlockException(shift_m=(0.0, 0.0, values[0]))],
+            relative_odds=1 / 20))

@@ -1,0 +1,322 @@
+"""Effects from outside the array: fields, other magnets, ferromagnetic objects, iron."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, added
+from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.solver.external_field import dipole_field, neighbour_field
+from halbach_fe.solver.formulation_choice import choose_route
+from halbach_fe.study.iron import IronRing, SteelCurve
+from halbach_fe.study.magnet import Neighbour, PointDipole
+from halbach_fe.study.model import Study, iron_of
+
+
+class BackgroundEffect(Effect):
+    """A uniform field is added to that of the magnet, such as that of the earth."""
+
+    name = "background"
+    title = "uniform background field"
+    kind = "field"
+    is_divisible = False
+    parameters = (
+        Parameter("x", "T", 0.0001), Parameter("y", "T", 0.0001), Parameter("z", "T", 0.0001),)
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        return np.tile(np.eye(3)[:, None], (1, len(nominal.points), 1))
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        total = tuple(added(study.external.background_T, values))
+        return study.with_(external__background_T=total)
+
+
+GAPS_M = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
+"""Distances between the facing ends of the two magnets, one candidate place each."""
+
+STEP_M = 1e-4
+"""Step of the finite difference with respect to the distance."""
+
+
+class NeighbourMagnetEffect(Effect):
+    """A magnet like this one stands on the same axis.
+
+    A place is the approximate position of its centre along z, on either side. The refinements
+    adjust its strength and its distance.
+    """
+
+    name = "neighbour_magnet"
+    title = "neighbouring magnet"
+    kind = "field"
+    parameters = (Parameter("strength", "1", 1.0),)
+    refinements = (Parameter("stronger", "1", 0.5), Parameter("farther", "m", 0.05))
+    unique = True
+    applied_in_full = True
+
+    def places(self, study: Study) -> Sequence[Place]:
+        if study.dimension == 2:
+            return []
+        length = 2 * build_magnet(study).array_half_length
+        return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
+
+    def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
+        """See `Effect.representatives`.
+
+        Near the ends of the magnet all neighbours on one side have similar fields: the middle one
+        has a correlation of 0.7 or more with every other one.
+        """
+        sides = ([place for place in places if side * place.at_m[0] > 0] for side in (-1, 1))
+        return [side[len(side) // 2] for side in sides if side]
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        return neighbour_field(nominal.magnet, Neighbour(z_m=place.at_m[0]), nominal.points)[None]
+
+    def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        stronger, farther = values[1:]
+        here, beyond = (neighbour_field(nominal.magnet, Neighbour(z_m=_centre(place, distance)),
+                                        nominal.points)
+                        for distance in (farther, farther + STEP_M))
+        return np.array([here, (1 + stronger) * (beyond - here) / STEP_M])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        stronger, farther = values[1:] or (0.0, 0.0)
+        neighbour = Neighbour(z_m=_centre(place, farther), factor=1 + float(stronger))
+        return study.with_(external__neighbours=(*study.external.neighbours, neighbour))
+
+
+def _centre(place: Place, farther: float) -> float:
+    """Return the z in m of the neighbour's centre, ``farther`` m beyond its place."""
+    return float(place.at_m[0] + np.sign(place.at_m[0]) * farther)
+
+
+STEP_M = 1e-4
+"""Step of the finite differences with respect to the position."""
+
+BEYOND_M = (0.03, 0.08, 0.15, 0.25)
+"""Distances of the candidate places from the magnet's ends."""
+
+
+NEAREST_M = 1e-3
+"""Distance in m from the object below which a reading shows nothing of it: a place of the grid may
+be one where the probe was, and the field of a point dipole is infinite there."""
+
+
+class FerromagneticObjectEffect(Effect):
+    """A small magnetized object, modelled as a point dipole.
+
+    The places are a coarse grid. The refinements are the displacement of the object from its place,
+    by short steps: far from the object the field does not say where it is.
+    """
+
+    name = "ferromagnetic_object"
+    title = "ferromagnetic object near the bore"
+    kind = "field"
+    is_divisible = False
+    parameters = (
+        Parameter("x", "A m2", 3.0), Parameter("y", "A m2", 3.0), Parameter("z", "A m2", 3.0),)
+    refinements = tuple(Parameter(f"at {axis}", "m", 0.05, longest_step=0.02) for axis in "xyz")
+
+    def places(self, study: Study) -> Sequence[Place]:
+        if study.dimension == 2:
+            return []
+        magnet = build_magnet(study)
+        half, outer = magnet.array_half_length, magnet.array_outer_radius
+        radii = [magnet.bore_radius, outer, 1.4 * outer]
+        heights = [side * (half + beyond) for side in (-1, 1) for beyond in BEYOND_M]
+        ends = [(r, z) for r in radii for z in heights]
+        outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
+        angles = 2 * np.pi * np.arange(12) / 12
+        axis = [Place(at_m=(0.0, 0.0, float(z))) for z in heights if abs(z) > half + 0.1]
+        found = axis + [Place(at_m=(float(r * np.cos(a)), float(r * np.sin(a)), float(z)))
+                        for r, z in ends + outside for a in angles]
+        inside = magnet.contains(np.array([place.at_m for place in found]))
+        return [place for place, within in zip(found, inside, strict=True) if not within]
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        position = np.array(place.at_m)
+        return np.array([_field(position, moment, nominal.points) for moment in np.eye(3)])
+
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        position, moment = _at(place, values), np.array(values[:3])
+        slopes = [(_field(position + step, moment, nominal.points)
+                   - _field(position - step, moment, nominal.points)) / (2 * STEP_M)
+                  for step in STEP_M * np.eye(3)]
+        fields = [_field(position, unit, nominal.points) for unit in np.eye(3)]
+        return np.array([*fields, *slopes])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        """See `Effect.apply`.
+
+        Raises
+        ------
+        StudyError
+            If the object is inside a block or iron, where there is no room for it: what a dipole
+            there explains is an error of that block.
+        """
+        if build_magnet(study).contains(_at(place, values)[None]).any():
+            raise StudyError(must_be(
+                "the ferromagnetic object", f"study {study.name}", "outside of blocks and iron",
+                f"{place.name}, inside"))
+        x, y, z = map(float, values[:3])
+        position_x, position_y, position_z = _at(place, values).tolist()
+        dipole = PointDipole(position_m=(position_x, position_y, position_z), moment_A_m2=(x, y, z))
+        return study.with_(external__dipoles=(*study.external.dipoles, dipole))
+
+    def refined_place(self, place: Place, values: Sequence[float]) -> Place:
+        return Place(at_m=tuple(_at(place, values).tolist()))
+
+    def reported(self, place: Place, values: Floats, sd: Floats) -> tuple[Floats, Floats]:
+        if len(values) == len(self.parameters):
+            return values, sd
+        return np.concatenate([values[:3], _at(place, values.tolist())]), sd
+
+
+def _field(position: Floats, moment: Floats, points: Floats) -> Floats:
+    """Return B (n, 3) in T of a dipole at points (n, 3) in m, 0 nearer than `NEAREST_M`."""
+    field = np.zeros_like(points)
+    far = np.linalg.norm(points - position, axis=1) >= NEAREST_M
+    field[far] = dipole_field(position, moment, points[far])
+    return field
+
+
+def _at(place: Place, values: Sequence[float]) -> Floats:
+    """Return the position (3,) in m of the object."""
+    return np.array(place.at_m) + (np.array(values[3:]) if len(values) > 3 else 0.0)
+
+
+PERMEABILITY = 1000.0
+"""Relative permeability that every candidate ring is given.
+
+It is typical of iron that is not saturated. No other value is tried, because a thin shield acts by
+the product of permeability and thickness, and the thickness is varied.
+"""
+
+CLEARANCE_M = 2e-4
+"""Smallest distance between blocks and iron."""
+
+THINNEST_M = 5e-4
+"""Smallest thickness of a ring."""
+
+WEAKEST = 0.1
+"""Smallest strength, relative to the whole ring at one of the places, of what may be a ring. A ring
+is applied in full: of one that is found with 2 % of its strength, for a small error that looks like
+it, 98 % would be wrong in the next round. Around the magnet of studies/diagnosis, the thinnest ring
+of `THINNEST_M` has 0.5 of the strength of one of 10 mm, one of 25 mm 1.02; a ring 0.1 m off the
+blocks has 0.19, and one 0.2 m off 0.05: that one is no candidate."""
+
+STEP_M = 5e-4
+"""Step of the finite differences with respect to the refinements."""
+
+
+class IronRingEffect(Effect):
+    """A coaxial tube of soft iron as long as the magnet surrounds it.
+
+    A place is a pair of inner and outer radius, and the refinements adjust both. The iron is
+    linear: iron that saturates is not a candidate, and is identified as a linear tube that is
+    thicker and farther out.
+    """
+
+    name = "iron_ring"
+    title = "iron ring around the magnet"
+    kind = "field"
+    parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
+    refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
+    unique = True
+    applied_in_full = True
+
+    def places(self, study: Study) -> Sequence[Place]:
+        if iron_of(study) is not None:
+            return []
+        blocks = build_magnet(study).array_outer_radius
+        return [Place(at_m=(blocks + gap, blocks + gap + thickness))
+                for gap, thickness in ((0.004, 0.002), (0.004, 0.01), (0.004, 0.025),
+                                       (0.02, 0.01))]
+
+    def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
+        """See `Effect.representatives`.
+
+        All rings shorten the fringe field, by more than ten times what a map can show. One of
+        middle thickness has a correlation of 0.8 or more with every other one.
+        """
+        return places[1:2] or places
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        return nominal.change_by_iron(self.apply(nominal.study, place, [1.0]))[None]
+
+    def refine(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        here = nominal.solve(self.apply(nominal.study, place, values))
+        return np.array([(nominal.solve(self.apply(nominal.study, place, np.add(
+            values, STEP_M * step).tolist())) - here) / STEP_M for step in np.eye(3)[1:]])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        inner, outer = place.at_m
+        farther, thicker = values[1:] or (0.0, 0.0)
+        thickness = max(outer - inner + thicker, THINNEST_M)
+        inner = max(inner + farther, build_magnet(study).array_outer_radius + CLEARANCE_M)
+        return study.with_(iron_ring=IronRing(
+            inner_radius_m=inner, outer_radius_m=inner + thickness,
+            relative_permeability=PERMEABILITY))
+
+
+SOFTER = 0.5
+"""Permeability of linear iron, relative to the study's, that stands for iron that saturates: it
+conducts less flux too."""
+
+STEEL = "aisi_1010"
+"""Steel whose H(B) curve stands for that of structural steels."""
+
+SOLID = "scalar_potential"
+"""Solver route of iron that saturates, unless one of `BOTH` applies."""
+
+BOTH = ("cross_section", "moments")
+"""Solver routes of linear and of saturating iron."""
+
+
+class IronSaturationEffect(Effect):
+    """The iron follows the H(B) curve of a structural steel, not a constant permeability."""
+
+    name = "iron_saturation"
+    title = "saturation of the iron ring"
+    kind = "field"
+    parameters = (Parameter("strength", "1", 1.0),)
+    is_binary = True
+    applied_in_full = True
+
+    def places(self, study: Study) -> Sequence[Place]:
+        ring = study.iron_ring
+        return [Place()] if ring is not None and ring.curve is None else []
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        study = before = nominal.study
+        if choose_route(nominal.magnet, nominal.points) not in BOTH:
+            # linear iron by the same route, so that both fields have the same mesh
+            before = study.with_(solver__route=SOLID)
+        return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
+
+    def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
+        ring = nominal.study.iron_ring
+        if ring is None or ring.relative_permeability is None:
+            return None
+        permeability = ring.relative_permeability
+        if permeability == 1.0 or choose_route(nominal.magnet, nominal.points) in BOTH:
+            return None  # nothing is softer than what conducts no flux
+        softer = nominal.study.with_(iron_ring=ring.with_(
+            relative_permeability=1 + SOFTER * (permeability - 1)))
+        return (nominal.solve(softer) - nominal.finite_element_field)[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        ring = study.iron_ring
+        if ring is None:
+            return study
+        return study.with_(iron_ring=IronRing(
+            inner_radius_m=ring.inner_radius_m, outer_radius_m=ring.outer_radius_m,
+            length_m=ring.length_m, curve=SteelCurve(kind="steel", name=STEEL)))
+
+
+EFFECTS = (BackgroundEffect(), NeighbourMagnetEffect(), FerromagneticObjectEffect(),
+           IronRingEffect(), IronSaturationEffect())
