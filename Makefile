@@ -1,4 +1,4 @@
-# make demo     the main job: the FASER dipole, before and after its measurement
+# make demo     the main job on the published profile of the FASER dipole: what is wrong, and what is left
 # make test     all tests
 # make fuzz     every reader of files, on files that are damaged or made up; half an hour
 # make verify-calibration  are the posteriors as sure as they may be?
@@ -25,7 +25,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-cubes study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup
-	.venv/bin/python studies/faser/run.py -o results/faser
+	.venv/bin/python studies/faser/diagnose.py -o results/demo --quick
 
 verify-calibration: setup
 	.venv/bin/python studies/calibration/run.py -o results/calibration
@@ -34,7 +34,8 @@ verify-calibration: setup
 verify-diagnosis: setup-test
 	.venv/bin/python studies/diagnosis/run.py -o results/diagnosis
 
-study-faser: demo
+study-faser: setup
+	.venv/bin/python studies/faser/run.py -o results/faser
 	.venv/bin/python studies/faser/twin.py -o results/faser-twin
 
 study-faser-diagnosis: setup

@@ -16,7 +16,8 @@ from halbach_fe.core.errors import EXIT_CODES
 from halbach_fe.core.versions import version
 
 VERBS = {
-    "new": "new", "solve": "solve", "infer": "infer", "diagnose": "diagnose", "verify": "verify",
+    "new": "new", "explain": "explain", "solve": "solve", "infer": "infer",
+    "diagnose": "diagnose", "verify": "verify",
     "multipoles": "multipoles", "homogeneity": "homogeneity",
     "forces": "forces", "design": "design", "cad": "cad", "plan": "plan", "prior": "prior",
     "shim": "shim", "shim-tray": "shim_tray", "sort": "sort",

@@ -6,6 +6,9 @@ length of the magnet or its inner radius open. The best one is registered in all
 updated and diagnosed::
 
     python studies/faser/diagnose.py -o results/faser-diagnosis
+
+With ``--quick`` the axis and a line beside it are compared, as the length is drawn or open: that is
+`make demo`.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,18 +82,23 @@ class Hypothesis:
     pose: PosePrior
 
 
+TERMINAL_COLUMNS = ("a profile of", "odds", "fringe", "homogeneous")
+"""Columns of the table of hypotheses that fit a terminal of 80 characters."""
+
 SHOWN_SHARE = 1e-3
 """Probability down to which it is shown in per cent."""
 
 ALL = (STEP, LENGTH, RADIUS)
-HYPOTHESES = (
-    Hypothesis("the axis; positions and drawing as assumed", (), ON_THE_AXIS),
+ALL_HYPOTHESES = (
+    Hypothesis("the axis; all as assumed", (), ON_THE_AXIS),
+    Hypothesis("the axis; length open", (LENGTH,), ON_THE_AXIS),
     Hypothesis("the axis; step open", (STEP,), ON_THE_AXIS),
-    Hypothesis("the axis; step, length and inner radius open", ALL, ON_THE_AXIS),
-    Hypothesis("a line beside the axis; positions and drawing as assumed", (), ANYWHERE),
+    Hypothesis("the axis; step, length, radius open", ALL, ON_THE_AXIS),
+    Hypothesis("a line beside the axis; all as assumed", (), ANYWHERE),
     Hypothesis("a line beside the axis; step open", (STEP,), ANYWHERE),
     Hypothesis("a line beside the axis; length open", (LENGTH,), ANYWHERE),
-    Hypothesis("a line beside the axis; step, length and inner radius open", ALL, ANYWHERE))
+    Hypothesis("a line beside the axis; step, length, radius open", ALL, ANYWHERE))
+QUICK_HYPOTHESES = tuple(each for each in ALL_HYPOTHESES if each.open_keys in ((), (LENGTH,)))
 
 
 @dataclass(frozen=True)
@@ -120,9 +129,10 @@ def medians(error: Floats, update: InferenceResult) -> tuple[float, float]:
     return float(np.median(error[fringe & apart])), float(np.median(error[~fringe & apart]))
 
 
-def answers_of(pose: PosePrior, data: xr.Dataset, session: Session) -> list[Answer]:
+def answers_of(hypotheses: Sequence[Hypothesis], pose: PosePrior, data: xr.Dataset,
+               session: Session) -> list[Answer]:
     """Register the profile by all hypotheses about a place, in one of its equal poses each."""
-    own = [each for each in HYPOTHESES if each.pose is pose]
+    own = [each for each in hypotheses if each.pose is pose]
     found = register(
         build_magnet(read_study(STUDY)), data, session, open_keys=own[0].open_keys,
         alternatives=[each.open_keys for each in own[1:]], pose=pose, most=1, say=common.say)
@@ -191,7 +201,7 @@ def columns_of(best: Answer, data: xr.Dataset) -> list[Fitted]:
 
 def column_table(fitted: list[Fitted], update: InferenceResult) -> list[dict[str, str]]:
     """Return rows of text, one per kind of reading."""
-    rows, most = [], max(each.log_evidence for each in fitted)
+    rows, most = [], max((each.log_evidence for each in fitted), default=0.0)
     for each in fitted:
         fringe, homogeneous = medians(each.error, update)
         turn = f"{np.degrees(each.parameters[3]):.0f} ± {np.degrees(each.sd[3]):.0f}"
@@ -236,14 +246,15 @@ def sentences(best: Answer, poses: list[Registration], answers: list[Answer],
         f"by a factor of 10^{log_odds:.0f}, and leaves {axis.medians()[0]:.3f} in the fringe, with "
         f"blocks bent to chi² of {axis.registration.chi2:.2g} per reading.",
     ]
-    line = fitted[0]
+    line = fitted[0] if fitted else None
     others = [f"{each.reading.name} by a factor of "
               f"10^{(line.log_evidence - each.log_evidence) / np.log(10):.0f}"
-              for each in fitted[1:]]
-    said.append(
-        f"At the published radius of the circles, {line.reading.name} at "
-        f"{np.degrees(line.parameters[3]):.0f} ± {np.degrees(line.sd[3]):.0f}° is more probable "
-        f"than {', '.join(others)}.")
+              for each in fitted[1:] if line]
+    if line:
+        said.append(
+            f"At the published radius of the circles, {line.reading.name} at "
+            f"{np.degrees(line.parameters[3]):.0f} ± {np.degrees(line.sd[3]):.0f}° is more "
+            f"probable than {', '.join(others)}.")
     if len(poses) > 1:
         said.append(
             f"B_x of a dipole is even in x, y and z: {len(poses)} poses, lines in other quadrants "
@@ -325,20 +336,25 @@ def run(arguments: argparse.Namespace) -> int:
     published = profile_to_map(HERE / "fig4_faser_on_axis.csv", measured, Z_STEP_M)
     data, text = read_map(measured), STUDY.read_text(encoding="utf-8")
     with common.session(arguments) as session:
+        hypotheses = QUICK_HYPOTHESES if arguments.quick else ALL_HYPOTHESES
         answers = [each for pose in (ANYWHERE, ON_THE_AXIS)
-                   for each in answers_of(pose, data, session)]
+                   for each in answers_of(hypotheses, pose, data, session)]
         answers.sort(key=lambda each: -each.registration.log_evidence)
         best = answers[0]
-        poses = register(build_magnet(read_study(STUDY)), data, session, say=common.say,
-                         open_keys=best.hypothesis.open_keys, pose=best.hypothesis.pose)
+        poses = [best.registration] if arguments.quick else register(
+            build_magnet(read_study(STUDY)), data, session, say=common.say,
+            open_keys=best.hypothesis.open_keys, pose=best.hypothesis.pose)
         if best.registration.log_evidence > poses[0].log_evidence + EQUAL_LOG_EVIDENCE:
             poses.insert(0, best.registration)
         else:  # of equal poses, all pages show the same one
             best = answers[0] = answer_of(best.hypothesis, poses[0], data, session)
-        common.say("comparing what the column may hold")
-        fitted = columns_of(best, data)
+        fitted = []
+        if not arguments.quick:
+            common.say("comparing what the column may hold")
+            fitted = columns_of(best, data)
         rows = hypothesis_table(answers, published)
-        common.print_table(rows, "What the profile may be a profile of")
+        common.print_table([{name: row[name] for name in TERMINAL_COLUMNS} for row in rows],
+                           "Median relative error of B_x at held-out readings")
         found = sentences(best, poses, answers, fitted, published)
         write_registration(read_study(STUDY), text, data, poses, folder / "registration", {})
         write_inference(best.update, folder / "inferred")
@@ -349,7 +365,7 @@ def run(arguments: argparse.Namespace) -> int:
                 "position is uncertain by 1 mm."]
         further = ["registration/registration.html: the poses and the probe",
                    "inferred/report.html: the updated magnet"]
-        if not arguments.no_diagnosis:
+        if not arguments.quick:
             left += diagnosed(best, data, session, text, folder / "diagnosis")
             further.append("diagnosis/diagnosis.html: what the registered model lacks")
     write_summary(answers, poses, folder / "profile.json")
@@ -411,8 +427,8 @@ def write_summary(answers: list[Answer], poses: list[Registration], path: Path) 
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--no-diagnosis", action="store_true",
-                        help="leave out the diagnosis of the registered study")
+    parser.add_argument("--quick", action="store_true",
+                        help="compare four of the answers, without further poses and a diagnosis")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,92 @@
+"""From a map to the magnet by one command, of a magnet in magpylib."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import tomlkit
+
+from halbach_fe.cli import main
+from halbach_fe.cli.verbs import module_of
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, write_record
+from tests.diagnosis.campaign import CIRCLES, NOISE_T, STUDY, drawn, field
+from tests.support.cuboids import DOCUMENT
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(DOCUMENT | {"inference": {"held_out": {"every": 5}}}))
+    return path
+
+
+def said(folder):
+    return PageRecord.model_validate_json((folder / PAGE_RECORD).read_bytes()).answer
+
+
+def test_a_map_that_the_update_explains_needs_nothing_else(study, generator, tmp_path, capsys):
+    """It is in mm, which an option says, as of import-map."""
+    readings = field(STUDY, drawn(STUDY, generator), CIRCLES)
+    readings += NOISE_T * generator.standard_normal(readings.shape)
+    np.savetxt(tmp_path / "mm.csv", np.hstack([1e3 * CIRCLES, readings]), delimiter=",",
+               header="x,y,z,Bx,By,Bz", comments="")
+    out = tmp_path / "out"
+    assert main(["explain", str(study), str(tmp_path / "mm.csv"), "--length-unit", "mm",
+                 "--columns", "x,y,z,Bx[T],By[T],Bz[T]", "-o", str(out)]) == 0
+    assert {path.name for path in out.iterdir()} == {"check", "inferred", "explanation.html"}
+    assert said(out / "inferred").sound
+    printed = capsys.readouterr()
+    assert "halbach-fe infer" in printed.err
+    assert "halbach-fe register" not in printed.err
+    assert "Do not trust" not in printed.out
+
+
+CHECK = Answer("?", "Passed.", "Yes.", "")
+GOOD, BAD = (replace(CHECK, sound=sound) for sound in (True, False))
+REGISTERED = replace(GOOD, command="halbach-fe infer DIR/study.registered.toml -o DIR")
+NEAR = replace(BAD, command="halbach-fe diagnose STUDY --measurements MAP -o DIR")
+UNKNOWN = replace(BAD, changes_study=False)
+
+
+@pytest.mark.parametrize(("answers", "steps", "joined"), [
+    ({"inferred": GOOD}, "check inferred", "check inferred"),
+    ({"inferred": BAD, "registered": REGISTERED, "updated": GOOD},
+     "check inferred registered updated", "check inferred registered updated"),
+    ({"inferred": BAD, "registered": NEAR, "diagnosed": GOOD, "explained": GOOD},
+     "check inferred registered diagnosed explained", "check inferred diagnosed explained"),
+    ({"inferred": BAD, "registered": REGISTERED, "updated": BAD, "diagnosed": GOOD,
+      "explained": BAD}, "check inferred registered updated diagnosed explained",
+     "check inferred registered updated diagnosed explained"),
+    ({"inferred": BAD, "registered": NEAR, "diagnosed": UNKNOWN},
+     "check inferred registered diagnosed", "check inferred diagnosed")])
+def test_each_command_runs_as_far_as_it_is_needed(
+        study, tmp_path, monkeypatch, answers, steps, joined):
+    """With answers that are given, so that every way is taken."""
+    ran, pages = [], []
+
+    def answered(module, arguments):
+        ran.append((arguments.output.name, str(getattr(arguments, "study", ""))))
+        arguments.output.mkdir(parents=True)
+        answer = {"check": CHECK, **answers}[arguments.output.name]
+        write_record(arguments.output / "page.html", "", answer, (), (), {}, None)
+        return 0
+
+    for verb in ("check", "infer", "register", "diagnose"):
+        module = module_of(verb)
+        monkeypatch.setattr(module, "run", partial(answered, module))
+    monkeypatch.setattr(module_of("report"), "run", lambda arguments: pages.extend(
+        folder.name for folder in arguments.folders) or 0)
+    (tmp_path / "map.csv").write_text("x")
+    assert main(["explain", str(study), str(tmp_path / "map.csv"), "-o",
+                 str(tmp_path / "out")]) == 0
+    assert " ".join(folder for folder, _ in ran) == steps
+    assert " ".join(pages) == joined
+    used = dict(ran)
+    if "updated" in used:
+        assert used["updated"].endswith("registered/study.registered.toml")
+    if "explained" in used:
+        assert used["explained"].endswith("diagnosed/study.diagnosed.toml")
