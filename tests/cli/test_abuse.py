@@ -6,6 +6,7 @@ Results that were wrong without a word are tested where they are computed.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 
@@ -335,6 +336,19 @@ def test_a_map_that_is_not_in_m_and_T(tmp_path, capsys):
         code, sentence = refused(["check", file], capsys)
         assert code == 4
         assert said in sentence
+
+
+@pytest.mark.parametrize(("options", "asked"), [
+    (["--at", "z=0.03"], False), (["--at", "z=30"], True),
+    (["--at", "z=0", "--origin-m", "0,0,10"], True),
+    (["--at", "z=30", "--origin-m", "0,0,-30"], False)])
+def test_coordinates_of_options_in_mm(tmp_path, capsys, options, asked):
+    file, out = tmp_path / "map.txt", tmp_path / "map.csv"
+    file.write_text("x[mm] y[mm] Bx[mT]\n0 0 200\n1 0 201\n")
+    assert main(["import-map", str(file), "-o", str(out), *options, "--json"]) == 0
+    remarks = " ".join(json.loads(capsys.readouterr().out)["remarks"])
+    assert ("Are they in mm?" in remarks) == asked
+    assert ("--origin-m is in m" in remarks) == (asked and "--origin-m" in options)
 
 
 def test_angles_in_degrees(tmp_path, capsys):
