@@ -165,7 +165,9 @@ def make_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"Cannot make folder {folder}: {error.strerror}.") from None
+        hint = (" It is a file; name a folder, which is made if there is none."
+                if folder.is_file() else "")
+        raise OutputError(f"Cannot make folder {folder}: {error.strerror}.{hint}") from None
     return folder
 
 

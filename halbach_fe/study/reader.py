@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
@@ -34,6 +35,7 @@ WRONG_UNITS = (
 """
 
 
+@typed
 def read_study(path: str | Path) -> Study:
     """Read and validate a study file.
 

@@ -420,7 +420,7 @@ def test_a_folder_is_refused_before_the_check(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("halbach_fe.measurement.map_check.check_map", None)
     code, sentence = refused(["check", file, "-o", file], capsys)
     assert code == 8
-    assert "Cannot make folder" in sentence
+    assert f"Cannot make folder {file}: File exists. It is a file; name a folder" in sentence
 
 
 def test_more_blocks_than_fit_into_a_ring(tmp_path, capsys):
@@ -434,6 +434,16 @@ def test_more_blocks_than_fit_into_a_ring(tmp_path, capsys):
     assert code == 3
     assert "`design.layer.blocks_per_ring`" in sentence
     assert "at the radius 0.065 m; instead received 20. 17 do." in sentence
+
+
+def test_a_report_into_no_page(tmp_path, capsys):
+    """The name of a study made a folder of that name."""
+    page = tmp_path / "x.toml"
+    code, sentence = refused(["report", tmp_path / "solved", "-o", page], capsys)
+    assert code == 8
+    assert f"a page (.html), or a folder for report.html; instead received '{page}'" in sentence
+    assert f"Write {tmp_path / 'x.html'}." in sentence
+    assert not page.exists()
 
 
 def test_a_report_on_its_own_folder(tmp_path, capsys):
