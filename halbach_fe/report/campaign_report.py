@@ -299,7 +299,8 @@ def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> 
     if not paths:
         raise OutputError(must_be(
             "folders", "the report", "a list of folders of results other than its own",
-            repr(folders) if isinstance(folders, str | Path) else ", ".join(map(str, folders)) or "none"))
+            str(folders) if isinstance(folders, str | Path)
+            else ", ".join(map(str, folders)) or "none"))
     return Campaign(tuple(read_chapters(paths)))
 
 

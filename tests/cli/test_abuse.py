@@ -9,6 +9,7 @@ import argparse
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import gmsh
 import pytest
@@ -19,7 +20,8 @@ from halbach_fe.cli.common import orders
 from halbach_fe.cli.verbs import with_values
 from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.block_table import write_blocks
+from halbach_fe.inference.block_prior import loose_blocks
+from halbach_fe.measurement.block_table import read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of
@@ -68,6 +70,8 @@ def test_a_stock_of_blocks_in_the_magnet(campaign, tmp_path, capsys, kind):
     (["tolerance", "{study}", "--draws", "1e4"], "must be a whole number, not '1e4'"),
     (["tolerance", "{study}", "--draws", "1000001"], "from 20 to 1e+06, not 1000001"),
     (["tolerance", "{study}", "--draws", "1"], "from 20 to 1e+06, not 1"),
+    (["tolerance", "{study}", "--draws", "0"], "from 20 to 1e+06, not 0"),
+    (["tolerance", "{study}", "--limit-units", "0"], "from 1e-06 to 1e+06, not 0"),
     (["tolerance", "{study}", "--limit-units", "1e308"], "from 1e-06 to 1e+06, not 1e308"),
     (["tolerance", "{study}", "--limit-units", "x"], "must be a number, not 'x'"),
     (["demagnetization", "{study}", "--across", "1000000"], "from 2 to 100, not 1000000"),
@@ -434,6 +438,27 @@ def test_more_blocks_than_fit_into_a_ring(tmp_path, capsys):
     assert code == 3
     assert "`design.layer.blocks_per_ring`" in sentence
     assert "at the radius 0.065 m; instead received 20. 17 do." in sentence
+
+
+def test_sorting_into_rings_that_differ(tmp_path, capsys):
+    """No key prior.types parts the rings; what the sentence advises does."""
+    study, blocks, table = (tmp_path / name for name in ("two.toml", "blocks.csv", "free.csv"))
+    document = changed(BASE, array__ring=[{"inner_radius_m": 0.05}, {"inner_radius_m": 0.055}])
+    del document["array"]["rings"]
+    study.write_text(tomlkit.dumps(document))
+    measured = measured_blocks(build_magnet(read_study(study)))
+    write_blocks(measured, blocks)
+    code, sentence = refused(["sort", study, blocks, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert "Input type 1 of study base must be of blocks that are alike" in sentence
+    assert "r01s01 and r02s01" in sentence
+    assert "halbach-fe export STUDY --format blocks), add a column `type`" in sentence
+    assert main(["export", str(study), "--format", "blocks", "-o", str(table)]) == 0
+    header, *rows = table.read_text().splitlines()
+    table.write_text("\n".join([f"{header},type", *(f"{row},{row.split(',')[0]}" for row in rows)]))
+    study.write_text(tomlkit.dumps(document | {"array": {"free_blocks": {"file": "free.csv"}}}))
+    write_blocks(replace(measured, type=("",) * len(measured)), blocks)
+    loose_blocks(build_magnet(read_study(study)), read_blocks(blocks))
 
 
 def test_a_report_into_no_page(tmp_path, capsys):
