@@ -18,6 +18,7 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.cli.common import orders
 from halbach_fe.cli.verbs import with_values
+from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import loose_blocks
@@ -25,7 +26,7 @@ from halbach_fe.measurement.block_table import read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.reader import read_study
+from halbach_fe.study.reader import parse_study, read_study
 from tests.cli.test_all_keys import BASE, measured_blocks
 from tests.cli.test_cli import refused
 from tests.cli.test_odd_studies import written
@@ -105,6 +106,8 @@ def test_command_lines(campaign, tmp_path, capsys, arguments, said):
     (["multipoles", "{study}", "--posterior", "nope.h5"], 4, "received No such file or directory"),
     (["simulate-measurement", "{study}", "--hide", "gain_x=0.1", "--hide", "gain_x=0.2"], 3,
      "given once"),
+    (["simulate-measurement", "{study}", "--hide", "temperature=1,-0.12"], 3, "write -0.0012."),
+    (["simulate-measurement", "{study}", "--hide", "ring_twisted=1,30"], 3, "Then write 0.523599"),
     (["simulate-measurement", "{study}", "--hide", "gain_x=1e308"], 3, "from -0.9 to 10"),
     (["simulate-measurement", "{study}", "--hide", "blocks_swapped=1,1,1,1"], 3, "another block"),
     (["simulate-measurement", "{study}", "--hide", "swapped_axes=1,1"], 3, "another axis"),
@@ -124,6 +127,24 @@ def test_values_that_no_magnet_has(campaign, tmp_path, capsys, arguments, code, 
     assert found == code
     assert said in sentence
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"demagnetization__remanence_coefficient_per_K": -0.12},
+     "per cent per kelvin? Then write -0.0012."),
+    ({"demagnetization__reference_temperature_C": 293.15}, "in kelvin? Then write 20."),
+    ({"demagnetization__squareness": 90.0}, "per cent? Then write 0.9."),
+    ({"instrument__rotation_rad": [0, 0, 30]}, "in degrees? Then write 0.523599."),
+    ({"prior__magnitude_sd": 2.0}, "in per cent? Then write 0.02."),
+    ({"prior__magnitude_std": 0.02}, "Did you mean `magnitude_sd`?"),
+    ({"array__ring_gap_mm": 1.0}, "Did you mean `ring_gap_m`? Then convert its values to m."),
+    ({"instrument__gain": [60, 0, 0]}, "Correct the value.")])
+def test_units_that_a_value_may_have_had(changes, said):
+    """What the sentence advises is within the limits; nothing is advised that is not."""
+    with pytest.raises(StudyError) as refusal:
+        parse_study(changed(BASE, **changes))
+    assert said in str(refusal.value)
+    assert ("convert" in said) == ("convert" in str(refusal.value))
 
 
 @pytest.mark.parametrize("celsius", ["295", "-273"])
