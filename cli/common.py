@@ -667,7 +667,8 @@ def _given(arguments: argparse.Namespace) -> dict[str, Path | None]:
     return {
         "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
         "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
-        "POSTERIOR": getattr(arguments, "posterior", None)}
+        "POSTERIOR": getattr(arguments, "posterior", None),
+        "HELD_OUT": getattr(arguments, "held_out", None)}
 
 
 def _from_here(path: Path | None) -> str | None:

@@ -92,10 +92,11 @@ class Campaign:
 
     @cached_property
     def named(self) -> dict[str, str]:
-        """Map, blocks and posterior, if all results use the same, by the words of commands."""
-        found: dict[str, set[str | None]] = {"MAP": set(), "BLOCKS": set(), "POSTERIOR": {
+        """Maps, blocks and posterior, if all results use the same, by the words of commands."""
+        found: dict[str, set[str | None]] = {word: set() for word in ("MAP", "BLOCKS", "HELD_OUT")}
+        found["POSTERIOR"] = {
             _from_here(one.folder / POSTERIOR) for one in self.chapters if one.verb == "infer"
-            and POSTERIOR in one.record.files and self.replaced(one) is None}}
+            and POSTERIOR in one.record.files and self.replaced(one) is None}
         for one in self.chapters:
             for word in found.keys() & one.record.named.keys():
                 found[word].add(_from_here(Path(one.record.named[word])))

@@ -482,6 +482,20 @@ def test_sorting_into_rings_that_differ(tmp_path, capsys):
     loose_blocks(build_magnet(read_study(study)), read_blocks(blocks))
 
 
+def test_a_study_in_place_of_a_map(campaign, tmp_path, capsys):
+    study, measured, _ = campaign
+    for command in (["export", study, "--format", "csv", "-o", tmp_path / "out.csv"],
+                    ["import-map", study, "-o", tmp_path / "out.csv"], ["check", study],
+                    ["infer", study, "--measurements", study, "-o", tmp_path / "out"]):
+        code, sentence = refused(command, capsys)
+        assert code == 4
+        assert "a file of measurements; instead received a study. halbach-fe solve" in sentence
+    code, sentence = refused(["diagnose", study, "--measurements", measured, "--check",
+                              tmp_path / "no.json", "-o", tmp_path / "out"], capsys)
+    assert code == 4
+    assert "a readable file; instead received 'No such file or directory'" in sentence
+
+
 def test_a_report_into_no_page(tmp_path, capsys):
     """The name of a study made a folder of that name."""
     page = tmp_path / "x.toml"
