@@ -150,7 +150,8 @@ def _(result: Verification, folder: str | Path) -> Path:
 
 @_write.register
 def _(result: MultipoleTables, folder: str | Path) -> Path:
-    write_multipoles(result.magnet.study, result.tables, None, Path(folder), provenance())
+    write_multipoles(result.magnet.study, result.tables, None, Path(folder), provenance(),
+                     result.disagreement, result.left_out)
     return Path(folder) / "multipoles.html"
 
 
