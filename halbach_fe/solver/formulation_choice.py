@@ -458,11 +458,15 @@ def check_points(
             f"Input `{key}` of study {magnet.name} must lie in air; instead "
             f"{count} of {len(points)} points lie {what}, the first at "
             f"({x:g}, {y:g}, {z:g}) m. {hint or 'Move them into the bore or beyond the ends.'}")
-    for remark in filter(None, (places.on_faces(), places.far_away())):
-        warnings.warn(remark, HalbachWarning, stacklevel=2)
     points = places.points
     route = choose_route(magnet, points)
-    if route == "moments":  # the blocks need no boundary
+    # only meshes have a boundary, beyond which the solve refuses points
+    unbounded = route == "moments" or (
+        magnet.is_vacuum and magnet.study.solver.method == "reaction")
+    for remark in (places.on_faces(), places.far_away() if unbounded else None):
+        if remark is not None:
+            warnings.warn(remark, HalbachWarning, stacklevel=2)
+    if unbounded:
         return points
     mesh = MESHES[route]
     directions = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,
