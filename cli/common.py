@@ -113,7 +113,7 @@ def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = Tru
     parser.add_argument("--jobs", type=positive, metavar="N",
                         help="number of GetDP runs at a time (default: 2, or with --scheduler the "
                         "number of cores of its workers)")
-    parser.add_argument("--mpi", type=within(positive, 1, MOST_MPI), default=1, metavar="N",
+    parser.add_argument("--mpi", type=within(whole, 1, MOST_MPI), default=1, metavar="N",
                         help="number of MPI processes that share each run, for solves that are too "
                         "large for a single process (default: %(default)s)")
     parser.add_argument("--scheduler", metavar="ADDRESS",
@@ -288,7 +288,7 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
                         help="in 3D: multipoles on the circle at Z in m, instead of those of the "
                         "field integrated along z")
-    parser.add_argument("--limit-units", type=within(positive_number, *LIMIT_UNITS), metavar="U",
+    parser.add_argument("--limit-units", type=within(finite_number, *LIMIT_UNITS), metavar="U",
                         help="largest unwanted multipole that is allowed, in units of 1e-4 of the "
                         "main multipole")
 
@@ -296,7 +296,7 @@ def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
 def add_objective_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of multipoles, and the limit of a study that asks for a homogeneous field."""
     add_multipole_arguments(parser)
-    parser.add_argument("--limit-ppm", type=within(positive_number, *LIMIT_PPM), metavar="P",
+    parser.add_argument("--limit-ppm", type=within(finite_number, *LIMIT_PPM), metavar="P",
                         help="if the study has a table [homogeneity]: largest rms deviation of |B| "
                         "in its region that is allowed, in ppm of the mean")
 
@@ -484,12 +484,17 @@ def positive(text: str) -> int:
     return _at_least(1, text)
 
 
-def _at_least(least: int, text: str) -> int:
+def whole(text: str) -> int:
+    """Parse a whole number."""
     try:
-        value = int(text)
+        return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"must be a whole number, not {printable(text, MAX_QUOTED)!r}") from None
+
+
+def _at_least(least: int, text: str) -> int:
+    value = whole(text)
     if value < least:
         raise argparse.ArgumentTypeError(f"must be at least {least}, not {value}")
     return value
@@ -662,7 +667,8 @@ def _given(arguments: argparse.Namespace) -> dict[str, Path | None]:
     return {
         "STUDY": getattr(arguments, "study", None), "BLOCKS": getattr(arguments, "blocks", None),
         "MAP": getattr(arguments, "measurements", getattr(arguments, "map", None)),
-        "POSTERIOR": getattr(arguments, "posterior", None)}
+        "POSTERIOR": getattr(arguments, "posterior", None),
+        "HELD_OUT": getattr(arguments, "held_out", None)}
 
 
 def _from_here(path: Path | None) -> str | None:

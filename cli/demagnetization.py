@@ -16,7 +16,7 @@ from halbach_fe.core.numbers import ACROSS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
     common.add_study_arguments(parser)
-    parser.add_argument("--across", type=common.within(common.positive, *ACROSS), metavar="N",
+    parser.add_argument("--across", type=common.within(common.whole, *ACROSS), metavar="N",
                         help="cells across the thickness of a block (default: 6)")
 
 

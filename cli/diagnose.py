@@ -81,7 +81,10 @@ def floor_of(path: Path, data: xr.Dataset) -> dict[str, float]:
         found = json.loads(path.read_text("utf-8"))
         floor = [float(value) for value in found["floor_T"]]
         maps = set(found["maps_sha256"].values())
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except OSError as error:
+        raise MeasurementError(must_be("file --check", str(path), "a readable file",
+                                       f"'{error.strerror}'", "Check the path.")) from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         floor, maps = [], set[str]()
     if len(floor) != len(COMPONENTS) or not all(0 <= value < math.inf for value in floor):
         raise MeasurementError(must_be(

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _density(text: str) -> float:
     """Parse a density in kg/m^3, or refuse one that no magnet has: 7.5 is one in g/cm^3."""
     try:
-        return common.within(common.positive_number, *DENSITY)(text)
+        return common.within(common.finite_number, *DENSITY)(text)
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"{error}; 7.5 g/cm^3 are 7500 kg/m^3") from None
 

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     answer = write_multipoles(study, tables, limit, arguments.output, {
         "GetDP": session.getdp.version, **common.digests(
             {"study file": arguments.study, "posterior": arguments.posterior})},
-        found.disagreement)
+        found.disagreement, found.left_out)
     if arguments.json:
         common.print_json(multipoles_summary(study, tables, limit))
     else:

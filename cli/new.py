@@ -100,6 +100,10 @@ def run(arguments: argparse.Namespace) -> int:
         given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)
     template = MagnetTemplate(**given)
     magnet = build_magnet(parse_new_study(new_study(path.stem, template, folder), folder))
+    if template.dsv_m is not None:
+        from halbach_fe.response.homogeneity import Region, region_points
+
+        region_points(magnet, Region.sphere(template.dsv_m / 2))  # refuses one that is not in air
     sigma, position = _noise(magnet)
     write_new_study(path, replace(template, sigma_T=sigma, position_sd_m=position))
     name = str(path) if not str(path).startswith("-") else f"./{path}"
@@ -144,6 +148,10 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
         raise CommandLineError(must_be(
             "--ring-length-m", "the command line", "given with --rings", "nothing",
             "Rings that follow each other along z have a length."))
+    if "dsv_m" in given and not given.keys() & {"ring_length_m", "cube_m", "free_blocks"}:
+        raise CommandLineError(must_be(
+            "--ring-length-m", "the command line", "given with --dsv-m", "nothing",
+            "A cross-section has no volume."))
     edge = given.get("cube_m")
     if isinstance(edge, float) and radius_m is not None and not edge < 2 * radius_m:
         raise CommandLineError(must_be(

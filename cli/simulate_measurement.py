@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_study_and_output(parser)
     parser.add_argument("--seed", type=common.positive, default=1, metavar="N",
                         help="seed of the random numbers (default: %(default)s)")
-    parser.add_argument("--coil-sd", type=common.within(common.positive_number, 1e-9, 0.3),
+    parser.add_argument("--coil-sd", type=common.within(common.finite_number, 1e-9, 0.3),
                         default=COIL_SD, metavar="F",
                         help="noise of the measured moment of a block, relative to the moment "
                         "(default: %(default)g)")
@@ -51,11 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hide-random", type=common.positive, default=0, metavar="K",
                         help="hide K effects of the field or the instrument that are drawn at "
                         "random")
-    parser.add_argument("--element-size", type=common.within(common.positive_number, 1e-5, 10),
+    parser.add_argument("--element-size", type=common.within(common.finite_number, 1e-5, 10),
                         metavar="M",
                         help="size in m of the largest elements of NGSolve (default: a third of "
                         "the blocks' thickness, in 2D half of that)")
-    parser.add_argument("--order", type=common.within(common.positive, 1, 10), metavar="N",
+    parser.add_argument("--order", type=common.within(common.whole, 1, 10), metavar="N",
                         help="order of NGSolve's elements (default: 3 in 3D, 5 in 2D)")
     common.add_json_argument(parser)
 

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="measured moments of the single blocks, whose prior replaces the "
                         "study's")
     common.add_objective_arguments(parser)
-    parser.add_argument("--draws", type=common.within(common.positive, *DRAWS), default=10_000,
+    parser.add_argument("--draws", type=common.within(common.whole, *DRAWS), default=10_000,
                         metavar="N",
                         help="number of magnets to draw (default: %(default)s)")
     common.add_seed_argument(parser)

@@ -80,6 +80,8 @@ class MultipoleTables(ShownInNotebook):
     disagreement : str or None
         Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
         if that is not known.
+    left_out : tuple of str
+        Sentences about references without a main multipole, which have no table.
 
     Examples
     --------
@@ -93,6 +95,7 @@ class MultipoleTables(ShownInNotebook):
     magnet: Magnet
     tables: Sequence[tuple[MultipoleModel, Mapping[str, Multipoles]]]
     disagreement: str | None = None
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -262,11 +265,11 @@ def multipoles(
     references = [reference]
     if magnet.dimension == 3:
         references = [replace(reference, z_m=None), replace(reference, z_m=reference.z_m or 0.0)]
-    models = multipole_models(magnet, references, session)
+    models, left_out = multipole_models(magnet, references, session)
     distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
-        for model in models], disagreement_of(posterior))
+        for model in models], disagreement_of(posterior), left_out)
 
 
 @alone

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 import typing
 from collections.abc import Callable
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, ParamSpec, TypeVar
 
@@ -17,15 +19,17 @@ R = TypeVar("R")
 READERS = {"BlockTable": "Read the file by hf.read_blocks.",
            "Study": "Read the file by hf.read_study.",
            "Magnet": "hf.build_magnet makes one of a study.",
-           "Session": "hf.Session.open makes one."}
+           "Session": "hf.Session.open makes one.",
+           "path": "Give it as text."}
 """How to come by an object of a class."""
 
 
 def typed(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function that refuses, by a StudyError, arguments of other classes than its own.
+    """Decorate a function that refuses, by a StudyError, missing arguments and those of other
+    classes than its own.
 
-    Only arguments that are annotated by classes of halbach-fe, or by such a class or None, are
-    checked.
+    Only arguments that are annotated by classes of halbach-fe, by ``str | Path``, or by such a
+    class or None, are checked.
     """
     signature = inspect.signature(function)
 
@@ -36,12 +40,19 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def checked(*arguments: P.args, **options: P.kwargs) -> R:
-        for name, value in signature.bind(*arguments, **options).arguments.items():
+        called = function.__qualname__
+        try:
+            bound = signature.bind(*arguments, **options)
+        except TypeError as error:
+            names = [name for name in signature.parameters if name != "cls"]
+            raise StudyError(f"Arguments of {called} must be {', '.join(names)}; instead: "
+                             f"{error}.") from None
+        for name, value in bound.arguments.items():
             expected = classes().get(name)
             if expected and not isinstance(value, expected):
-                wanted = expected[0].__name__
+                wanted = "path" if expected[0] is str else expected[0].__name__
                 article = "an" if wanted[0] in "AEIO" else "a"
-                raise StudyError(must_be(name, function.__name__, f"{article} {wanted}",
+                raise StudyError(must_be(name, called, f"{article} {wanted}",
                                          f"a {type(value).__name__}", READERS.get(wanted, "")))
         return function(*arguments, **options)
 
@@ -49,7 +60,9 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _own_classes(hint: Any) -> tuple[type, ...]:
-    """Return the classes of an annotation, if they are halbach-fe's or None; else nothing."""
+    """Return the classes of an annotation that are halbach-fe's, paths or None; else nothing."""
+    if typing.get_args(hint) == (str, Path):
+        return str, os.PathLike
     parts = typing.get_args(hint) if isinstance(hint, UnionType) else (hint,)
     own = tuple(part for part in parts if isinstance(part, type)
                 and part.__module__.startswith("halbach_fe."))

@@ -77,6 +77,10 @@ def file_bytes(path: Path, where: str) -> bytes:
     MeasurementError
         If the file cannot be read or is empty; ``where`` names it in the message.
     """
+    if path.suffix == ".toml":
+        raise MeasurementError(must_be(
+            "path", where, "a file of measurements", "a study", "halbach-fe solve STUDY writes its "
+            "field, as field_map.csv; halbach-fe export STUDY --format blocks its blocks."))
     try:
         raw = path.read_bytes()
     except OSError as error:
@@ -165,7 +169,9 @@ def make_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"Cannot make folder {folder}: {error.strerror}.") from None
+        hint = (" It is a file; name a folder, which is made if there is none."
+                if folder.is_file() else "")
+        raise OutputError(f"Cannot make folder {folder}: {error.strerror}.{hint}") from None
     return folder
 
 

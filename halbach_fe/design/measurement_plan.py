@@ -161,16 +161,16 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
             f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
             f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
             "fewer, or add `plan.candidates`.")
-    check_points(magnet, baseline)
-    check_points(magnet, candidates, "plan.candidates")
-    if magnet.study.homogeneity is not None:
-        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
     farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
     if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
         raise StudyError(must_be(
             "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
             "the magnet, where there is some field", f"one at {farthest:.4g} m",
             "Are they in metres?"))
+    check_points(magnet, baseline)
+    check_points(magnet, candidates, "plan.candidates")
+    if magnet.study.homogeneity is not None:
+        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
     points = np.vstack([baseline, candidates])
     # the order in which they would be measured is not known yet
     steady = magnet.study.instrument.with_(lag_m=0.0)

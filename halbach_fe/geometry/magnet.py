@@ -294,7 +294,9 @@ class Magnet(ShownInNotebook):
         distance, _ = KDTree(points[:, :size]).query(middles[:, :size])
         near = [self.blocks[number] for number in np.flatnonzero(distance <= self._reaches)]
         others = neighbour_blocks(self.blocks, self.external.neighbours)
-        return surroundings((*near, *others, *self.iron), points)
+        found = surroundings((*near, *others, *self.iron), points)
+        reach = self.radius if self.dimension == 2 else max(self.radius, self.half_length)
+        return replace(found, reach=reach)
 
     @cached_property
     def _reaches(self) -> Floats:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
+from halbach_fe.study.types import look_like_mm
 
 ON_SURFACE = 1e-8
 """Distance from a surface, relative to the size of the body, up to which a point lies on it: 0.2 nm
@@ -227,6 +228,8 @@ class Surroundings:
         Number of bodies on whose faces a point lies; 2 between bodies that touch.
     names : dict of int to list of str
         Names of the bodies whose faces or edges the point with this number touches.
+    reach : float
+        Distance in m from the middle to which the magnet reaches.
     """
 
     points: Floats
@@ -234,6 +237,7 @@ class Surroundings:
     on_edge: NDArray[np.bool_]
     faces: Ints
     names: dict[int, list[str]]
+    reach: float = np.inf
 
     @property
     def no_air(self) -> NDArray[np.bool_]:
@@ -255,9 +259,23 @@ class Surroundings:
                  "Move them out of the blocks.")):
             if chosen.any():
                 first = int(np.argmax(chosen))
-                names = " and ".join(self.names.get(first, [])[:2])
-                return first, int(chosen.sum()), what.format(names), hint
+                names = self.names.get(first, [])[:2]
+                if chosen is edges and len(names) > 1:
+                    what += ", unless they are magnetized alike and flush"
+                    hint = ("Move them off the edge, by 0.1 mm say; or state blocks that are alike "
+                            "and flush as one block, which has a face there.")
+                return first, int(chosen.sum()), what.format(" and ".join(names)), hint
         return None
+
+    def far_away(self) -> str | None:
+        """Return the sentence about points so far away that they may be in mm, None without any."""
+        far = look_like_mm(self.points, self.reach)
+        if not far.any():
+            return None
+        distance = np.linalg.norm(self.points, axis=1).max()
+        return (f"{far.sum()} of {len(far)} points lie up to {distance:.3g} m from the middle of "
+                f"the magnet, which reaches to {self.reach:.3g} m: hardly any of its field is left "
+                f"there. Are they in mm? Then write {distance / 1000:.3g} for {distance:.3g}.")
 
     def on_faces(self) -> str | None:
         """Return the sentence about points on faces, None if there are none."""

@@ -314,7 +314,8 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     blocks, size = magnet.blocks, magnet.dimension
     table = with_types(magnet, table)
     _check_types(magnet, table)
-    _check_alike(magnet, lambda block: block.shape_axes, "Make them types of their own.")
+    _check_alike(magnet, lambda block: block.shape_axes, "Name them as types of their own.",
+                 OF_OTHER_RINGS)
     index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
@@ -573,13 +574,21 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
             f"the same moment {name} in all", "Was that component measured?"))
 
 
+OF_OTHER_RINGS = (
+    "A type has the same slots in all rings. Where rings differ, list the blocks as "
+    "`array.free_blocks` (halbach-fe export STUDY --format blocks), add a column `type` to that "
+    "table, and leave the types out of the table of measured blocks.")
+"""What to do about blocks of one slot that are not alike."""
+
+
 def _check_alike(
-    magnet: Magnet, axes: Callable[[MagnetBlock], Floats], hint: str
+    magnet: Magnet, axes: Callable[[MagnetBlock], Floats], hint: str, of_a_slot: str = ""
 ) -> None:
     """Raise a StudyError if the study's blocks of a type differ, seen from their own axes.
 
     ``axes`` returns the axes of a block as columns (3, 3). A moment must mean the same deviation
-    from the nominal magnetization for all blocks of a type.
+    from the nominal magnetization for all blocks of a type. The advice ``of_a_slot`` takes the
+    place of ``hint`` if the blocks have the same slot.
     """
     blocks = magnet.blocks
     finite = [replace(block, z_min=0.0, z_max=1.0) if magnet.dimension == 2 else block
@@ -594,8 +603,10 @@ def _check_alike(
         first = members[0] if members else -1
         for number in members[1:]:
             if np.abs(seen[number] - seen[first]).max() > 1e-6 * np.abs(seen[first]).max():
+                stated = label in magnet.study.prior.types
+                alike = blocks[number].slot == blocks[first].slot
                 raise StudyError(must_be(
-                    f"`prior.types.{label}`", f"study {magnet.name}",
-                    "blocks that are alike from their own axes",
+                    f"`prior.types.{label}`" if stated else f"type {label}",
+                    f"study {magnet.name}", "of blocks that are alike from their own axes",
                     f"{blocks[first].name} and {blocks[number].name}, of another magnetization, "
-                    "permeability or shape", hint))
+                    "permeability or shape", (alike and of_a_slot) or hint))

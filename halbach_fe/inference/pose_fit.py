@@ -43,6 +43,7 @@ from halbach_fe.measurement.doubted_terms import (
     block_doubts,
     doubts,
     factor_of,
+    likeness_of,
     words_of,
 )
 from halbach_fe.measurement.field_map import is_total_field, points_of
@@ -380,7 +381,7 @@ class PoseFit:
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
             log_evidence, at_rest, _probe_sd(self._of_probe(sd[6:6 + PROBE])), blocks,
-            self._doubts(scaled, blocks), self._factor(pose, values), total=self.total)
+            self._doubts(scaled, blocks), *self._factor(pose, values), total=self.total)
 
     def _doubts(self, scaled: Floats, blocks: Gaussian) -> tuple[Term, ...]:
         """Return the terms that a fit has taken far from their priors.
@@ -398,15 +399,17 @@ class PoseFit:
         return doubts(terms, count) + block_doubts(
             self.magnet, blocks.mean, self.prior.mean, self.prior.sd)
 
-    def _factor(self, pose: Floats, values: Floats) -> float:
-        """Return how many times the readings are what a probe without errors reads of the magnet.
+    def _factor(self, pose: Floats, values: Floats) -> tuple[float, float]:
+        """Return how many times the readings are what a probe without errors reads of the magnet,
+        and how alike both are, see `likeness_of`.
 
         A wrong unit shows in it, which gains, blocks and offsets share out among them otherwise.
         """
         sensors = sensor_positions(self.instrument(pose, values), self.points)
         exact = self.instrument(pose, np.append(np.zeros(PROBE), values[PROBE:]))
         expected = seen(sensor_matrix(exact), field_at_sensors(self._field(values), sensors)[0])
-        return factor_of(self.readings[self.training], expected[self.training])
+        both = self.readings[self.training], expected[self.training]
+        return factor_of(*both), likeness_of(*both)
 
     def _check_effects(self, state: _State) -> None:
         """Raise a StudyError if an open key changes no reading that is fitted."""

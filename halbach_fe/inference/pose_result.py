@@ -211,6 +211,8 @@ class Registration:
         see `halbach_fe.measurement.doubted_terms`.
     factor : float
         How many times the readings are what a probe without errors reads of the nominal magnet.
+    likeness : float
+        How alike both are (-1 to 1); where they are not, no factor relates them.
     component : str
         Which component the readings were taken for, where the map does not say it; else empty.
     total : bool
@@ -235,6 +237,7 @@ class Registration:
     blocks: Gaussian = dataclasses.field(repr=False)
     doubts: tuple[Term, ...] = ()
     factor: float = 1.0
+    likeness: float = 1.0
     component: str = ""
     total: bool = False
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.files import as_path, atomic, file_bytes
@@ -91,6 +92,7 @@ class BlockTable:
         _check(self)
 
 
+@typed
 def read_blocks(path: str | Path) -> BlockTable:
     """Read and validate a table of measured blocks.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.stats import binom
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import (
@@ -108,6 +109,7 @@ def middle_of(points: Floats) -> Floats:
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
+@typed
 def read_maps(study: Study, folder: str | Path = ".") -> dict[str, xr.Dataset]:
     """Read the maps that a study lists.
 

@@ -29,6 +29,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from halbach_fe.core import untrusted
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
@@ -186,6 +187,7 @@ def write_map(data: xr.Dataset, path: Path) -> None:
         writers[path.suffix](data, temporary)
 
 
+@typed
 def read_map(path: str | Path) -> xr.Dataset:
     """Read and validate a map from CSV, HDF5 (.h5, .hdf5, .nc) or VTU.
 

@@ -114,8 +114,9 @@ class Answer:
     def with_paths(self, paths: Mapping[str, object]) -> Answer:
         """Return the answer with the paths that are known in place of the words of its command.
 
-        An update with a map gets the table of blocks too, if its path is known. Of a study that
-        lists its maps, `infer`, `diagnose` and `register` take no other.
+        An update with a map gets the table of blocks too, if its path is known, and `infer` and
+        `diagnose` the held-out map. Of a study that lists its maps, `infer`, `diagnose` and
+        `register` take no other.
         """
         def known(word: str) -> str:
             name, slash, rest = word.partition("/")
@@ -127,9 +128,11 @@ class Answer:
                                *(options if isinstance(options, list) else [])])
 
         words = self.command.split(" ")
-        if paths.get("BLOCKS") is not None and "--measurements" in words and not {
-                "--blocks", "NEW_MAP"} & set(words):
-            words[words.index("-o"):words.index("-o")] = ["--blocks", "BLOCKS"]
+        if "--measurements" in words and "NEW_MAP" not in words:
+            for option, word, verbs in (("--blocks", "BLOCKS", words),
+                                        ("--held-out", "HELD_OUT", ("infer", "diagnose"))):
+                if paths.get(word) is not None and option not in words and {*verbs} & {*words}:
+                    words[words.index("-o"):words.index("-o")] = [option, word]
         if paths.get(LISTED_MAPS) and "MAP" in words and {*TAKE_LISTED_MAPS} & set(words):
             first = words.index("--measurements")
             del words[first:first + 2]

@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path, PurePath
 from urllib.parse import quote
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import MAX_QUOTED, MAX_SENTENCE, OutputError, must_be, printable
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.result_folder import result_folder, single_file
@@ -28,7 +29,7 @@ from halbach_fe.report.page_record import Picture
 from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.model import Study
 
-PAGE = "report.html"
+PAGE, PAGES = "report.html", (".html", ".htm")
 
 DIAGNOSED = "study.diagnosed.toml"
 """The study that halbach-fe diagnose writes, with what was missing."""
@@ -91,10 +92,11 @@ class Campaign:
 
     @cached_property
     def named(self) -> dict[str, str]:
-        """Map, blocks and posterior, if all results use the same, by the words of commands."""
-        found: dict[str, set[str | None]] = {"MAP": set(), "BLOCKS": set(), "POSTERIOR": {
+        """Maps, blocks and posterior, if all results use the same, by the words of commands."""
+        found: dict[str, set[str | None]] = {word: set() for word in ("MAP", "BLOCKS", "HELD_OUT")}
+        found["POSTERIOR"] = {
             _from_here(one.folder / POSTERIOR) for one in self.chapters if one.verb == "infer"
-            and POSTERIOR in one.record.files and self.replaced(one) is None}}
+            and POSTERIOR in one.record.files and self.replaced(one) is None}
         for one in self.chapters:
             for word in found.keys() & one.record.named.keys():
                 found[word].add(_from_here(Path(one.record.named[word])))
@@ -284,18 +286,26 @@ def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
 def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> Campaign:
     """Read the results of one magnet; see `campaign_report`.
 
-    The folder ``output`` of the report itself, which wildcards may name too, is left out.
+    The folder ``output`` of the report itself, which wildcards may name too, is left out. A file
+    that would be no page is refused by an OutputError.
     """
-    paths = [] if isinstance(folders, str) else [
+    if output is not None and output.suffix[1:].isalpha() and not (
+            output.suffix.lower() in PAGES or output.is_dir()):
+        raise OutputError(must_be(
+            "-o", "halbach-fe report", "a page (.html), or a folder for report.html",
+            f"'{output}'", f"Write {output.with_suffix(PAGES[0])}."))
+    paths = [] if isinstance(folders, str | Path) else [
         path for path in map(as_path, folders) if output is None
         or path.resolve() != output.resolve()]
     if not paths:
         raise OutputError(must_be(
             "folders", "the report", "a list of folders of results other than its own",
-            repr(folders) if isinstance(folders, str) else ", ".join(map(str, folders)) or "none"))
+            str(folders) if isinstance(folders, str | Path)
+            else ", ".join(map(str, folders)) or "none"))
     return Campaign(tuple(read_chapters(paths)))
 
 
+@typed
 def campaign_report(folders: Sequence[str | Path], output: str | Path) -> Path:
     """Join the results of one magnet into a page: the answer of every command, with links.
 
@@ -337,7 +347,7 @@ def campaign_report(folders: Sequence[str | Path], output: str | Path) -> Path:
 def write_campaign_report(campaign: Campaign, output: Path) -> Path:
     """Write the page of a campaign; see `campaign_report`. Return its path."""
     with ExitStack() as stack:
-        if output.suffix.lower() in (".html", ".htm"):
+        if output.suffix.lower() in PAGES:
             path = output
             stack.enter_context(single_file(path, "halbach-fe report"))
         else:

@@ -114,7 +114,10 @@ def _largest_field(result: InferenceResult) -> str:
     component = f"B{COMPONENTS[main]}" if np.linalg.norm(np.delete(along, main)) < ALONG_AN_AXIS \
         else f"B along ({_numbers(along, '.4f')})"
     moved = np.abs(place - 1e3 * result.observation.positions[most]).max() > 1e-3
-    where = f"({_numbers(place.round(3), '.5g')}) mm{' of the magnet' if moved else ''}"
+    sd = 1e3 * _sd_of_place(result, most)
+    numbers = (", ".join(map(with_error, (place.round(9) + 0.0).tolist(), sd.tolist())) if sd.any()
+               else _numbers(place.round(3), ".5g"))
+    where = f"({numbers}) mm{' of the magnet' if moved or sd.any() else ''}"
     what = ("The strongest component of the updated field at the map's positions, "
             f"{component} at {where}, is ")
     if result.observation.of_total_field[most]:
@@ -122,6 +125,19 @@ def _largest_field(result: InferenceResult) -> str:
                 f"{where} is ")
     return (f"{what}"
             f"{with_error(1e3 * abs(field.mean[most]), 1e3 * field.sd[most])} mT.")
+
+
+def _sd_of_place(result: InferenceResult, number: int) -> Floats:
+    """Return the standard deviations (3,) in m of where a reading lies in the magnet, along its
+    axes: of a map whose pose was found. Shift and turns are taken as independent.
+    """
+    pose = next((one for one in (result.terms.poses if result.terms else ())
+                 if one.name == result.maps[number]), None)
+    if pose is None:
+        return np.zeros(3)
+    x, y, z = result.field.places[number] - pose.middle_m
+    arms = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
+    return np.asarray(np.sqrt(np.square(pose.middle_sd_m) + arms**2 @ np.square(pose.turn_sd_rad)))
 
 
 def _numbers(values: Floats, form: str) -> str:

@@ -274,7 +274,9 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
 
 
 def place_of(model: MultipoleModel) -> str:
-    """Return the circle of a reference in words."""
+    """Return the reference in words: a circle, or the field integrated along z."""
+    if model.integrated:
+        return f"the field integrated along z, at a radius of {1e3 * model.radius:.4g} mm"
     where = ("" if model.z is None  # the middle of a magnet is 0 to rounding
              else f" at z = {1e3 * round(model.z, 9):.4g} mm")
     return f"the circle of {1e3 * model.radius:.4g} mm{where}"
@@ -288,9 +290,12 @@ def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
 @own_style
 def write_multipoles(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None, folder: Path,
-    provenance: Mapping[str, str], disagreement: str | None = None,
+    provenance: Mapping[str, str], disagreement: str | None = None, left_out: Sequence[str] = (),
 ) -> Answer:
-    """Write multipoles.csv, multipoles.json, multipoles.html and its figures; return the answer."""
+    """Write multipoles.csv, multipoles.json, multipoles.html and its figures; return the answer.
+
+    ``left_out`` are the sentences of `multipole_models`.
+    """
     write_multipole_csv(study, tables, folder / "multipoles.csv")
     summary = multipoles_summary(study, tables, limit)
     write_text(folder / "multipoles.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
@@ -304,5 +309,6 @@ def write_multipoles(
              for (model, magnets), picture in zip(tables, pictures, strict=True)]
     said = answer(tables, limit, disagreement, faults_in_words(study))
     write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
-               provenance=provenance, answer=said, parts=parts, rows=multipole_rows(tables[0][1]))
+               provenance=provenance, answer=said, parts=parts, rows=multipole_rows(tables[0][1]),
+               left_out=left_out)
     return said

@@ -25,7 +25,12 @@ from halbach_fe.inference.registration import (
     turn_from_axes,
 )
 from halbach_fe.measurement.campaign import Map
-from halbach_fe.measurement.doubted_terms import doubts_in_words, factor_in_words, known_factor
+from halbach_fe.measurement.doubted_terms import (
+    UNLIKE,
+    doubts_in_words,
+    factor_in_words,
+    known_factor,
+)
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
     UNDIRECTED_COLUMN,
@@ -185,13 +190,19 @@ def _doubts(best: Registration) -> list[str]:
     """Say what lies far from its prior, and what a common factor of the readings tells."""
     if not best.doubts:
         return []
-    return [each for each in (doubts_in_words(best.doubts), factor_in_words(best.factor)) if each]
+    return [each for each in (doubts_in_words(best.doubts),
+                              factor_in_words(best.factor, best.likeness)) if each]
+
+
+def _are_alike(best: Registration) -> bool:
+    """Tell whether the readings are like the nominal field, so that a factor may relate both."""
+    return abs(best.likeness) >= UNLIKE
 
 
 def _is_of_the_file(best: Registration) -> bool:
     """Tell whether doubts are about what the file says of its numbers, not about the magnet."""
-    return bool(best.doubts) and (best.explains or bool(known_factor(best.factor))
-                                  or len(_measured(best)) == 1)
+    of_a_factor = _are_alike(best) and bool(known_factor(best.factor))
+    return bool(best.doubts) and (best.explains or of_a_factor or len(_measured(best)) == 1)
 
 
 def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
@@ -201,7 +212,7 @@ def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
         return (f"Is the component really B{_measured(best)[0]}, along the map's own axes? If that "
                 f"is not certain, name its column {UNDIRECTED_COLUMN} (import-map: --component "
                 "unknown), and register finds which one it is.", again)
-    if factor_in_words(best.factor):
+    if _are_alike(best) and factor_in_words(best.factor):
         return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
                 "instrument.flux_density_unit_T in the study), and register it again.", again)
     return ("Look whether rows, axes, components and units of the map are what its columns say "

@@ -10,6 +10,8 @@ from pathlib import Path
 import tomlkit
 
 from halbach_fe.api import HomogeneityResult, MultipoleTables
+from halbach_fe.core.arguments import typed
+from halbach_fe.core.errors import must_be
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.core.versions import version
 from halbach_fe.design.assembly import Assembly
@@ -68,6 +70,7 @@ def provenance(getdp: str | None = None) -> dict[str, str]:
     return versions if getdp is None else versions | {"GetDP": getdp}
 
 
+@typed
 def write_report(result: object, folder: str | Path) -> Path:
     """Write the files of a result into a folder: its tables, and its HTML page with all figures.
 
@@ -104,7 +107,9 @@ Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
     """
     owner = next((OWNERS[kind] for kind in type(result).__mro__ if kind in OWNERS), None)
     if owner is None:
-        raise TypeError(f"there is no report for a {type(result).__name__}")
+        raise TypeError(must_be(
+            "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
+            f"a {type(result).__name__}"))
     command, study = owner
     with result_folder(Path(folder), f"halbach-fe {command}", attrgetter(study)(result).name):
         return _write(result, folder)
@@ -145,7 +150,8 @@ def _(result: Verification, folder: str | Path) -> Path:
 
 @_write.register
 def _(result: MultipoleTables, folder: str | Path) -> Path:
-    write_multipoles(result.magnet.study, result.tables, None, Path(folder), provenance())
+    write_multipoles(result.magnet.study, result.tables, None, Path(folder), provenance(),
+                     result.disagreement, result.left_out)
     return Path(folder) / "multipoles.html"
 
 

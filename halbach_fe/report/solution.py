@@ -58,6 +58,11 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
             f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.").lstrip()
     of_blocks = ("It is the field of the magnet as the study states it; a magnet that is built has "
                  "the tolerances of its blocks besides.")
+    if far := solution.magnet.surroundings(solution.points).far_away():
+        return Answer("How strong is the field?", said,
+                      f"Not before the positions are checked. {far} {of_blocks}",
+                      "Correct the positions, or go on if they are meant to be there.",
+                      "halbach-fe solve STUDY -o DIR", False)
     if error <= ROUNDING * high:
         return Answer("How strong is the field?", said,
                       "Yes: that is exact. The study's blocks have a recoil permeability of 1 and "

@@ -106,7 +106,7 @@ def stray_figure(stray: StrayField) -> Figure:
     for axis, plane in zip(axes[:-1], stray.planes, strict=True):
         names = [name for name in "xyz" if name != plane.across]
         first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
-        size = np.log(plane.size_T)
+        size = np.log(np.maximum(plane.size_T, min(*OTHERS_T, stray.limit_T) / 10))  # may be 0
         if plane.across == "z":
             axis.add_patch(Circle((0, 0), radius, color="#cccccc", lw=0))
             limits: list[Patch] = [Circle(

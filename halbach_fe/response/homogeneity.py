@@ -35,7 +35,7 @@ from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import FluxDensity, Instrument, PointPositions
-from halbach_fe.study.types import COMPONENTS
+from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M
 
 PPM = 1e6
 
@@ -138,6 +138,9 @@ class Region:
         if min(self.half_axes_m) <= 0:
             raise StudyError(must_be("half_axes_m", "a region", "above 0",
                                      f"{min(self.half_axes_m):g}"))
+        if max(self.half_axes_m) > MAX_LENGTH_M:
+            raise StudyError(must_be("half_axes_m", "a region", f"at most {MAX_LENGTH_M:g} m",
+                                     f"{max(self.half_axes_m):g}", "Was it meant in millimetres?"))
         alike = {"sphere": 3, "cylinder": 2, "ellipsoid": 1}[self.shape]
         if len(set(self.half_axes_m[:alike])) > 1:
             raise StudyError(must_be(

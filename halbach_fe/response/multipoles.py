@@ -282,16 +282,16 @@ def multipole_model(magnet: Magnet, reference: MultipoleReference,
     StudyError
         If the reference does not fit the study, or the nominal magnet has no main multipole.
     """
-    return multipole_models(magnet, (reference,), session)[0]
+    return multipole_models(magnet, (reference,), session)[0][0]
 
 
 def multipole_models(
     magnet: Magnet, references: Sequence[MultipoleReference], session: Session
-) -> list[MultipoleModel]:
+) -> tuple[list[MultipoleModel], tuple[str, ...]]:
     """Return the `multipole_model` of several references, which share the solves.
 
     Those at which the main multipole of the nominal magnet vanishes are left out, unless it does at
-    all of them.
+    all of them; the sentences that say so come second.
 
     Warns
     -----
@@ -332,11 +332,11 @@ def multipole_models(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
             phases * _complexes(model.offset[part])[index], model.error[part][index],
             model.nominal, -turn))
-    for place in left_out:
-        warnings.warn(
-            f"{place} has no multipole of order {main}, which cancels there: its table, in units "
-            "of 1e-4 of that, is left out.", HalbachWarning, stacklevel=2)
-    return models
+    said = tuple(f"{place} has no multipole of order {main}, which cancels there: its table, in "
+                 "units of 1e-4 of that, is left out." for place in left_out)
+    for each in said:
+        warnings.warn(each, HalbachWarning, stacklevel=2)
+    return models, said
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:

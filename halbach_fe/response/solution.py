@@ -94,7 +94,7 @@ def study_observation(magnet: Magnet) -> Observation:
     Warns
     -----
     HalbachWarning
-        If a position is on a face of magnet or iron.
+        If a position is on a face of magnet or iron, or so far away that it may be in mm.
     """
     return _observed(magnet)[0]
 

@@ -441,8 +441,8 @@ def check_points(
     Warns
     -----
     HalbachWarning
-        If points are on a face, or so near to the outer boundary that its condition affects their
-        field.
+        If points are on a face, so far away that they may be in mm, or so near to the outer
+        boundary that its condition affects their field.
     """
     if magnet.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
@@ -458,12 +458,15 @@ def check_points(
             f"Input `{key}` of study {magnet.name} must lie in air; instead "
             f"{count} of {len(points)} points lie {what}, the first at "
             f"({x:g}, {y:g}, {z:g}) m. {hint or 'Move them into the bore or beyond the ends.'}")
-    remark = places.on_faces()
-    if remark is not None:
-        warnings.warn(remark, HalbachWarning, stacklevel=2)
     points = places.points
     route = choose_route(magnet, points)
-    if route == "moments":  # the blocks need no boundary
+    # only meshes have a boundary, beyond which the solve refuses points
+    unbounded = route == "moments" or (
+        magnet.is_vacuum and magnet.study.solver.method == "reaction")
+    for remark in (places.on_faces(), places.far_away() if unbounded else None):
+        if remark is not None:
+            warnings.warn(remark, HalbachWarning, stacklevel=2)
+    if unbounded:
         return points
     mesh = MESHES[route]
     directions = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,

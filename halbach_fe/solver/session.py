@@ -119,6 +119,7 @@ class Session:
     counter: RunCounter | None = None
 
     @classmethod
+    @typed
     def open(
         cls, folder: str | Path, jobs: int | None = None, getdp: str | None = None,
         progress: Progress | None = None,

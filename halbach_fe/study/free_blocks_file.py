@@ -233,7 +233,8 @@ def _check_columns(header: Sequence[str], where: str) -> None:
             difflib.get_close_matches(name[:100], COLUMNS, 1, 0.6))
         raise StudyError(must_be(
             f"column {number}", where, "a known column", f"'{name}'" if near else "another name",
-            f"Did you mean `{near[0]}`?" if near else f"Known columns: {', '.join(COLUMNS)}."))
+            sentences.did_you_mean(near[0], name) if near
+            else f"Known columns: {', '.join(COLUMNS)}."))
 
 
 def _check_count(count: int, where: str) -> None:

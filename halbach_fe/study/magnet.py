@@ -122,5 +122,6 @@ class Demagnetization(StudyModel):
             if 1 + coefficient * (self.temperature_C - self.reference_temperature_C) <= 0:
                 raise ValueError(f"{name}_coefficient_per_K ({coefficient}) makes the {name} zero "
                                  f"or negative at {self.temperature_C:g} °C; use a fraction per "
-                                 "kelvin, not per cent, and a temperature the linear law holds for")
+                                 "kelvin, not per cent, and a temperature in °C, not in kelvin, "
+                                 "that the linear law holds for")
         return self

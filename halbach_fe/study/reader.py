@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
@@ -29,11 +30,16 @@ MAX_WRONG_UNIT = 1e12
 
 WRONG_UNITS = (
     ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
-    ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4))
+    ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
+    ("_rad", "degrees", np.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
+    ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
 """
+ZERO_C_IN_K = 273.15
 
 
+@typed
 def read_study(path: str | Path) -> Study:
     """Read and validate a study file.
 
@@ -154,7 +160,7 @@ def _sentence(error: ValidationError, where: str) -> str:
     if kind == "extra_forbidden":
         name = str(first["loc"][-1])
         near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
-        hint = (f"Did you mean `{near[0]}`?" if near
+        hint = (sentences.did_you_mean(near[0], name) if near
                 else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
         if not near and len(first["loc"]) > 1 and name in Study.model_fields and not isinstance(
                 value, Mapping):
@@ -194,16 +200,21 @@ def _unit_hint(key: str, value: float, limits: Mapping[str, Any]) -> str:
 
     ``limits`` are those of pydantic that the value violates, by their names: ge, gt, le or lt.
     """
+    return wrong_unit(key, value, limits) or "Correct the value."
+
+
+def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
+    """Return the hint of `_unit_hint`, empty if no unit fits."""
     key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
     if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
-        return "Correct the value."
+        return ""
     for suffix, unit, factor in WRONG_UNITS:
-        given = value * factor
+        given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
                 limits.get("ge", -np.inf) <= given <= limits.get("le", np.inf)) and (
                 limits.get("gt", -np.inf) < given < limits.get("lt", np.inf)):
             return f"Was it meant in {unit}? Then write {given:.6g}."
-    return "Correct the value."
+    return ""
 
 
 def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:

@@ -55,6 +55,17 @@ EXPECTED = {
 """What is expected, by the kind of error; the models raise no others."""
 
 
+UNITS = ("m", "T", "deg", "rad", "C", "K")
+"""Units at the end of names."""
+
+
+def did_you_mean(near: str, given: str) -> str:
+    """Return the question for a known name that is near, and for its unit if only that differs."""
+    stem, _, unit = near.rpartition("_")
+    other = unit in UNITS and stem == given.rpartition("_")[0]
+    return f"Did you mean `{near}`?" + (f" Then convert its values to {unit}." if other else "")
+
+
 def expected(error: ErrorDetails) -> str:
     """Return what a value must be."""
     given = error.get("ctx", {})

@@ -8,6 +8,8 @@ from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -18,6 +20,7 @@ from pydantic import (
     model_validator,
 )
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import sentences
 
@@ -27,6 +30,8 @@ MIN_SIGMA_T, MAX_SIGMA_T = 1e-15, 1.0
 """Limits of the standard deviation of a reading in T: no probe is as exact, or as bad, and squares
 of other numbers may be zero or infinite."""
 MAX_POINTS = 1_000_000
+USUAL_REACH_M = 0.1
+"""Distance in m from the middle to which magnets of permanent blocks reach, if no study says it."""
 
 # The limits are there to reveal a wrong unit (mm for m, mT for T); they are wider than is sensible.
 Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
@@ -64,6 +69,15 @@ compensated SmCo are constant, and coercivities of AlNiCo rise by up to 3e-4/K."
 RemanenceCoefficient = Annotated[float, Field(ge=-0.01, le=RISING_PER_K)]
 Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
+
+
+def look_like_mm(points: Floats, reach_m: float = USUAL_REACH_M) -> NDArray[np.bool_]:
+    """Tell of points (n, 3), read in m, which are rather in mm, for a magnet of a reach in m.
+
+    The limit is half-way by factors between 1 m and 1 mm: beyond it, a thousandth of the distance
+    is nearer to the magnet's reach than the distance is.
+    """
+    return np.asarray(np.linalg.norm(points, axis=1) > np.sqrt(1000.0) * reach_m)
 
 
 def one_or_list(kind: Any) -> BeforeValidator:

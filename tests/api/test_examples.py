@@ -149,7 +149,7 @@ def test_a_report_replaces_no_other_result(dipole, tmp_path):
         hf.write_report(another, folder)
     assert (folder / "report.html").read_bytes() == page
     assert hf.write_report(result, folder) == folder / "report.html"
-    with pytest.raises(TypeError, match="no report for a NoneType"):
+    with pytest.raises(TypeError, match="has returned; instead received a NoneType"):
         hf.write_report(None, tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
@@ -182,6 +182,7 @@ SEEDS = "seed .* a whole number of at least 0; instead received -1"
     (lambda magnet, session: hf.Region.sphere(float("nan")), "half_axes_m .* received nan"),
     (lambda magnet, session: hf.Region.sphere("0.1"), "half_axes_m .* received 0.1"),
     (lambda magnet, session: hf.Region.sphere(-0.1), "half_axes_m .* above 0"),
+    (lambda magnet, session: hf.Region.sphere(100), "at most 10 m; .* in millimetres"),
     (lambda magnet, session: hf.Region("cube", (0.01,) * 3), "one of sphere"),
     (lambda magnet, session: hf.Region("cylinder", (0.01, 0.01)), "three numbers"),
     (lambda magnet, session: hf.Region("sphere", (0.01, 0.02, 0.01)), "equal along x, y and z"),
@@ -211,6 +212,11 @@ def test_forces_of_no_magnet(short_dipole, session):
 
 @pytest.mark.parametrize(("use", "said"), [
     (lambda magnet, session: hf.build_magnet("study.toml"), "a Study; .* by hf.read_study"),
+    (lambda magnet, session: hf.read_study(magnet), "path of read_study must be a path"),
+    (lambda magnet, session: hf.Session.open(magnet), "folder of Session.open must be a path"),
+    (lambda magnet, session: hf.solve(magnet), "must be magnet, session; instead: missing"),
+    (lambda magnet, session: hf.write_report(magnet), "must be result, folder; instead: missing"),
+    (lambda magnet, session: hf.campaign_report("solved", "page.html"), "a list of folders"),
     (lambda magnet, session: hf.solve(session, magnet), "magnet of solve must be a Magnet"),
     (lambda magnet, session: hf.solve(magnet.study, session), "hf.build_magnet makes one"),
     (lambda magnet, session: hf.infer(magnet, None, "results"), "hf.Session.open makes one"),

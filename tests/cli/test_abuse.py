@@ -6,8 +6,10 @@ Results that were wrong without a word are tested where they are computed.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
+from dataclasses import replace
 
 import gmsh
 import pytest
@@ -16,13 +18,15 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.cli.common import orders
 from halbach_fe.cli.verbs import with_values
+from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.block_table import write_blocks
+from halbach_fe.inference.block_prior import loose_blocks
+from halbach_fe.measurement.block_table import read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.reader import read_study
+from halbach_fe.study.reader import parse_study, read_study
 from tests.cli.test_all_keys import BASE, measured_blocks
 from tests.cli.test_cli import refused
 from tests.cli.test_odd_studies import written
@@ -67,6 +71,8 @@ def test_a_stock_of_blocks_in_the_magnet(campaign, tmp_path, capsys, kind):
     (["tolerance", "{study}", "--draws", "1e4"], "must be a whole number, not '1e4'"),
     (["tolerance", "{study}", "--draws", "1000001"], "from 20 to 1e+06, not 1000001"),
     (["tolerance", "{study}", "--draws", "1"], "from 20 to 1e+06, not 1"),
+    (["tolerance", "{study}", "--draws", "0"], "from 20 to 1e+06, not 0"),
+    (["tolerance", "{study}", "--limit-units", "0"], "from 1e-06 to 1e+06, not 0"),
     (["tolerance", "{study}", "--limit-units", "1e308"], "from 1e-06 to 1e+06, not 1e308"),
     (["tolerance", "{study}", "--limit-units", "x"], "must be a number, not 'x'"),
     (["demagnetization", "{study}", "--across", "1000000"], "from 2 to 100, not 1000000"),
@@ -100,6 +106,8 @@ def test_command_lines(campaign, tmp_path, capsys, arguments, said):
     (["multipoles", "{study}", "--posterior", "nope.h5"], 4, "received No such file or directory"),
     (["simulate-measurement", "{study}", "--hide", "gain_x=0.1", "--hide", "gain_x=0.2"], 3,
      "given once"),
+    (["simulate-measurement", "{study}", "--hide", "temperature=1,-0.12"], 3, "write -0.0012."),
+    (["simulate-measurement", "{study}", "--hide", "ring_twisted=1,30"], 3, "Then write 0.523599"),
     (["simulate-measurement", "{study}", "--hide", "gain_x=1e308"], 3, "from -0.9 to 10"),
     (["simulate-measurement", "{study}", "--hide", "blocks_swapped=1,1,1,1"], 3, "another block"),
     (["simulate-measurement", "{study}", "--hide", "swapped_axes=1,1"], 3, "another axis"),
@@ -119,6 +127,24 @@ def test_values_that_no_magnet_has(campaign, tmp_path, capsys, arguments, code, 
     assert found == code
     assert said in sentence
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"demagnetization__remanence_coefficient_per_K": -0.12},
+     "per cent per kelvin? Then write -0.0012."),
+    ({"demagnetization__reference_temperature_C": 293.15}, "in kelvin? Then write 20."),
+    ({"demagnetization__squareness": 90.0}, "per cent? Then write 0.9."),
+    ({"instrument__rotation_rad": [0, 0, 30]}, "in degrees? Then write 0.523599."),
+    ({"prior__magnitude_sd": 2.0}, "in per cent? Then write 0.02."),
+    ({"prior__magnitude_std": 0.02}, "Did you mean `magnitude_sd`?"),
+    ({"array__ring_gap_mm": 1.0}, "Did you mean `ring_gap_m`? Then convert its values to m."),
+    ({"instrument__gain": [60, 0, 0]}, "Correct the value.")])
+def test_units_that_a_value_may_have_had(changes, said):
+    """What the sentence advises is within the limits; nothing is advised that is not."""
+    with pytest.raises(StudyError) as refusal:
+        parse_study(changed(BASE, **changes))
+    assert said in str(refusal.value)
+    assert ("convert" in said) == ("convert" in str(refusal.value))
 
 
 @pytest.mark.parametrize("celsius", ["295", "-273"])
@@ -337,6 +363,19 @@ def test_a_map_that_is_not_in_m_and_T(tmp_path, capsys):
         assert said in sentence
 
 
+@pytest.mark.parametrize(("options", "asked"), [
+    (["--at", "z=0.03"], False), (["--at", "z=30"], True),
+    (["--at", "z=0", "--origin-m", "0,0,10"], True),
+    (["--at", "z=30", "--origin-m", "0,0,-30"], False)])
+def test_coordinates_of_options_in_mm(tmp_path, capsys, options, asked):
+    file, out = tmp_path / "map.txt", tmp_path / "map.csv"
+    file.write_text("x[mm] y[mm] Bx[mT]\n0 0 200\n1 0 201\n")
+    assert main(["import-map", str(file), "-o", str(out), *options, "--json"]) == 0
+    remarks = " ".join(json.loads(capsys.readouterr().out)["remarks"])
+    assert ("Are they in mm?" in remarks) == asked
+    assert ("--origin-m is in m" in remarks) == (asked and "--origin-m" in options)
+
+
 def test_angles_in_degrees(tmp_path, capsys):
     file = tmp_path / "ring.txt"
     file.write_text("r phi z Br Bphi Bz\n" + "".join(
@@ -406,7 +445,7 @@ def test_a_folder_is_refused_before_the_check(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("halbach_fe.measurement.map_check.check_map", None)
     code, sentence = refused(["check", file, "-o", file], capsys)
     assert code == 8
-    assert "Cannot make folder" in sentence
+    assert f"Cannot make folder {file}: File exists. It is a file; name a folder" in sentence
 
 
 def test_more_blocks_than_fit_into_a_ring(tmp_path, capsys):
@@ -420,6 +459,51 @@ def test_more_blocks_than_fit_into_a_ring(tmp_path, capsys):
     assert code == 3
     assert "`design.layer.blocks_per_ring`" in sentence
     assert "at the radius 0.065 m; instead received 20. 17 do." in sentence
+
+
+def test_sorting_into_rings_that_differ(tmp_path, capsys):
+    """No key prior.types parts the rings; what the sentence advises does."""
+    study, blocks, table = (tmp_path / name for name in ("two.toml", "blocks.csv", "free.csv"))
+    document = changed(BASE, array__ring=[{"inner_radius_m": 0.05}, {"inner_radius_m": 0.055}])
+    del document["array"]["rings"]
+    study.write_text(tomlkit.dumps(document))
+    measured = measured_blocks(build_magnet(read_study(study)))
+    write_blocks(measured, blocks)
+    code, sentence = refused(["sort", study, blocks, "-o", tmp_path / "out"], capsys)
+    assert code == 3
+    assert "Input type 1 of study base must be of blocks that are alike" in sentence
+    assert "r01s01 and r02s01" in sentence
+    assert "halbach-fe export STUDY --format blocks), add a column `type`" in sentence
+    assert main(["export", str(study), "--format", "blocks", "-o", str(table)]) == 0
+    header, *rows = table.read_text().splitlines()
+    table.write_text("\n".join([f"{header},type", *(f"{row},{row.split(',')[0]}" for row in rows)]))
+    study.write_text(tomlkit.dumps(document | {"array": {"free_blocks": {"file": "free.csv"}}}))
+    write_blocks(replace(measured, type=("",) * len(measured)), blocks)
+    loose_blocks(build_magnet(read_study(study)), read_blocks(blocks))
+
+
+def test_a_study_in_place_of_a_map(campaign, tmp_path, capsys):
+    study, measured, _ = campaign
+    for command in (["export", study, "--format", "csv", "-o", tmp_path / "out.csv"],
+                    ["import-map", study, "-o", tmp_path / "out.csv"], ["check", study],
+                    ["infer", study, "--measurements", study, "-o", tmp_path / "out"]):
+        code, sentence = refused(command, capsys)
+        assert code == 4
+        assert "a file of measurements; instead received a study. halbach-fe solve" in sentence
+    code, sentence = refused(["diagnose", study, "--measurements", measured, "--check",
+                              tmp_path / "no.json", "-o", tmp_path / "out"], capsys)
+    assert code == 4
+    assert "a readable file; instead received 'No such file or directory'" in sentence
+
+
+def test_a_report_into_no_page(tmp_path, capsys):
+    """The name of a study made a folder of that name."""
+    page = tmp_path / "x.toml"
+    code, sentence = refused(["report", tmp_path / "solved", "-o", page], capsys)
+    assert code == 8
+    assert f"a page (.html), or a folder for report.html; instead received '{page}'" in sentence
+    assert f"Write {tmp_path / 'x.html'}." in sentence
+    assert not page.exists()
 
 
 def test_a_report_on_its_own_folder(tmp_path, capsys):

@@ -83,6 +83,7 @@ def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
     said = page(tmp_path / "out" / "multipoles.html")
     assert "The largest unwanted multipole" in said
     assert "Of the field integrated along z" not in said
+    assert "The field integrated along z has no multipole of order 1, which cancels there" in said
     assert {row["where"] for row in rows_of(tmp_path / "out" / "multipoles.csv", "prior")} == {
         "local"}
     tolerance = ["tolerance", *command[1:-1], tmp_path / "tolerance"]
@@ -97,6 +98,9 @@ def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
         said = page(tmp_path / "out" / "multipoles.html")
         assert "units of 1e-4 of it mean nothing" in said
         assert "Only as absolute numbers" not in said
+        assert ("The field integrated along z, at a radius of 30 mm: there is no main multipole"
+                in said.replace("\u00a0", " "))
+        assert "The circle of 30 mm:" not in said
     run(capsys, *command, "--json")
     said = page(tmp_path / "out" / "multipoles.html")
     assert ("there is no main multipole, of order 1, but for errors" in said) == cancels

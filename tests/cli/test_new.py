@@ -18,6 +18,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.grades import grade
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
+from tests.cli.test_cli import refused
 from tests.conftest import ROOT
 
 MAGNETS = [
@@ -125,6 +126,18 @@ def study_without_sphere(folder):
     path = folder / "circles.toml"
     assert main(["new", str(path), *CUBES, "--rings", "4"]) == 0
     return path
+
+
+@pytest.mark.parametrize(("options", "code", "said"), [
+    (["--ring-length-m", "0.04", "--dsv-m", "0.12"], 3, "is inside magnet or iron"),
+    (["--ring-length-m", "0.04", "--dsv-m", "0.5"], 3, "which contains blocks"),
+    (["--ring-length-m", "0.04", "--dsv-m", "20"], 3, "Was it meant in millimetres?"),
+    (["--dsv-m", "0.05"], 2, "A cross-section has no volume")])
+def test_spheres_that_are_no_volume_of_the_bore(tmp_path, capsys, options, code, said):
+    found, sentence = refused(["new", tmp_path / "new.toml", *options], capsys)
+    assert found == code
+    assert said in sentence
+    assert not (tmp_path / "new.toml").exists()
 
 
 def test_cubes_around_a_sphere_with_noise_that_suits_them(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import magpylib
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,6 +16,7 @@ from halbach_fe.geometry.surface import ON_SURFACE
 from halbach_fe.inference.readings import read_campaign
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.solution import answer
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.solution import solve, study_observation
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
@@ -170,6 +172,32 @@ def test_between_blocks_that_touch():
         check_points(magnet, np.array([[0.03, 0.001, 0]]))
 
 
+def test_a_seam_of_blocks_that_are_alike():
+    """The field is finite there, if both are really alike; what the sentence advises works."""
+    def bar(x_m, size_x_m):
+        count = len(x_m)
+        return magnet_of({
+            "name": ["a", "b"][:count], "shape": ["cuboid"] * count, "x_m": x_m,
+            "y_m": [0.0] * count, "z_m": [0.0] * count, "size_x_m": [size_x_m] * count,
+            "size_y_m": [0.02] * count, "size_z_m": [0.02] * count,
+            "remanence_x_T": [0.0] * count, "remanence_y_T": [0.0] * count,
+            "remanence_z_T": [1.3] * count})
+
+    whole = magpylib.magnet.Cuboid(dimension=(0.04, 0.02, 0.02), polarization=(0.0, 0.0, 1.3),
+                                   position=(0.01, 0.0, 0.0))
+    seam = np.array([[0.01, 0.002, 0.01]])
+    beside = seam + np.array([1e-4, 0.0, 0.0])
+    split = bar([0.0, 0.02], 0.02)
+    with pytest.raises(StudyError, match="on an edge of a and b, where the field is infinite, "
+                                         "unless they are magnetized alike and flush"):
+        check_points(split, seam)
+    for magnet, points in ((split, beside), (bar([0.01], 0.04), seam)):
+        with pytest.warns(HalbachWarning, match="1 of 1 points lie on a face"):
+            found = field_of(magnet.blocks, check_points(magnet, points))
+        np.testing.assert_allclose(found, [just_outside(whole, points, np.array([[0, 0, 1.0]]))],
+                                   atol=FACE_ERROR)
+
+
 def test_faces_of_iron():
     """Of a tube: the inner and the outer face are faces, a rim is an edge."""
     magnet = build_magnet(parse_study(changed(
@@ -219,6 +247,18 @@ def test_readings_of_all_verbs(session):
     edge = field_map(np.array([[0.05, 0, 0.01]]), np.ones((1, 3)))
     with pytest.raises(MeasurementError, match="on an edge of a, where the field is infinite"):
         read_campaign(magnet, maps_of(magnet.study, edge))
+
+
+def test_positions_in_mm(session):
+    """31 times as far from the middle as the magnet reaches: the answer asks for the unit."""
+    far = changed(FACE, observation__positions__points_m=[[0, 0, 1.6], [0, 0, 30]])
+    question = "1 of 2 points lie up to 30 m from the middle of the magnet, which reaches to 0.05"
+    with pytest.warns(HalbachWarning, match=question):
+        said = answer(solve(build_magnet(parse_study(far)), session))
+    assert question in said.trust
+    assert not said.sound
+    near = changed(FACE, observation__positions__points_m=[[0, 0, 1.58]])
+    assert answer(solve(build_magnet(parse_study(near)), session)).trust.startswith("Yes")
 
 
 def test_permeable_block(session):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 
 import numpy as np
@@ -21,6 +22,7 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.campaign import maps_of, read_maps
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import concatenate, observe
+from halbach_fe.report.inference_answer import answer
 from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import root_matrix
@@ -76,6 +78,14 @@ def test_two_maps_find_their_poses_and_agree(generator, tmp_path):
     for score in result.scores:
         if score.part == "held out":
             assert score.chi2_posterior == pytest.approx(1.0, abs=5 * np.sqrt(2 / score.readings))
+    # the strongest reading is said where it lies, with the error of the pose that was found
+    said = re.search(r"at \((.*?)\) mm of the magnet", answer(result).said)[1]
+    place, sd = (1e-3 * np.array(each) for each in zip(*(
+        map(float, part.split("\xa0±\xa0")) for part in said.split(", ")),
+        strict=True))
+    away = np.abs(np.vstack([BODY, FRINGE]) - place)
+    assert (away[np.argmin(away.sum(axis=1))] < 4 * sd).all()
+    assert ((sd > 1e-7) & (sd < 2e-4)).all()
     # the study that is returned has the poses that were found
     fringe = result.study.maps[1].instrument
     assert Rotation.from_rotvec(fringe.rotation_rad).as_matrix() == pytest.approx(

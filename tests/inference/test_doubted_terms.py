@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from contextlib import nullcontext
 from dataclasses import replace
 
 import magpylib
@@ -15,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
@@ -178,7 +179,13 @@ def test_a_map_of_half_the_field_is_no_map_of_the_magnet(magnet, generator, tmp_
     assert said.trust.startswith(DOUBTED)
     assert "known before" in said.trust
     assert "times the field of the magnet as it was ordered (half)" in said.trust
-    assert "unit" in said.step
+    assert "unit, the sign and the factor" in said.step
+    # the control: where readings are not like the field, no factor is spoken of
+    unlike = answer([replace(half[0], likeness=0.1), *half[1:]])
+    assert "times the field" not in unlike.trust
+    assert "not like the field of the magnet as it was ordered" in unlike.trust
+    assert "factor" not in unlike.step
+    assert half[0].likeness > 0.9  # 0.98 by the noise
     assert USE_ANY not in said.trust
     summary = registration_summary(half)["poses"][0]
     assert not summary["sound"]
@@ -210,6 +217,11 @@ def test_half_a_field_weakens_the_blocks(generator, tmp_path):
     assert "ordered" not in inference_answer(right).trust
 
 
+def asks_for_mm(asked):
+    """A context in which places far from the magnet are warned of, or nothing is."""
+    return pytest.warns(HalbachWarning, match="in mm?") if asked else nullcontext()
+
+
 def test_readings_that_no_factor_makes_those_of_the_magnet(generator, tmp_path):
     """Places in mm that are taken for m, and exchanged components: a factor would mislead.
     Controls: half the field, and a map that is right but for noise ten times as large as stated.
@@ -222,7 +234,8 @@ def test_readings_that_no_factor_makes_those_of_the_magnet(generator, tmp_path):
                       + 2e-3 * generator.standard_normal((len(points_of(good)), 3)))
     half = quadrupole_map(generator, 0.5)
     for data, unlike in ((in_mm, True), (turned, True), (half, False), (noisy, False)):
-        said = infer(magnet, data, Session.open(tmp_path)).disagreement
+        with asks_for_mm(data is in_mm):
+            said = infer(magnet, data, Session.open(tmp_path)).disagreement
         assert "cannot all be right" in said
         assert ("not like the field" in said) == unlike
         assert ("times the field" in said) == (data is half)
@@ -237,7 +250,9 @@ def test_a_held_out_map_that_is_unlike_the_magnet(generator, tmp_path):
     places = points_of(other) + np.array([1e-4, 0, 0])
     for data, unlike in ((field_map(1e3 * places, other["B_T"].values), True),
                          (field_map(places, 1.03 * other["B_T"].values), False)):
-        said = infer(magnet, good, Session.open(tmp_path), validation_map=data).held_out_conflict
+        with asks_for_mm(unlike):
+            said = infer(magnet, good, Session.open(tmp_path),
+                         validation_map=data).held_out_conflict
         assert "of the held-out map are farther" in said
         assert ("not like the field" in said) == unlike
 

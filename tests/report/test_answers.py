@@ -444,6 +444,17 @@ def test_the_command_has_the_files_of_the_user(tmp_path):
         str(tmp_path / "my study.toml"), "--posterior", "p", "--blocks", "a b/b.csv", "-o", "DIR"]
 
 
+@pytest.mark.parametrize(("verb", "held_out"), [
+    ("infer", True), ("diagnose", True), ("register", False), ("shim", False)])
+def test_the_command_has_the_held_out_map_where_it_takes_one(verb, held_out):
+    answer = Answer("?", "", "", "", f"halbach-fe {verb} STUDY --measurements MAP -o DIR")
+    found = answer.with_paths({"MAP": "m.csv", "HELD_OUT": "h.csv"}).command
+    assert found.endswith(f"m.csv{' --held-out h.csv' if held_out else ''} -o DIR")
+    assert answer.with_paths({"MAP": "m.csv"}).command.endswith("m.csv -o DIR")
+    new = replace(answer, command=answer.command.replace("MAP", "NEW_MAP"))
+    assert "--held-out" not in new.with_paths({"HELD_OUT": "h.csv"}).command
+
+
 @pytest.mark.parametrize("verb", ["infer", "diagnose", "register", "shim"])
 def test_a_study_that_lists_its_maps_gets_no_other(verb):
     """`infer`, `diagnose` and `register` refuse one beside them; `shim` takes a single map."""

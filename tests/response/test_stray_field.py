@@ -8,11 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.report.stray_field import stray_figure
 from halbach_fe.response.stray_field import NEAREST, stray_field
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
+from tests.conftest import changed
 from tests.support.cuboids import DOCUMENT
 
 CUBE_M, REMANENCE_T = 0.02, 1.3
@@ -24,6 +26,18 @@ LONE = {
         "remanence_x_T": [0.0], "remanence_y_T": [0.0], "remanence_z_T": [REMANENCE_T]}},
     "observation": {"quantity": "flux_density", "positions": {
         "kind": "points", "points_m": [[0.0, 0.0, 0.0]]}}}
+
+
+def test_planes_where_the_field_is_zero(tmp_path):
+    """Between opposite cubes that touch, |B| is 0 on a plane of the figure; warnings are errors."""
+    pair = changed(LONE, array__free_blocks={
+        "name": ["a", "b"], "x_m": [-0.01, 0.01], "y_m": [0.0, 0.0], "z_m": [0.0, 0.0],
+        "shape": ["cuboid"] * 2, "size_x_m": [CUBE_M] * 2, "size_y_m": [CUBE_M] * 2,
+        "size_z_m": [CUBE_M] * 2, "remanence_x_T": [0.0, 0.0],
+        "remanence_y_T": [REMANENCE_T, -REMANENCE_T], "remanence_z_T": [0.0, 0.0]})
+    found = stray_field(build_magnet(parse_study(pair)), Session.open(tmp_path))
+    assert min(plane.size_T.min() for plane in found.planes) == 0
+    stray_figure(found)
 
 
 def cuboids():

@@ -7,11 +7,18 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
 from halbach_fe.core.files import atomic, file_bytes
-from halbach_fe.measurement.field_map import POSITION_COLUMNS, check_readings, read_map, write_map
+from halbach_fe.measurement.field_map import (
+    POSITION_COLUMNS,
+    check_readings,
+    points_of,
+    read_map,
+    write_map,
+)
 from halbach_fe.measurement.formats import (
     bdsim,
     columns,
@@ -25,6 +32,7 @@ from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of
+from halbach_fe.study.types import look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
     FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read),
@@ -80,7 +88,7 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     where = f"map {path}"
     raw = file_bytes(path, where)
     if not name and (own := _own(path, raw, declared)) is not None:
-        return own
+        return _with_doubt(own, declared)
     name = name or format_of(raw, declared, where)
     if declared.decimal_comma and name in ("opera", "openpmd"):
         raise MeasurementError(must_be("format", where, "one in which numbers may have a decimal "
@@ -90,7 +98,21 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     check_readings(data, path)
     data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
                    "imported_sha256": hashlib.sha256(raw).hexdigest()}
-    return ImportedFile(found, name)
+    return _with_doubt(ImportedFile(found, name), declared)
+
+
+def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
+    """Return the file, with a remark if its points lie where few magnets have a field."""
+    points = points_of(file.data)
+    if not look_like_mm(points).any():
+        return file
+    distance = float(np.linalg.norm(points, axis=1).max())
+    remark = (f"The points lie up to {distance:.3g} m from the origin, where few magnets of "
+              "permanent blocks have a field. Are they in mm? Then give --length-unit mm"
+              + ("; and --origin-m is in m." if declared.origin_m is not None
+                 else "; and --at is in m." if declared.at else "."))
+    return replace(file, imported=replace(
+        file.imported, remarks=(*file.imported.remarks, remark)))
 
 
 def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedFile | None:

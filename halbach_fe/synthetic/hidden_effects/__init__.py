@@ -11,6 +11,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.study.reader import wrong_unit
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import gross_errors, instrument_effects, magnet_effects
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, HiddenEffect, Site
@@ -112,7 +113,9 @@ def _check_size(site: Site, hidden: ChosenEffect) -> None:
         unit = f" {parameter.unit}" if parameter.unit else ""
         low, high = parameter.limits
         if not low <= value <= high:
-            refuse(parameter.name, f"from {low:.3g} to {high:.3g}{unit}", value)
+            key = "coefficient_per_K" if parameter.unit == "1/K" else f"_{parameter.unit}"
+            refuse(parameter.name, f"from {low:.3g} to {high:.3g}{unit}", value,
+                   wrong_unit(key, value, {"ge": low, "le": high}))
         values[parameter.name] = value
     if hidden.effect.name == "iron_ring":
         if values["inner_radius"] < site.outer:
