@@ -1,4 +1,4 @@
-"""Explain a field map: is it sound, where does it lie, what magnet is it of, and what is missing?
+"""Explain a field map: whether it is sound, where it lies, of what magnet it is, what is missing.
 
 Runs the commands that lead from a map to the magnet that was measured, each as far as it is
 needed: check (does the map obey Maxwell's equations?), infer (update the magnet), and where the
