@@ -51,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hide-random", type=common.positive, default=0, metavar="K",
                         help="hide K effects of the field or the instrument that are drawn at "
                         "random")
+    parser.add_argument("--component", choices=("abs",),
+                        help="make maps of |B| alone, as of an NMR teslameter; the components of B "
+                        "are those of observation.components in the study")
     parser.add_argument("--element-size", type=common.within(common.positive_number, 1e-5, 10),
                         metavar="M",
                         help="size in m of the largest elements of NGSolve (default: a third of "
@@ -91,7 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     with common.progress_bar("magpylib") as show:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
-                                     arguments.hide_random, elements, progress, placed)
+                                     arguments.hide_random, elements, progress, placed,
+                                     arguments.component == "abs")
     written = write_campaign(campaign, arguments.output)
     # the files are in the units and along the axes that the study states, unless another unit is
     # hidden in them; the page is in m and T
@@ -102,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
                         arguments.output, [common.digest(path) for path in written])
     summary = {
         "study": study.name, "points": campaign.readings.sizes["point"],
-        "readings": int(np.isfinite(campaign.readings["B_T"].values).sum()),
+        "readings": int(np.isfinite(campaign.without_noise).sum()),
         "blocks": len(campaign.blocks), "model": campaign.truth["model"],
         "truth_sha256": campaign.readings.attrs["truth_sha256"],
         "files": [str(path) for path in written]}

@@ -595,6 +595,7 @@ def demagnetization(
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
     progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
+    magnitude: bool = False,
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.
 
@@ -616,6 +617,8 @@ def simulate_measurement(
     placed : BlockTable, optional
         The blocks of an earlier simulation with this seed in the places in which they are to be
         assembled: the table that `sort` returns.
+    magnitude : bool
+        Whether the maps are of |B| alone, as of an NMR teslameter.
 
     Returns
     -------
@@ -646,4 +649,5 @@ def simulate_measurement(
                                  "effect", f"a text, '{hide}'", "Put it into brackets."))
     build_magnet(study)  # refuses what cannot be built
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress, placed=placed)
+                             hide_random=hide_random, progress=progress, placed=placed,
+                             magnitude=magnitude)
