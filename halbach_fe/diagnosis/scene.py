@@ -9,21 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.inference.infer import with_instruments
 from halbach_fe.inference.instrument_fit import OpenTerms
+from halbach_fe.inference.readings import unit_vectors
 from halbach_fe.inference.result import InstrumentTerms
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
+    check_total_field,
     in_si_and_magnet_axes,
     map_time,
     nonlinear_part,
@@ -61,6 +64,8 @@ class ScannedMap:
         From 0 to 1.
     rows : slice
         Of its points among those of all maps.
+    is_total : bool
+        Whether it is a map of |B| alone.
     """
 
     name: str
@@ -71,6 +76,20 @@ class ScannedMap:
     points: Floats
     time: Floats
     rows: slice
+    is_total: bool = False
+
+    def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
+        """Tell whether the map can show an effect: |B| has one sensor, without axes."""
+        if not effect.can_show(self.points):
+            return False
+        if effect.kind == "field" or not self.is_total:
+            return True
+        changed = effect.apply(study, place, [parameter.sd for parameter in effect.parameters])
+        try:
+            check_total_field(changed.instrument)
+        except MeasurementError:
+            return False
+        return True
 
     def study_of(self, study: Study) -> Study:
         """Return what a study says about this map alone."""
@@ -106,7 +125,8 @@ class Campaign:
             listed = bool(study.maps) and not one.is_validation
             found.append(ScannedMap(
                 one.name, one.probe, one.pose, number if listed else None, one.is_validation,
-                points, map_time(one.data), slice(first, first + len(points))))
+                points, map_time(one.data), slice(first, first + len(points)),
+                is_total_field(one.data)))
             first += len(points)
         return cls(tuple(found), data)
 
@@ -152,14 +172,18 @@ class Campaign:
         Maps that cannot show it have none.
         """
         if effect.kind == "field" or not self.is_listed:
-            return list(effect.places(study)) if any(
-                effect.can_show(one.points) for one in self.maps if not one.is_validation) else []
+            maps = [one for one in self.maps if not one.is_validation
+                    and effect.can_show(one.points)]
+            return [place for place in (effect.places(study) if maps else ()) if any(
+                one.can_have(effect, place, study) for one in maps)]
         found: dict[Place, list[str]] = {}
         for one in self.maps:
             if one.number is None or not effect.can_show(one.points):
                 continue
             own = one.study_of(study)
             for place in effect.places(own):
+                if not one.can_have(effect, place, own):
+                    continue
                 for owner in _owners(one, keys_of(effect, place, own)):
                     found.setdefault(replace(place, instrument=owner), []).append(one.name)
         return [replace(place, maps=tuple(names)) for place, names in found.items()]
@@ -235,7 +259,9 @@ class Scene:
         """Return the change of all values (k, n, 3) in T per unit of each parameter."""
         effect, place = hypothesis.effect, hypothesis.place
         if effect.kind == "instrument" and not effect.applied_in_full:
-            return self._by_map(place, partial(_signature_of_instrument, effect, place))
+            total = {id(own): one.is_total for own, one in zip(self.fields, self.maps, strict=True)}
+            return self._by_map(place, lambda nominal, stated: _signature_of_instrument(
+                effect, place, nominal, stated, total[id(nominal)]))
         return self.seen(hypothesis, lambda nominal: effect.signature(nominal, place))
 
     def rough_signature(self, hypothesis: Hypothesis) -> Floats | None:
@@ -304,7 +330,7 @@ def _owners(one: ScannedMap, keys: set[str]) -> list[str]:
 
 
 def _signature_of_instrument(
-    effect: Effect, place: Place, nominal: NominalFields, stated: Floats
+    effect: Effect, place: Place, nominal: NominalFields, stated: Floats, is_total: bool
 ) -> Floats:
     """Return the change of a map's values (k, n, 3) in T per unit of each parameter.
 
@@ -319,24 +345,33 @@ def _signature_of_instrument(
         Of this map.
     stated : ndarray, shape (n, 3), in m
         Its points as the map states them.
+    is_total : bool
+        Whether it is of |B| alone.
     """
     found = []
     for number, parameter in enumerate(effect.parameters):
         step = STEP * parameter.sd
         values = step * np.eye(len(effect.parameters))[number]
         more, less = (_shown(effect.apply(nominal.study, place, amounts.tolist()).instrument,
-                             nominal, stated) for amounts in (values, -values))
+                             nominal, stated, is_total) for amounts in (values, -values))
         found.append((more - less) / (2 * step))
     return np.array(found)
 
 
-def _shown(instrument: Instrument, nominal: NominalFields, stated: Floats) -> Floats:
+def _shown(
+    instrument: Instrument, nominal: NominalFields, stated: Floats, is_total: bool
+) -> Floats:
     """Return the values (n, 3) in T of a map by an instrument, near where the probe was.
 
-    The field is linear about the points of ``nominal``.
+    The field is linear about the points of ``nominal``. Of a map of |B| the law of the probe is
+    that of a single number, which is given along the field.
     """
     away = sensor_positions(instrument, stated) - nominal.points[:, None]
     field = nominal.field[:, None] + np.einsum("ncj,nsj->nsc", nominal.gradient, away)
     linear = np.einsum("sc,nsc->ns", sensor_matrix(instrument), field)
-    return with_memory(
+    if is_total:
+        along = unit_vectors(linear)
+        linear = np.repeat(np.sum(linear * along, axis=1)[:, None], 3, axis=1)
+    shown = with_memory(
         instrument, linear + nonlinear_part(instrument, linear, nominal.time), nominal.time)
+    return shown * along if is_total else shown
