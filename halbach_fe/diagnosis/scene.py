@@ -84,9 +84,9 @@ class ScannedMap:
             return False
         if effect.kind == "field" or not self.is_total:
             return True
-        changed = effect.apply(study, place, [parameter.sd for parameter in effect.parameters])
         try:
-            check_total_field(changed.instrument)
+            for values in np.diag([parameter.sd for parameter in effect.parameters]).tolist():
+                check_total_field(effect.apply(study, place, values).instrument)
         except MeasurementError:
             return False
         return True
