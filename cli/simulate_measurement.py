@@ -16,7 +16,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.measurement.instrument import by_stated_units
+from halbach_fe.measurement.instrument import by_stated_units, check_total_field
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -77,6 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     magnet = build_magnet(study)  # refuses, as every command does, what cannot be built
+    if arguments.component == "abs":
+        check_total_field(study.instrument)
     # before the simulation, which may take long; a refused study leaves no folder all the same
     common.own_folder(arguments, "halbach-fe simulate-measurement", study.name)
     elements = Elements(arguments.element_size, arguments.order)

@@ -43,6 +43,7 @@ from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.instrument import check_total_field
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
     Homogeneity,
@@ -648,6 +649,8 @@ def simulate_measurement(
         raise StudyError(must_be("hide", "simulate_measurement", "a list of texts, one for each "
                                  "effect", f"a text, '{hide}'", "Put it into brackets."))
     build_magnet(study)  # refuses what cannot be built
+    if magnitude:
+        check_total_field(study.instrument)
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
                              hide_random=hide_random, progress=progress, placed=placed,
                              magnitude=magnitude)

@@ -25,8 +25,6 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map
-from halbach_fe.measurement.instrument import check_total_field
-from halbach_fe.measurement.observation import TOTAL
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.study.magnet import check_apart
@@ -145,8 +143,7 @@ def simulate_campaign(
     Raises
     ------
     MeasurementError
-        If ``placed`` is not a table of these blocks, or leaves places empty, or if the study's
-        instrument is none of |B| that is asked for.
+        If ``placed`` is not a table of these blocks, or leaves places empty.
     StudyError
         If the study does not state the noise of its readings, measures at a point inside a
         material, or cannot have one of the effects, or if its magnet cannot be simulated.
@@ -162,8 +159,9 @@ def simulate_campaign(
         raise StudyError(must_be(
             "`maps`", f"study {study.name}", "left out of a simulated measurement, which is of one "
             "map", f"a list of {len(study.maps)}"))
-    if magnitude:
-        _check_magnitude(study)
+    if magnitude and study.observation.quantity != "flux_density":
+        raise StudyError(must_be("`observation.quantity`", f"study {study.name}",
+                                 "flux_density for a map of |B|", study.observation.quantity))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
     sigma = point_noise(study, np.vstack([points, others]), magnitude)
     blocks, coil, noise, effects, faults = _streams(seed)
@@ -256,14 +254,6 @@ def measured(
     return recorded, readings.round(DIGITS)[:, :1 if magnitude else 3]
 
 
-def _check_magnitude(study: Study) -> None:
-    """Refuse a study of which no map of |B| can be made."""
-    if study.observation.quantity != "flux_density":
-        raise StudyError(must_be("`observation.quantity`", f"study {study.name}",
-                                 "flux_density for a map of |B|", study.observation.quantity))
-    check_total_field(study.instrument)
-
-
 def _as_stated(stated: Instrument, fields: Floats, counts: Sequence[int]) -> Floats:
     """Return fields (3, n, 3) in T that an ideal probe shows as the stated one shows ``fields``.
 
@@ -334,7 +324,7 @@ def point_noise(study: Study, points: Floats, magnitude: bool = False) -> Floats
                                  "Add [[noise.regions]]."))
     sigma = np.array([region.sigma_T for region in study.noise.regions])
     if magnitude:
-        return sigma[noise_regions(study.noise, points[:, 2], (TOTAL,) * len(points))][:, None]
+        return sigma[noise_regions(study.noise, points[:, 2], ("",) * len(points))][:, None]
     result = np.full((len(points), 3), np.nan)
     for number, name in enumerate(COMPONENTS):
         if name in observed_components(study):

@@ -7,6 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 
+from halbach_fe.api import simulate_measurement
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import is_total_field, points_of, read_map
@@ -137,7 +138,8 @@ offset_T = [1e-3, 1e-3, 1e-3]
     noise = (read["Babs_T"].values - found.without_noise[:, 0]) / 1e-6
     assert 0.4 < noise.std() < 1.7  # of 12 readings; 4 sigma of chi
     with pytest.raises(MeasurementError, match="three equal entries"):
-        simulate_campaign(parsed(STUDY + "[instrument]\ngain = [0.01, 0, 0]\n"), 3, magnitude=True)
+        simulate_measurement(parsed(STUDY + "[instrument]\ngain = [0.01, 0, 0]\n"), 3,
+                             magnitude=True)
     study = tmp_path / "study.toml"
     study.write_text(STUDY)
     assert main(["simulate-measurement", str(study), "-o", str(tmp_path / "campaign"),
