@@ -16,7 +16,7 @@ import numpy as np
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.measurement.instrument import by_stated_units
+from halbach_fe.measurement.instrument import by_stated_units, check_total_field
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -51,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hide-random", type=common.positive, default=0, metavar="K",
                         help="hide K effects of the field or the instrument that are drawn at "
                         "random")
+    parser.add_argument("--component", choices=("abs",),
+                        help="make maps of |B| alone, as of an NMR teslameter; the components of B "
+                        "are those of observation.components in the study")
     parser.add_argument("--element-size", type=common.within(common.finite_number, 1e-5, 10),
                         metavar="M",
                         help="size in m of the largest elements of NGSolve (default: a third of "
@@ -74,6 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     study = read_study(arguments.study)
     magnet = build_magnet(study)  # refuses, as every command does, what cannot be built
+    if arguments.component == "abs":
+        check_total_field(study.instrument)
     # before the simulation, which may take long; a refused study leaves no folder all the same
     common.own_folder(arguments, "halbach-fe simulate-measurement", study.name)
     elements = Elements(arguments.element_size, arguments.order)
@@ -91,7 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     with common.progress_bar("magpylib") as show:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
-                                     arguments.hide_random, elements, progress, placed)
+                                     arguments.hide_random, elements, progress, placed,
+                                     arguments.component == "abs")
     written = write_campaign(campaign, arguments.output)
     # the files are in the units and along the axes that the study states, unless another unit is
     # hidden in them; the page is in m and T
@@ -102,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
                         arguments.output, [common.digest(path) for path in written])
     summary = {
         "study": study.name, "points": campaign.readings.sizes["point"],
-        "readings": int(np.isfinite(campaign.readings["B_T"].values).sum()),
+        "readings": int(np.isfinite(campaign.without_noise).sum()),
         "blocks": len(campaign.blocks), "model": campaign.truth["model"],
         "truth_sha256": campaign.readings.attrs["truth_sha256"],
         "files": [str(path) for path in written]}

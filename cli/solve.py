@@ -12,6 +12,7 @@ import time
 
 from halbach_fe.cli import common
 from halbach_fe.cli.streams import say
+from halbach_fe.core.pace import duration
 
 MANY = 10_000
 """Number of blocks above which the command says how far it is: it takes minutes."""
@@ -33,14 +34,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     started = time.monotonic()
     magnet = build_magnet(read_study(arguments.study))
-    if arguments.dry_run:
-        from halbach_fe.response.resource_estimate import estimate_solve
-
-        return common.print_estimate(
-            estimate_solve(magnet, study_observation(magnet), common.jobs(arguments)),
-            arguments.json)
     many = len(magnet.blocks) > MANY
-    if many:
+    if arguments.dry_run or (many and not magnet.is_vacuum):
+        from halbach_fe.response.resource_estimate import TIME_FACTOR, estimate_solve
+
+        cost = estimate_solve(magnet, study_observation(magnet), common.jobs(arguments))
+        if arguments.dry_run:
+            return common.print_estimate(cost, arguments.json)
+        say(f"{cost.blocks} blocks that magnetize each other, or iron: about "
+            f"{duration(cost.seconds)}, within a factor of {TIME_FACTOR:g}, and "
+            f"{cost.memory_GiB:.2g} GiB. {cost.warning or ''}")
+    elif many:
         say(f"{len(magnet.blocks)} blocks: first their field at the positions and far outside.")
     with common.session(arguments, magnet.study) as session:
         solution = solve(magnet, session)

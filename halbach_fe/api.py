@@ -44,6 +44,7 @@ from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.instrument import check_total_field
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
     Homogeneity,
@@ -604,6 +605,7 @@ def demagnetization(
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
     progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
+    magnitude: bool = False,
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.
 
@@ -625,6 +627,8 @@ def simulate_measurement(
     placed : BlockTable, optional
         The blocks of an earlier simulation with this seed in the places in which they are to be
         assembled: the table that `sort` returns.
+    magnitude : bool
+        Whether the maps are of |B| alone, as of an NMR teslameter.
 
     Returns
     -------
@@ -654,5 +658,8 @@ def simulate_measurement(
         raise StudyError(must_be("hide", "simulate_measurement", "a list of texts, one for each "
                                  "effect", f"a text, '{hide}'", "Put it into brackets."))
     build_magnet(study)  # refuses what cannot be built
+    if magnitude:
+        check_total_field(study.instrument)
     return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress, placed=placed)
+                             hide_random=hide_random, progress=progress, placed=placed,
+                             magnitude=magnitude)

@@ -23,7 +23,7 @@ from halbach_fe.diagnosis.search import apply_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import observation_of
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import Data, check_maps, refuse_total_fields
+from halbach_fe.measurement.campaign import Data, check_maps
 from halbach_fe.response.resource_estimate import Estimate, estimate_infer, estimate_solve
 from halbach_fe.solver.mesh import with_rough_mesh
 from halbach_fe.study.model import Study
@@ -92,7 +92,6 @@ def estimate_diagnosis(
         If a map does not lie where the study says: a diagnosis would register it first.
     """
     data = check_maps(study, data)
-    refuse_total_fields(data, validation_map)
     _, corrected, starts = correct_map_errors(study, data, blocks, catalogue())
     if study.dimension == 3 and not starts and (
             max(misfits_of(corrected, data).values()) > MIN_MISFIT_OF_A_POSE):

@@ -28,6 +28,7 @@ must explain all of them, and those of an instrument belong to a map or to a pro
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,6 +37,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
@@ -82,7 +84,8 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import Data, check_maps, refuse_total_fields
+from halbach_fe.measurement.campaign import Data, check_maps
+from halbach_fe.measurement.field_map import is_total_field
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 
@@ -179,7 +182,11 @@ def diagnose(
         If a map or the blocks do not fit the study.
     """
     data = check_maps(study, data)
-    refuse_total_fields(data, validation_map)
+    if any(is_total_field(one) for one in (
+            [data] if isinstance(data, xr.Dataset) else data.values())):
+        warnings.warn(
+            "Of a map of |B| no gross errors are looked for (units, axes, signs).",
+            HalbachWarning, stacklevel=2)
     with session.with_cache() as cached:
         found = _diagnose(study, data, cached, blocks,
                           catalogue() if effects is None else effects, validation_map, say, solver,

@@ -18,6 +18,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.inference.readings import unit_vectors
 from halbach_fe.measurement.instrument import (
     nonlinear_part,
     sensor_matrix,
@@ -56,6 +57,8 @@ class NominalFields:
         blocks in vacuum, or None if `solve` takes no longer.
     stated : ndarray, shape (n, 3), in m, or None
         The points as the map states them; None if they are where the probe was.
+    of_total_field : bool
+        Whether the map is of |B| alone.
     way : ndarray, shape (n, 3), or None
         Unit vectors along which the stage came to each point, see
         `halbach_fe.measurement.scan_lines.motion`; None if the points are all of a map, in its
@@ -72,6 +75,7 @@ class NominalFields:
     solve_iron: Callable[[Study], Floats | None] = field(default=lambda study: None, kw_only=True)
     measured_magnetizations: Floats | None = field(default=None, kw_only=True)
     stated: Floats | None = field(default=None, kw_only=True)
+    of_total_field: bool = field(default=False, kw_only=True)
     way: Floats | None = field(default=None, kw_only=True)
     _gradients: dict[int, Floats] = field(default_factory=dict, init=False, repr=False)
 
@@ -205,11 +209,16 @@ class NominalFields:
     def shown(self, instrument: Instrument) -> Floats:
         """Return the values (n, 3) in T of the map by an instrument, near where the probe was.
 
-        The field is linear about the points.
+        The field is linear about the points. Of a map of |B| the law of the probe is that of a
+        single number, which is given along the field.
         """
         stated = self.points if self.stated is None else self.stated
         away = sensor_positions(instrument, stated, self.way) - self.points[:, None]
         field = self.field[:, None] + np.einsum("ncj,nsj->nsc", self.gradient, away)
         linear = np.einsum("sc,nsc->ns", sensor_matrix(instrument), field)
-        return with_memory(
+        along = np.ones(1)
+        if self.of_total_field:
+            along = unit_vectors(linear)
+            linear = np.repeat(np.sum(along * linear, axis=1)[:, None], 3, axis=1)
+        return along * with_memory(
             instrument, linear + nonlinear_part(instrument, linear, self.time), self.time)

@@ -23,10 +23,11 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
+from halbach_fe.measurement.observation import TOTAL
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.inference import ExcludedReading, Inference
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import COMPONENTS, Component
+from halbach_fe.study.types import COMPONENTS
 
 NEIGHBOURS = 24
 """Number of neighbours of the same component. A second-order polynomial has ten coefficients."""
@@ -80,6 +81,7 @@ class Outlier:
     row : int
         Row of the map, from 1.
     component : str
+        x, y or z, or `TOTAL` of |B|.
     at_m : tuple of float
         Position of the reading according to the map.
     off_T, sd_T : float
@@ -90,7 +92,7 @@ class Outlier:
     """
 
     row: int
-    component: Component
+    component: str
     at_m: tuple[float, ...]
     off_T: float
     sd_T: float
@@ -103,7 +105,7 @@ def outliers_of(update: InferenceResult, campaign: Campaign) -> tuple[Outlier, .
     There are none among Fourier coefficients, each of which is computed from many readings.
     """
     observation = update.observation
-    if (np.diff(observation.analysis.indptr) != 1).any():
+    if not all(observation.components):
         return ()
     own = np.array(update.parts) != HELD_OUT_MAP
     root = with_fewer_columns(update.prediction_prior.root(np.flatnonzero(own)))
@@ -117,11 +119,11 @@ def outliers_of(update: InferenceResult, campaign: Campaign) -> tuple[Outlier, .
     if not flagged.any():
         return ()
     predicted = leave_one_out(root, residual, noise, training & ~flagged)
-    point, component = np.divmod(observation.analysis.indices[own], len(COMPONENTS))
+    point, component = observation.map_rows[own], np.array(observation.components)[own].tolist()
     names, listed = maps[own], bool(update.study.maps)
     first = {one.name: one.rows.start for one in campaign.maps}
     return tuple(
-        Outlier(int(point[k] - first[str(names[k])]) + 1, COMPONENTS[component[k]],
+        Outlier(int(point[k] - first[str(names[k])]) + 1, component[k],
                 tuple(observation.positions[own][k].tolist()), float(predicted.difference[k]),
                 float(predicted.sd[k]), str(names[k]) if listed else None)
         for k in np.flatnonzero(flagged))
@@ -139,12 +141,14 @@ def excluding(study: Study, outliers: Sequence[Outlier]) -> Study:
 
 def _excluding(inference: Inference, outliers: Sequence[Outlier]) -> Inference:
     """Return the settings of a map with outliers excluded."""
-    rows: dict[int, list[Component]] = {}
+    rows: dict[int, list[str]] = {}
     for outlier in outliers:
         rows.setdefault(outlier.row, []).append(outlier.component)
     return inference.with_(excluded_readings=(
         *inference.excluded_readings,
-        *(ExcludedReading(row=row, components=tuple(names)) for row, names in rows.items())))
+        *(ExcludedReading(row=row, components=tuple(
+            name for name in COMPONENTS if name in names or TOTAL in names))
+          for row, names in rows.items())))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -22,8 +23,9 @@ from halbach_fe.inference.infer import with_instruments
 from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.result import InstrumentTerms
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
+    check_total_field,
     in_si_and_magnet_axes,
     map_time,
     probe_points,
@@ -53,6 +55,8 @@ class ScannedMap:
         From 0 to 1.
     rows : slice
         Of its points among those of all maps.
+    is_total : bool
+        Whether it is a map of |B| alone.
     """
 
     name: str
@@ -63,6 +67,20 @@ class ScannedMap:
     points: Floats
     time: Floats
     rows: slice
+    is_total: bool = False
+
+    def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
+        """Tell whether the map can show an effect: |B| has one sensor, without axes."""
+        if not effect.can_show(self.points):
+            return False
+        if effect.kind == "field" or not self.is_total:
+            return not effect.of_total_field
+        try:
+            for values in np.diag([parameter.sd for parameter in effect.parameters]).tolist():
+                check_total_field(effect.apply(study, place, values).instrument)
+        except MeasurementError:
+            return False
+        return True
 
     def study_of(self, study: Study) -> Study:
         """Return what a study says about this map alone."""
@@ -98,7 +116,8 @@ class Campaign:
             listed = bool(study.maps) and not one.is_validation
             found.append(ScannedMap(
                 one.name, one.probe, one.pose, number if listed else None, one.is_validation,
-                points, map_time(one.data), slice(first, first + len(points))))
+                points, map_time(one.data), slice(first, first + len(points)),
+                is_total_field(one.data)))
             first += len(points)
         return cls(tuple(found), data)
 
@@ -144,14 +163,18 @@ class Campaign:
         Maps that cannot show it have none.
         """
         if effect.kind == "field" or not self.is_listed:
-            return list(effect.places(study)) if any(
-                effect.can_show(one.points) for one in self.maps if not one.is_validation) else []
+            maps = [one for one in self.maps if not one.is_validation
+                    and effect.can_show(one.points)]
+            return [place for place in (effect.places(study) if maps else ()) if any(
+                one.can_have(effect, place, study) for one in maps)]
         found: dict[Place, list[str]] = {}
         for one in self.maps:
             if one.number is None or not effect.can_show(one.points):
                 continue
             own = one.study_of(study)
             for place in effect.places(own):
+                if not one.can_have(effect, place, own):
+                    continue
                 for owner in _owners(one, keys_of(effect, place, own)):
                     found.setdefault(replace(place, instrument=owner), []).append(one.name)
         return [replace(place, maps=tuple(names)) for place, names in found.items()]
@@ -191,7 +214,7 @@ class Campaign:
         return Scene(self.maps, tuple(NominalFields(
             one.study_of(study), points[one.rows], one.time, solve(one.rows),
             solve_iron=solve_iron(one.rows), measured_magnetizations=magnetizations,
-            stated=one.points)
+            stated=one.points, of_total_field=one.is_total)
             for one in self.maps))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ def blocks_of_array(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
                  for block in nominal)
 
 
+@lru_cache(maxsize=4)  # which a magnet and its check for overlaps both need
 def nominal_blocks(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
     """Build the blocks of an array without the deviations that its exceptions describe."""
     blocks: list[MagnetBlock] = []

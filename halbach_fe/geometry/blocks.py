@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import Outline, outline_area, outline_part
+from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outline_part
 from halbach_fe.geometry.surface import Contact, contact_of_prism
 from halbach_fe.study.materials import MU_0
 
@@ -97,10 +97,9 @@ class MagnetBlock:
     @cached_property
     def middle(self) -> Floats:
         """Mean of the corners of the nominal place, (3,) in m; z is 0 for an infinite block."""
-        x, y = np.mean([edge.start for edge in self.outline], axis=0)
         z = 0.0 if np.isinf(self.z_max) else (self.z_min + self.z_max) / 2
         turn = rotation_matrix(self.orientation_rad)
-        return np.asarray(turn @ [x, y, z] + np.array(self.origin_m))
+        return np.asarray(turn @ [*mean_corner(self.outline), z] + np.array(self.origin_m))
 
     @cached_property
     def axes(self) -> Floats:
@@ -232,6 +231,19 @@ def rotation_matrix(vector: tuple[float, float, float]) -> Floats:
     if not any(vector):  # most blocks of most magnets, which may have thousands
         return np.eye(3)
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def frames_of(blocks: Sequence[MagnetBlock]) -> tuple[Floats, Floats]:
+    """Return `position` (blocks, 3) in m and `axes` (blocks, 3, 3) of many blocks."""
+    turns, turned, origins, moves = (
+        np.array([getattr(block, key) for block in blocks]).reshape(-1, 3) for key in (
+            "rotation_rad", "orientation_rad", "origin_m", "displacement_m"))
+    positions = origins + moves
+    for number, block in enumerate(blocks):
+        if any(block.rotation_rad):
+            positions[number] = block.position
+    return positions, np.asarray(
+        Rotation.from_rotvec(turns).as_matrix() @ Rotation.from_rotvec(turned).as_matrix())
 
 
 def vector(values: Floats) -> tuple[float, float, float]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
@@ -9,7 +12,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix, vector
 from halbach_fe.geometry.outline import Outline, closed_outline
 from halbach_fe.study.array import Array
-from halbach_fe.study.free_blocks import REMANENCE_VECTOR, FreeBlocks
+from halbach_fe.study.free_blocks import REMANENCE_VECTOR, SIZES, FreeBlocks, Shape
 
 
 def nominal_free_blocks(array: Array, dimension: int) -> list[MagnetBlock]:
@@ -84,11 +87,15 @@ def free_outline(table: FreeBlocks, number: int) -> Outline:
     Shapes of four edges begin at the inner end of the face at negative y, as blocks of rings do.
     """
     shape = table.shape[number]
+    return _outline(shape, tuple(table.value(column, number) for column in SIZES[shape]))
+
+
+@lru_cache(maxsize=4096)  # tables of many blocks have few shapes
+def _outline(shape: Shape, sizes: tuple[Any, ...]) -> Outline:
+    """Return the outline of a shape of given `SIZES`."""
     if shape == "prism":
-        return closed_outline(counter_clockwise(np.array(table.value("outline_m", number))))
-    size = {column: values[number] for column in (
-        "size_x_m", "size_y_m", "inner_radius_m", "outer_radius_m", "angle_deg", "inner_width_m",
-        "outer_width_m", "radius_m", "sides") if (values := getattr(table, column))}
+        return closed_outline(counter_clockwise(np.array(sizes[0])))
+    size = dict(zip(SIZES[shape], sizes, strict=True))
     if shape == "sector":
         half = np.radians(size["angle_deg"]) / 2
         return sector_outline(size["inner_radius_m"], size["outer_radius_m"], -half, half)

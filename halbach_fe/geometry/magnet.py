@@ -18,7 +18,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
-from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block
+from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import points_on
 from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
@@ -199,8 +199,7 @@ class Magnet(ShownInNotebook):
             ends = [0.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
             points = np.vstack([np.column_stack([outline, np.full(len(outline), z)])
                                 for z in ends])
-            found.append(replace(block, displacement_m=(0.0, 0.0, 0.0),
-                                 rotation_rad=(0.0, 0.0, 0.0)).from_frame(points))
+            found.append(points @ rotation_matrix(block.orientation_rad).T + block.origin_m)
         return tuple(found)
 
     @cached_property

@@ -82,6 +82,13 @@ def points_on(outline: Outline) -> Floats:
     return points
 
 
+@lru_cache(maxsize=4096)
+def mean_corner(outline: Outline) -> tuple[float, float]:
+    """Return the mean of the corners of an outline, in m."""
+    x, y = np.mean([edge.start for edge in outline], axis=0).tolist()
+    return x, y
+
+
 def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
     """Tell which points (n, 2) in m lie inside an outline.
 

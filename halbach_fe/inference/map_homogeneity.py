@@ -10,8 +10,10 @@ the updated magnet that of the map shows how much the update explains.
 
 Of a map that lacks components the uniform field along these is unknown, and with it |B|. If the
 main field is along components that it has, the size of these is |B| to first order, and is what is
-told; otherwise nothing is. Neither is what the readings leave open for the most part, nor a
-held-out part that contradicts the whole map or tells much less than it.
+told; otherwise nothing is. A map of |B| alone, as of an NMR probe, tells B along the nominal field
+at every point, which is |B| but for the square of what lies across. Neither is what the readings
+leave open for the most part, nor a held-out part that contradicts the whole map or tells much less
+than it.
 """
 
 from __future__ import annotations
@@ -29,10 +31,9 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.instrument_fit import OpenTerms
-from halbach_fe.inference.readings import Readings, read_campaign
+from halbach_fe.inference.readings import Readings, read_campaign, unit_vectors
 from halbach_fe.inference.result import HELD_OUT
 from halbach_fe.measurement.campaign import Map, maps_of
-from halbach_fe.measurement.field_map import refuse_total_field
 from halbach_fe.measurement.harmonic_field import (
     UNIFORM,
     HarmonicFit,
@@ -110,8 +111,6 @@ def map_homogeneity(
         If the map does not fit the study, or the region reaches beyond it.
     """
     maps = maps_of(magnet.study, data)
-    for one in maps:
-        refuse_total_field(one.data, "a fit of the field by itself")
     readings = read_campaign(magnet, maps)
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
@@ -195,11 +194,25 @@ def _fitted(
     normals = np.random.default_rng(seed).standard_normal((root.shape[1], DRAWS))
     every = np.column_stack([mean, mean[:, None] + root @ normals])
     points = (model.points[:len(model.weights)] - centre) / free_m
-    told = _told(operator)
-    fields = np.einsum("ab,nbd->nad", told, (_fields(points) @ every).reshape(len(points), 3, -1))
-    lacking = _lacking(told)
-    main = model.nominal_mean
-    if np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
+    told, main = _told(operator), model.nominal_mean
+    fields, lacking = (_fields(points) @ every).reshape(len(points), 3, -1), _lacking(told)
+    remark = ""
+    if observation.of_total_field[used].all():
+        nominal = model.field(model.response.nominal[:, None])[..., 0]
+        along, lacking = unit_vectors(nominal), ""
+        told = along[:, :, None] * along[:, None]
+        differs = _differs(np.sum(along * fields[..., 0], axis=1),
+                           np.linalg.norm(nominal, axis=1), model.weights)
+        if differs > ALONG:
+            return None, noise, (
+                f"is of |B|, which differs by up to {100 * differs:.2g} % from the nominal one in "
+                "the region: the field may turn too much there for |B| to be harmonic. Measure "
+                "components.")
+        remark = (f"is of |B|, fitted as B along the nominal field. That is |B| but for some "
+                  f"{PPM * differs**2:.0f} ppm, if the field differs from the nominal one as much "
+                  "across it as along it; the direction of the mean of B is not told.")
+    fields = told @ fields
+    if not remark and np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
         return None, noise, (f"has no {lacking}, along which much of the main field is: it does "
                              "not tell how homogeneous |B| is.")
     known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True)
@@ -207,6 +220,8 @@ def _fitted(
     if left > OPEN * known.rms_ppm:
         return None, noise, (f"leaves {left:.0f} ppm rms of the field in the region open, of "
                              f"{known.rms_ppm:.0f} ppm: it does not tell how homogeneous it is.")
+    if remark:
+        return replace(known, components="|B|"), noise, remark
     if not lacking:
         return known, noise, ""
     has = " and ".join(f"B{name}" for name in COMPONENTS if f"B{name}" not in lacking)
@@ -221,6 +236,11 @@ def _told(operator: sparse.csr_array) -> Floats:
     values, vectors = np.linalg.eigh(rows.T @ rows)
     along = vectors[:, values > SEEN**2 * values[-1]]
     return np.asarray(along @ along.T)
+
+
+def _differs(size: Floats, nominal: Floats, weights: Floats) -> float:
+    """Return by how much |B| (n,) differs at most from the nominal one, times a common factor."""
+    return float(np.max(np.abs(size / nominal - weights @ size / (weights @ nominal))))
 
 
 def _lacking(told: Floats) -> str:

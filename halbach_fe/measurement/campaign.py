@@ -24,7 +24,6 @@ from halbach_fe.measurement.field_map import (
     is_total_field,
     points_of,
     read_map,
-    refuse_total_field,
 )
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
@@ -222,13 +221,6 @@ def check_maps(study: Study, data: object) -> xr.Dataset | dict[str, xr.Dataset]
             f"{', '.join(one.name for one in study.maps) or 'none'} for "
             f"{', '.join(map(str, data)) or 'none'}", "Read them by read_maps."))
     return {name: checked_map(one, name) for name, one in data.items()}
-
-
-def refuse_total_fields(data: Data, validation_map: xr.Dataset | None) -> None:
-    """Raise a MeasurementError if any map of a diagnosis is of |B| alone."""
-    for one in (*([data] if isinstance(data, xr.Dataset) else data.values()), validation_map):
-        if one is not None:
-            refuse_total_field(one, "diagnose")
 
 
 def with_pivots(maps: Sequence[Map]) -> list[Map]:

@@ -148,7 +148,8 @@ def refuse_total_field(data: xr.Dataset, what: str) -> None:
         raise MeasurementError(must_be(
             f"map {data.encoding.get('source', '')}".rstrip(), what,
             "of components Bx, By or Bz", f"a map of |B| alone ({TOTAL_COLUMN})",
-            "`infer` and `register` take such a map, and `check` tests its readings."))
+            "`infer`, `register`, `diagnose` and `homogeneity` take such a map, and `check` "
+            "tests its readings."))
 
 
 def readings_sha256(data: xr.Dataset) -> str:

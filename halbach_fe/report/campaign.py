@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
+from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
 from halbach_fe.report.page import (
@@ -40,7 +41,8 @@ COLOURS = (POSTERIOR, PRIOR, SECOND)
 def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: int) -> Answer:
     """Say what was simulated, and what to do with it."""
     maps = [readings] + ([] if held_out is None else [held_out])
-    largest = max(float(np.nanmax(np.abs(each["B_T"].values))) for each in maps)
+    largest = max(float(np.nanmax(np.abs(column)))
+                  for each in maps for column in _columns(study, each).values())
     more = "" if held_out is None else (
         f", {counted(held_out.sizes['point'], 'more point')} to test predictions (held-out.csv)")
     sigma = _noise(study, readings)
@@ -86,7 +88,7 @@ def write_campaign_page(
             geometry_figure(magnet, points, None if held_out is None else points_of(held_out)),
             f"The nominal blocks of the first ring, {'the iron, ' if magnet.iron else ''}and the "
             "points of the map and the held-out points")}
-    magnitude = np.linalg.norm(np.nan_to_num(readings["B_T"].values), axis=1)
+    magnitude = np.linalg.norm(list(_columns(study, readings).values()), axis=0)
     write_page(
         folder / "campaign.html", "campaign.html.j2", save(figures, folder), study=study,
         provenance={"source": "simulated", "SHA-256 of the truth": readings.attrs["truth_sha256"]},
@@ -108,20 +110,30 @@ def campaign_table(
 
 def _map_row(study: Study, name: str, data: xr.Dataset) -> dict[str, str]:
     """Return the row of a map in the page's table."""
-    fields, z = data["B_T"].values, points_of(data)[:, 2]
+    fields, z = _columns(study, data), points_of(data)[:, 2]
     sigma = _noise(study, data)
     return {"points of": name, "number": str(len(z)),
-            "components": ", ".join(f"B{name}" for name in observed_components(study)),
+            "components": ", ".join(fields),
             "z in mm": " to ".join(dict.fromkeys(
                 f"{1e3 * round(end, 9):.4g}" for end in (z.min(), z.max()))),
-            "largest reading": flux_density(float(np.nanmax(np.abs(fields))), 5),
+            "largest reading": flux_density(float(np.nanmax(np.abs(
+                list(fields.values())))), 5),
             "sd of the noise": " to ".join(dict.fromkeys(
                 flux_density(float(end), 2) for end in (np.nanmin(sigma), np.nanmax(sigma))))}
 
 
 def _noise(study: Study, data: xr.Dataset) -> Floats:
     """Return standard deviations (n, 3) in T: the map's if it has them, else the study's."""
-    return data["sigma_T"].values if "sigma_T" in data else point_noise(study, points_of(data))
+    return data["sigma_T"].values if "sigma_T" in data else point_noise(
+        study, points_of(data), is_total_field(data))
+
+
+def _columns(study: Study, data: xr.Dataset) -> dict[str, Floats]:
+    """Return the readings (n,) in T of a map, by their names."""
+    if is_total_field(data):
+        return {TOTAL_LABEL: data[TOTAL_COLUMN].values}
+    return {f"B{name}": data["B_T"].values[:, COMPONENTS.index(name)]
+            for name in observed_components(study)}
 
 
 def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
@@ -129,16 +141,13 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
     if any(curve(points_of(data)) is None for data in maps.values()):
         (data, *_) = maps.values()
         return maps_figure(points_of(data), {
-            f"B{name}": 1e3 * data["B_T"].values[:, COMPONENTS.index(name)]
-            for name in observed_components(study)}, "mT")
+            name: 1e3 * column for name, column in _columns(study, data).items()}, "mT")
     figure, (axis,) = stacked_axes(1)
     figure.set_figheight(4)
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
         place, label = curve(points_of(data)) or (np.zeros(0), "")
-        for component in observed_components(study):
-            number = COMPONENTS.index(component)
-            axis.plot(place, 1e3 * data["B_T"].values[:, number], marker, ms=4,
-                      color=COLOURS[number], label=f"B{component}, {name}")
+        for (shown, column), colour in zip(_columns(study, data).items(), COLOURS, strict=False):
+            axis.plot(place, 1e3 * column, marker, ms=4, color=colour, label=f"{shown}, {name}")
         axis.set_xlabel(label)
     axis.set_ylabel("reading in mT")
     figure.legend(loc="outside upper center", ncols=2 * len(maps), markerscale=2)

@@ -22,6 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter
+from tomlkit.items import Array, Trivia, Whitespace
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
@@ -138,9 +139,19 @@ def programs() -> str:
 
 def rendered(template: str, study: Study | None = None, **data: object) -> str:
     """Return the HTML of a template of this folder; all texts in ``data`` are escaped."""
-    text = None if study is None else tomlkit.dumps(_without_empty_cells(
-        study.model_dump(mode="json", exclude_unset=True, exclude_none=True)))
-    return _templates().get_template(template).render(study=study, study_text=text, **data)
+    return _templates().get_template(template).render(
+        study=study, study_text=None if study is None else _study_text(study), **data)
+
+
+def _study_text(study: Study) -> str:
+    """Return the text of a study as it was read; page.json alone has a very large table."""
+    keys = study.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+    table, remark = study.array.free_blocks, ""
+    if table is not None and len(table) > MOST_MEASURED:
+        del keys["array"]["free_blocks"]
+        remark = (f"# array.free_blocks, a table of {len(table)} blocks, is in page.json beside "
+                  "this page.\n")
+    return remark + tomlkit.dumps({key: _item(value) for key, value in keys.items()})
 
 
 @cache
@@ -159,13 +170,20 @@ def units_kept(text: str) -> str:
     return re.sub(rf"(?<=\d) (?=(?:{UNITS})(?!\w))|(?<=\d) (?=± \d)|(?<=±) (?=\d)", "\u00a0", text)
 
 
-def _without_empty_cells(value: Any) -> Any:
-    """Return keys and values with "" for the empty cells of tables, which TOML does not have."""
+def _item(value: Any) -> Any:
+    """Return keys and values for tomlkit, with "" for empty cells, which TOML does not have.
+
+    A list is made at once: tomlkit appends to it in a time that grows with its length.
+    """
     if isinstance(value, dict):
-        return {key: _without_empty_cells(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_without_empty_cells(one) for one in value]
-    return "" if value is None else value
+        return {key: _item(one) for key, one in value.items()}
+    if not isinstance(value, list):
+        return "" if value is None else value
+    items = [_item(one) for one in value]
+    if any(isinstance(one, dict) for one in items):
+        return items
+    parts = [part for one in items for part in (Whitespace(", "), tomlkit.item(one))]
+    return Array(parts[1:], Trivia())
 
 
 def figure_of(height_in: float, width_in: float = WIDEST_IN) -> Figure:

@@ -7,8 +7,6 @@ from functools import singledispatch
 from operator import attrgetter
 from pathlib import Path
 
-import tomlkit
-
 from halbach_fe.api import HomogeneityResult, MultipoleTables
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import must_be
@@ -46,6 +44,7 @@ from halbach_fe.report.tolerance import write_tolerance
 from halbach_fe.report.verification import write_verification
 from halbach_fe.response.mesh_convergence import Verification
 from halbach_fe.response.solution import Solution, write_solution
+from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.simulate import SimulatedCampaign, write_campaign
 
@@ -138,7 +137,7 @@ def _(result: InferenceResult, folder: str | Path) -> Path:
 @_write.register
 def _(result: Diagnosis, folder: str | Path) -> Path:
     study = result.corrected_study
-    text = tomlkit.dumps(study.model_dump(mode="json", exclude_defaults=True))
+    text = study_text(study)
     return write_diagnosis(result, (), study, text, Path(folder))
 
 
@@ -181,7 +180,7 @@ def _(result: Assembly, folder: str | Path) -> Path:
 
 @_write.register
 def _(result: Designed, folder: str | Path) -> Path:
-    text = tomlkit.dumps(result.study.model_dump(mode="json", exclude_defaults=True))
+    text = study_text(result.study)
     write_design(result, text, Path(folder), provenance())
     return Path(folder) / "design.html"
 
@@ -194,7 +193,7 @@ def _(result: MeasurementPlan, folder: str | Path) -> Path:
 
 @_write.register
 def _(result: Shim, folder: str | Path) -> Path:
-    text = tomlkit.dumps(result.study.model_dump(mode="json", exclude_defaults=True))
+    text = study_text(result.study)
     write_shim(result, result.result, text, Path(folder))
     return Path(folder) / "shim.html"
 

@@ -359,8 +359,8 @@ class Homogeneity:
     harmonics : tuple of Harmonic
         Empty unless the region is a sphere.
     components : str
-        Names of the components whose size stands for |B|, if the others were not measured; there is
-        no direction then.
+        Names of the components whose size stands for |B|, if the others were not measured, or
+        ``|B|`` if it was measured alone; there is no direction then.
     """
 
     mean_T: float

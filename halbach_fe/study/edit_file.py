@@ -251,9 +251,17 @@ def _add_note(item: Item, note: str) -> None:
 
 
 def _rewritten(study: Study, notes: list[str]) -> str:
-    """Return a study file with all keys of a study that are not defaults, after some comments."""
+    """Return `study_text` after some comments."""
     lines = "".join(f"# {note}\n" for note in notes if note)
+    return f"{lines}\n{study_text(study)}"
+
+
+def study_text(study: Study) -> str:
+    """Return a study file with all keys of a study that are not defaults.
+
+    It refers to a table of free blocks beside it, see `write_edited`.
+    """
     keys = study.model_dump(mode="json", exclude_defaults=True)
     if study.array.free_blocks is not None:
         keys["array"]["free_blocks"] = {"file": FREE_BLOCKS_FILE}
-    return f"{lines}\n{tomlkit.dumps(keys)}"
+    return tomlkit.dumps(keys)

@@ -24,7 +24,7 @@ from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, total_field_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.study.magnet import check_apart
@@ -35,7 +35,7 @@ from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic import stated_instrument
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet, magnetizations
-from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
+from halbach_fe.synthetic.faulty_instrument import IDEAL_AXES, FaultyInstrument
 from halbach_fe.synthetic.hidden_effects import (
     RequestedEffect,
     choose_effects,
@@ -51,7 +51,7 @@ from halbach_fe.synthetic.placed_blocks import in_places
 from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.reaction import by_elements, reaction_field
 from halbach_fe.synthetic.stated_instrument import columns
-from halbach_fe.synthetic.true_magnet import TrueMagnet
+from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, TrueMagnet
 
 COIL_SD = 0.001
 """Noise of a Helmholtz coil relative to the moment; usual coils reach 0.1 %."""
@@ -91,7 +91,8 @@ class SimulatedCampaign(ShownInNotebook):
     truth : dict
         The magnetizations, hidden effects and other numbers that were drawn, as plain data.
     without_noise : ndarray, shape (n, 3)
-        Readings of the map before noise was added, in the field unit of the record.
+        Readings of the map before noise was added, in the field unit of the record; (n, 1) of a map
+        of |B|.
 
     Examples
     --------
@@ -112,7 +113,7 @@ class SimulatedCampaign(ShownInNotebook):
 def simulate_campaign(
     study: Study, seed: int, coil_sd: float = COIL_SD, hide: Sequence[RequestedEffect] = (),
     hide_random: int = 0, elements: Elements | None = None, progress: Progress = no_progress,
-    placed: BlockTable | None = None,
+    placed: BlockTable | None = None, magnitude: bool = False,
 ) -> SimulatedCampaign:
     """Draw a magnet, measure it, and describe the truth.
 
@@ -135,6 +136,9 @@ def simulate_campaign(
     placed : BlockTable, optional
         The blocks of this seed in other places, in which they are then assembled: what `sort` made
         of the table of an earlier simulation. Its places become those of the campaign's table.
+    magnitude : bool
+        Whether the probe reads |B| alone, as that of an NMR teslameter does. It has the gain, the
+        offset and the place of the sensor of Bx, and no axes.
 
     Raises
     ------
@@ -155,8 +159,11 @@ def simulate_campaign(
         raise StudyError(must_be(
             "`maps`", f"study {study.name}", "left out of a simulated measurement, which is of one "
             "map", f"a list of {len(study.maps)}"))
+    if magnitude and study.observation.quantity != "flux_density":
+        raise StudyError(must_be("`observation.quantity`", f"study {study.name}",
+                                 "flux_density for a map of |B|", study.observation.quantity))
     points, others = points_from(study.observation.positions), between(study.observation.positions)
-    sigma = point_noise(study, np.vstack([points, others]))
+    sigma = point_noise(study, np.vstack([points, others]), magnitude)
     blocks, coil, noise, effects, faults = _streams(seed)
     nominal = magnet_of(study)
     site = site_of(study, nominal)
@@ -172,7 +179,8 @@ def simulate_campaign(
     check_apart(study.external, nominal_places, study.name)
     offsets = real_places(study, nominal_places, noise) - nominal_places
     recorded, readings = measured(
-        magnet, instrument, points, others, elements, faults, progress, offsets, study.instrument)
+        magnet, instrument, points, others, elements, faults, progress, offsets, study.instrument,
+        magnitude)
     truth: dict[str, object] = {
         "study": study.name, "seed": seed, "model": model_of(magnet),
         "effects": [effect.plain() for effect in hidden],
@@ -213,9 +221,9 @@ def _streams(seed: int) -> list[np.random.Generator]:
 def measured(
     magnet: TrueMagnet, instrument: FaultyInstrument, points: Floats, others: Floats,
     elements: Elements | None, generator: np.random.Generator, progress: Progress,
-    offsets: Floats | None = None, stated: Instrument = IDEAL,
+    offsets: Floats | None = None, stated: Instrument = IDEAL, magnitude: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Return the recorded points and readings without noise, both (n, 3).
+    """Return the recorded points and readings without noise, both (n, 3); of |B|, (n, 1).
 
     The ``points`` of the map come first, the held-out points ``others`` last. ``offsets`` (n, 3) in
     m displace the probe from each of them. The ``stated`` instrument, which the study describes,
@@ -234,11 +242,16 @@ def measured(
     check_air(magnet, distinct)
     fields = true_field(magnet, distinct, elements, progress)[inverse].reshape(places.shape)
     time = np.arange(len(nominal)) / max(1, len(points) - 1)
+    if magnitude:  # a length has no axes: it is as the reading of a single sensor of Bx
+        fields = np.linalg.norm(fields, axis=2)[..., None] * [1.0, 0.0, 0.0]
+        stated = stated.model_copy(update={"rotation_rad": ZERO_VECTOR})
+        instrument = replace(instrument, rotation=ZERO_VECTOR, axes=IDEAL_AXES,
+                             order=(0, 1, 2), signs=(1.0, 1.0, 1.0))
     if stated != IDEAL:
         fields = _as_stated(stated, fields, [len(part) for part in maps])
     recorded, readings = instrument.record(
         nominal, instrument.readings(fields, time, generator))
-    return recorded, readings.round(DIGITS)
+    return recorded, readings.round(DIGITS)[:, :1 if magnitude else 3]
 
 
 def _as_stated(stated: Instrument, fields: Floats, counts: Sequence[int]) -> Floats:
@@ -292,8 +305,9 @@ def model_of(magnet: TrueMagnet) -> dict[str, str]:
     return programs
 
 
-def point_noise(study: Study, points: Floats) -> Floats:
-    """Return the standard deviations (n, 3) in T of the components at points (n, 3) in m.
+def point_noise(study: Study, points: Floats, magnitude: bool = False) -> Floats:
+    """Return the standard deviations (n, 3) in T of the components at points (n, 3) in m, or those
+    of their ``magnitude``, (n, 1).
 
     They are NaN for components that the study does not observe. If the study observes Fourier
     coefficients, its sigma is theirs; the variance of a coefficient of n points is 2/n times that
@@ -309,6 +323,8 @@ def point_noise(study: Study, points: Floats) -> Floats:
                                  "given for a simulated measurement", "nothing",
                                  "Add [[noise.regions]]."))
     sigma = np.array([region.sigma_T for region in study.noise.regions])
+    if magnitude:
+        return sigma[noise_regions(study.noise, points[:, 2], ("",) * len(points))][:, None]
     result = np.full((len(points), 3), np.nan)
     for number, name in enumerate(COMPONENTS):
         if name in observed_components(study):
@@ -353,21 +369,24 @@ def check_air(magnet: TrueMagnet, points: Floats) -> None:
 def _map(
     study: Study, points: Floats, readings: Floats, sigma: Floats, seal: dict[str, str]
 ) -> xr.Dataset:
-    """Return a map of the components that the study observes.
+    """Return a map of the components that the study observes, or of |B| from readings (n, 1).
 
     ``seal`` holds the attributes of the map, among them the hash of the truth.
     """
     # the noise of flux densities is stated in the study, that of single points behind Fourier
     # coefficients is not
     known = None if study.observation.quantity == "flux_density" else sigma
-    shown = np.where([name in observed_components(study) for name in COMPONENTS], readings, np.nan)
     file = study.instrument  # states the units and axes of the map
     if known is not None:
         known = np.abs(columns(file.field_axes, known, file.flux_density_unit_T))
     places = columns(file.position_axes, points, file.length_unit_m)
-    return field_map(
-        places if file.length_unit_m == 1 else places.round(DIGITS),
-        columns(file.field_axes, shown, file.flux_density_unit_T).round(DIGITS), known, seal)
+    places = places if file.length_unit_m == 1 else places.round(DIGITS)
+    if readings.shape[1] == 1:
+        return total_field_map(
+            places, (readings[:, 0] / file.flux_density_unit_T).round(DIGITS), attributes=seal)
+    shown = np.where([name in observed_components(study) for name in COMPONENTS], readings, np.nan)
+    field = columns(file.field_axes, shown, file.flux_density_unit_T).round(DIGITS)
+    return field_map(places, field, known, seal)
 
 
 def truth_text(truth: dict[str, object]) -> str:

@@ -123,6 +123,7 @@ def update_of(residual, root, points=POINTS):
     count = len(residual)
     observation = SimpleNamespace(
         analysis=sparse.eye_array(count).tocsr(), labels=LABELS[:count], map_points=points,
+        components=[label[1:] for label in LABELS[:count]], map_rows=np.arange(count) // 3,
         positions=np.repeat(points, 3, axis=0),
         read=lambda fields: fields.reshape(len(fields), -1))
     return SimpleNamespace(
@@ -151,7 +152,7 @@ def test_outliers_are_told_and_left_out(root, clean):
         (2, ("y", "z")), (1001, ("x",))]
     # coefficients are made of many readings
     update = update_of(clean, root)
-    update.observation.analysis = sparse.csr_array(np.ones((COUNT, 2)))
+    update.observation.components = [""] * COUNT
     assert outliers_of(update, campaign_of()) == ()
 
 

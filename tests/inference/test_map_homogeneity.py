@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from halbach_fe.api import homogeneity
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR, not_carried
-from halbach_fe.measurement.field_map import field_map
+from halbach_fe.measurement.field_map import field_map, total_field_map
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.report.homogeneity import answer
 from halbach_fe.report.result_files import write_report
@@ -117,6 +118,37 @@ def test_a_map_of_one_component(generator, tmp_path, errors, axis):
         assert each.rms_ppm == middle  # no estimate is outside of its own range
         assert each.peak_to_peak_ppm == each.peak_to_peak_range_ppm[1]
         assert low - (high - low) / 2 - 1e6 * second < rms < high + (high - low) / 2 + 1e6 * second
+
+
+def test_a_map_of_the_magnitude(generator, tmp_path, errors):
+    """Truth by magpylib, of blocks that are 3 % off: |B| is what the page says, to its bars and to
+    the second order that it states; of a quadrupole, whose field turns, nothing is said.
+    """
+    magnet = build_magnet(study())
+    data = measured(generator, errors)
+    data = total_field_map(GRID, np.linalg.norm(data["B_T"].values, axis=1))
+    found = homogeneity(magnet, Session.open(tmp_path), REGION, data=data)
+    points, weights, _ = region_points(magnet, REGION)
+    size = np.linalg.norm(true_field(1, points, errors=errors), axis=1)
+    mean = float(weights @ size)
+    rms = 1e6 * float(np.sqrt(weights @ (size / mean - 1)**2))
+    second = float(re.search(r"but for some (\d+) ppm", found.map_remarks[0])[1])
+    assert second < 500  # 3 % of 36 blocks leave some 1 % of the field: 100 ppm
+    assert found.map_misfit == pytest.approx(1, abs=0.1)  # of 729 readings: 2.6 % is one sd
+    for known in found.of_map.values():
+        assert known.components == "|B|"
+        assert known.mean_T == pytest.approx(mean, abs=4 * known.mean_sd_T + 1e-6 * second * mean)
+        low, _, high = known.rms_range_ppm
+        assert low - (high - low) / 2 - second < rms < high + (high - low) / 2 + second
+    nominal = found.by_name["prior"]  # the control: it is another magnet
+    assert abs(nominal.mean_T - mean) > 20 * found.of_map[MAP].mean_sd_T
+    write_report(found, tmp_path / "page")
+    assert "map, |B| alone" in (tmp_path / "page" / "homogeneity.html").read_text()
+    field = true_field(2, GRID, errors=errors)
+    turning = total_field_map(GRID, np.linalg.norm(field, axis=1))
+    found = homogeneity(magnet, Session.open(tmp_path), REGION, data=turning)
+    assert not found.of_map
+    assert "may turn too much there for |B| to be harmonic" in found.map_remarks[0]
 
 
 def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):

@@ -15,7 +15,6 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.readings import read_campaign
 from halbach_fe.inference.registration import register
 from halbach_fe.inference.storage import write_inference
@@ -183,8 +182,6 @@ def test_a_probe_of_components_is_refused(key, value, words, generator, session)
 
 def test_what_needs_components_says_so(generator, session):
     data = total_map(1, 1, generator)
-    with pytest.raises(MeasurementError, match=r"map of \|B\| alone"):
-        map_homogeneity(build_magnet(study_of(1)), data, None)
     fourier = study_of(1, observation={
         "quantity": "fourier_coefficients", "harmonics": 3, "positions": {
             "kind": "circles", "radius_m": 0.05, "angles": 12}}, inference={})

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import tomllib
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import tomlkit
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
@@ -155,3 +157,23 @@ def test_keys_by_route(short_dipole):
             ({"solver__method": "direct"}, far, ["block_size_m"])):
         said = finer_in_words(build_magnet(short_dipole(**changes)), points)
         assert re.findall(r"mesh\.(\w+)", said) == keys
+
+
+def test_the_study_on_a_page_is_written_in_linear_time(monkeypatch):
+    """tomlkit's insertion into an array takes a time that grows with its length: 97 336 cubes took
+    hours. The text reads back to the table; of a very large one it names the file that has it.
+    """
+    def refused(*_):
+        raise AssertionError("inserted one by one")
+
+    magnet = magnet_of([(0.1 * i, 0.0, 0.0) for i in range(12)])
+    monkeypatch.setattr(tomlkit.items.Array, "insert", refused)
+    free = tomllib.loads(page._study_text(magnet.study))["array"]["free_blocks"]
+    assert tuple(free["x_m"]) == magnet.study.array.free_blocks.x_m
+    assert free["name"][11] == "b11"
+    with pytest.raises(AssertionError, match="one by one"):  # the control
+        tomlkit.dumps({"x": [1, 2]})
+    monkeypatch.setattr(page, "MOST_MEASURED", 11)
+    text = page._study_text(magnet.study)
+    assert "a table of 12 blocks, is in page.json" in text
+    assert "free_blocks" not in tomllib.loads(text)["array"]

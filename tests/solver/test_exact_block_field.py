@@ -5,6 +5,7 @@ from __future__ import annotations
 import magpylib
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
@@ -12,6 +13,7 @@ from halbach_fe.solver import exact_block_field, prism_kernel
 from halbach_fe.solver.exact_block_field import field_of, field_on_circles, gradient_of, unit_field
 from halbach_fe.solver.prism_kernel import arc_table
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
+from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 
 MAGPYLIB_ERROR = 1e-6
@@ -231,3 +233,39 @@ def test_scaling(short_dipole, generator):
                               generator.uniform(-0.2, 0.2, 20)])
     np.testing.assert_allclose(field_of(build_magnet(small).blocks, points),
                                field_of(build_magnet(large).blocks, 2 * points), atol=1e-12)
+
+
+def test_equal_blocks_are_evaluated_at_once(monkeypatch, generator):
+    """343 cubes in any pose, one of them with a face through a point, in one call of the closed
+    form, against magpylib; a block of another size is one more call.
+    """
+    places = np.stack(np.meshgrid(*3 * [0.03 * np.arange(-3, 4)]), axis=-1).reshape(-1, 3)
+    turns = generator.uniform(-60, 60, places.shape)
+    turns[0] = 0
+    points = np.vstack([generator.uniform(0.12, 0.2, (3, 3)), places[0] - [0.005, 0, 0]])
+    table = {"name": [f"b{i}" for i in range(343)], "shape": 343 * ["cuboid"],
+             **dict(zip(("x_m", "y_m", "z_m"), places.T.tolist(), strict=True)),
+             **{f"rotation_{axis}_deg": turns[:, i].tolist() for i, axis in enumerate("xyz")},
+             **{f"size_{axis}_m": 343 * [0.01] for axis in "xyz"}, "remanence_T": 343 * [1.2]}
+
+    def blocks_of(**changes):
+        return build_magnet(parse_study({
+            "name": "cubes", "dimension": 3, "mesh": {"block_size_m": 0.01},
+            "array": {"recoil_permeability": 1.0, "free_blocks": {**table, **changes}},
+            "observation": {"quantity": "flux_density", "positions": {
+                "kind": "points", "points_m": [[0, 0, 0.5]]}}})).blocks
+
+    blocks, calls, whole = blocks_of(), [], exact_block_field._outline_field
+    monkeypatch.setattr(exact_block_field, "_outline_field", lambda block, points: (
+        calls.append(len(points)), whole(block, points))[1])
+    found = field_of(blocks, points)
+    assert calls == [343 * len(points)]
+    outside = np.vstack([points[:3], points[3] - [1e-12, 0, 0]])  # the limit that a face stands for
+    expected = sum(magpylib.magnet.Cuboid(
+        polarization=(1.2, 0, 0), dimension=3 * [0.01], position=place,
+        orientation=Rotation.from_rotvec(turn, degrees=True)).getB(outside)
+        for place, turn in zip(places, turns, strict=True))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    calls.clear()
+    field_of(blocks_of(size_x_m=[0.011, *342 * [0.01]]), points)
+    assert len(calls) == 2

@@ -6,6 +6,7 @@ import tomllib
 
 import numpy as np
 import pytest
+import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -13,7 +14,7 @@ from pydantic import ValidationError
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.study import edit_file
-from halbach_fe.study.edit_file import REWRITTEN_NOTE, edited_text
+from halbach_fe.study.edit_file import REWRITTEN_NOTE, edited_text, study_text
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import ROOT
@@ -176,3 +177,22 @@ def test_impossible_studies_are_refused():
     narrow = study.model_copy(update={"array": study.array.model_copy(update={"block": block})})
     with pytest.raises(StudyError, match=r"angular_gap_deg.*greater than or equal to 0"):
         edited_text(PLAIN, [(narrow, "")])
+
+
+def test_study_with_empty_cells_is_written():
+    """A table of several shapes has empty cells, which TOML does not have: it stays a file."""
+    study = parse_study({
+        "name": "rod", "dimension": 3, "mesh": {"block_size_m": 0.01},
+        "array": {"recoil_permeability": 1.0, "free_blocks": {
+            "name": ["rod", "cube"], "shape": ["cylinder", "cuboid"], "x_m": [0.0, 0.1],
+            "y_m": [0.0, 0.0], "z_m": [0.0, 0.0], "radius_m": [0.01, None],
+            "size_x_m": [None, 0.02], "size_y_m": [None, 0.02], "size_z_m": [0.02, 0.02],
+            "remanence_T": [1.2, 1.3]}},
+        "observation": {"quantity": "flux_density", "positions": {
+            "kind": "points", "points_m": [[0.0, 0.0, 0.1]]}}})
+    text = study_text(study)
+    assert tomllib.loads(text)["array"]["free_blocks"] == {"file": "free_blocks.csv"}
+    changed = study.with_(name="wand")
+    assert 'name = "wand"' in edited_text(text, [(changed, "renamed")])
+    with pytest.raises(tomlkit.exceptions.ConvertError):  # the control
+        tomlkit.dumps(study.model_dump(mode="json", exclude_defaults=True))

@@ -7,7 +7,10 @@ import tomllib
 import numpy as np
 import pytest
 
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.api import simulate_measurement
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.measurement.field_map import is_total_field, points_of, read_map
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     nonlinear_part,
@@ -113,3 +116,33 @@ def test_gain_and_offset_are_in_the_readings():
     expected = plain.without_noise[:, :2] * [1.01, 1.02] + [1e-3, 0]
     np.testing.assert_allclose(found.without_noise[:, :2], expected, atol=2e-12)
     assert np.abs(found.without_noise - plain.without_noise).max() > 1e-3
+
+
+def test_a_map_of_the_magnitude(tmp_path, capsys):
+    """|B| is the length of what three sensors show without errors, with the probe's one gain and
+    offset, in the file's unit; a turned probe reads the same, and three gains are refused.
+    """
+    turned = "\n[instrument]\nrotation_rad = [0, 0, 0.3]\n"
+    plain = simulate_campaign(parsed(STUDY + turned), 3)
+    size = np.linalg.norm(plain.without_noise[:, :2], axis=1)
+    stated = parsed(STUDY + turned + """
+flux_density_unit_T = 1e-3
+gain = [0.02, 0.02, 0.02]
+offset_T = [1e-3, 1e-3, 1e-3]
+""")
+    found = simulate_campaign(stated, 3, magnitude=True)
+    np.testing.assert_allclose(found.without_noise[:, 0], 1.02 * size + 1e-3, atol=2e-12)
+    assert np.abs(found.without_noise[:, 0] - size).max() > 1e-3  # the control
+    read = in_si_and_magnet_axes(stated.instrument, found.readings)
+    assert is_total_field(read)
+    noise = (read["Babs_T"].values - found.without_noise[:, 0]) / 1e-6
+    assert 0.4 < noise.std() < 1.7  # of 12 readings; 4 sigma of chi
+    with pytest.raises(MeasurementError, match="three equal entries"):
+        simulate_measurement(parsed(STUDY + "[instrument]\ngain = [0.01, 0, 0]\n"), 3,
+                             magnitude=True)
+    study = tmp_path / "study.toml"
+    study.write_text(STUDY)
+    assert main(["simulate-measurement", str(study), "-o", str(tmp_path / "campaign"),
+                 "--component", "abs"]) == 0
+    assert is_total_field(read_map(tmp_path / "campaign" / "map.csv"))
+    assert "|B|" in capsys.readouterr().out

@@ -143,6 +143,8 @@ class Effect(ABC):
         Whether some of the parameters may be exactly zero, so that the effect competes by its
         parts, such as a displacement along z alone. A vector that has any direction is not
         divisible.
+    of_total_field : bool
+        Whether it is an effect of probes of |B|, whose three columns have one sensor.
     relative_odds : float
         Prior odds that the effect is missing, relative to those of other effects.
     """
@@ -157,6 +159,7 @@ class Effect(ABC):
     applied_in_full: bool = False
     defining: tuple[str, ...] = ()
     is_divisible: bool = True
+    of_total_field: bool = False
     relative_odds: float = 1.0
 
     @property

@@ -36,6 +36,7 @@ class InstrumentRow(InstrumentEffect):
     parameters: tuple[Parameter, ...]
     change_of: Change
     is_divisible: bool = True
+    of_total_field: bool = False
     shown_by: Callable[[Floats], bool] = lambda points: True
 
     def can_show(self, points: Floats) -> bool:
@@ -79,6 +80,12 @@ def _plus(key: str, part: int | None = None) -> Change:
         found[here] += np.reshape(values, found[here].shape)
         return {key: found.tolist()}
     return change
+
+
+def _plus_alike(key: str) -> Change:
+    """Return the change that adds the amplitude to all three entries of a key."""
+    return lambda instrument, values: {
+        key: [entry + values[0] for entry in getattr(instrument, key)]}
 
 
 def _longer_arm(instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
@@ -145,6 +152,16 @@ EFFECTS = (
           ("sensor_position", "place of the B{} sensor in the probe", "x y z", "m", 1e-3,
            "sensor_position_m"))
       for axis in range(3)),
+    *(_row(f"{name}_of_magnitude", f"{title} the probe of |B|", amplitude, unit, sd,
+           _plus_alike(key), of_total_field=True)
+      for name, title, amplitude, unit, sd, key in (
+          ("gain", "sensitivity of", "gain", "1", 3e-3, "gain"),
+          ("offset", "zero of", "offset", "T", 1e-4, "offset_T"),
+          ("drift", "drift of the zero of", "change", "T", 1e-4, "drift_T"),
+          ("quadratic_nonlinearity", "quadratic non-linearity of", "coefficient", "1/T", 3e-3,
+           "quadratic_per_T"),
+          ("cubic_nonlinearity", "cubic non-linearity of", "coefficient", "1/T^2", 5e-3,
+           "cubic_per_T2"))),
     *(_row(f"misalignment_{sensor}{other}", f"B{sensor} sensor tilted towards {other}",
            "crosstalk", "rad", 2e-3, _picked_up(sensor + other))
       for sensor in COMPONENTS for other in COMPONENTS if sensor != other),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, frames_of
 from halbach_fe.geometry.outline import Edge, Outline
 
 CHORD = np.pi / 6
@@ -155,14 +155,14 @@ def cells_of(blocks: Sequence[MagnetBlock], per_side: int, divisions: int = 2) -
     """
     known: dict[tuple[object, ...], tuple[Floats, ...]] = {}
     number, centres, axes, corners, halves, flags = [], [], [], [], [], []
-    for i, block in enumerate(blocks):
+    for i, (block, position, frame) in enumerate(zip(blocks, *frames_of(blocks), strict=True)):
         key = block.outline, block.z_min, block.z_max
         if key not in known:
             known[key] = _local_cells(block, per_side)
         place, turn, vertices, half, cuboid = known[key]
         number.append(np.full(len(half), i))
-        centres.append(block.from_frame(place))
-        axes.append(block.axes @ turn)
+        centres.append(place @ frame.T + position)
+        axes.append(frame @ turn)
         corners.append(vertices)
         halves.append(half)
         flags.append(cuboid)
