@@ -71,7 +71,8 @@ def test_signatures_are_derivatives(name, nominal):
             assert np.abs(change - step * signature[number]).max() < 1e-2 * size
             # negative controls: the wrong sign, another component
             assert np.abs(change + step * signature[number]).max() > size
-            assert np.abs(change - step * signature[number][:, [1, 2, 0]]).max() > 0.5 * size
+            exchanged = np.abs(change - step * signature[number][:, [1, 2, 0]]).max()
+            assert exchanged > 0.5 * size or effect.of_total_field  # in which all are alike
 
 
 @pytest.mark.parametrize("loss", [0.4, 1.0, 2.0])
