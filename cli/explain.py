@@ -104,7 +104,7 @@ class _Explanation:
 
     def diagnose(self) -> bool:
         """Look for what the study lacks, and tell whether it was found and may be used."""
-        from halbach_fe.report.diagnosis_answer import STUDY_FILE
+        from halbach_fe.diagnosis.summary import STUDY_FILE
 
         found = self.run("diagnose", "diagnosed", self.study)
         if found.changes_study:
