@@ -387,7 +387,8 @@ def run(arguments: argparse.Namespace) -> int:
               "all blocks integrated out.",
         columns=column_table(fitted, best.update),
         poses=[] if arguments.quick else pose_table(poses),
-        places=[] if arguments.quick else place_table(poses), left=left, further=further, files="profile.json, measured.csv")
+        places=[] if arguments.quick else place_table(poses),
+        left=left, further=further, files="profile.json, measured.csv")
     for sentence in found + left:
         common.say(sentence)
     common.say(f"Report: {folder / 'profile.html'}")
