@@ -23,6 +23,9 @@ HIGHEST_DEGREE = 20
 """Highest degree of a spherical harmonic: those in the bore fall with a power of the radius, and
 points on the sphere grow with the square of the degree."""
 
+EMPTY_CELL = "–"
+"""Text of a table's cell without an entry."""
+
 TINY = 1e-6
 """Size below which a number that is shown to people is zero."""
 

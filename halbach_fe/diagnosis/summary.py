@@ -15,7 +15,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
-from halbach_fe.core.numbers import decimals
+from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
@@ -34,6 +34,7 @@ from halbach_fe.diagnosis.result import (
     UnknownCause,
 )
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
+from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.inference.result import (
     ALL_READINGS,
     COVERAGE_Z,
@@ -56,9 +57,6 @@ DISPLAY_UNITS = {
 
 PRESENT = "present"
 """Amount of an effect that is all or nothing."""
-
-EMPTY_CELL = "–"
-"""Text of a table's cell without an entry."""
 
 MOST_DISPLACED_MM = 10.0
 """Largest displacement of a block that reports state; signatures are linear up to a few mm."""
@@ -281,14 +279,6 @@ def place_in_words(place: Place) -> str:
 def _in_map(name: str | None) -> str:
     """Return the name of a map before what is said of it; nothing for the only one."""
     return "" if name is None else f"map {name}: "
-
-
-def block_in_words(ring: int, slot: int, label: str = "") -> str:
-    """Describe a block by its own label, or else by ring and slot; 0 stands for all of them."""
-    if label and label != f"r{ring:02d}s{slot:02d}":
-        return f"block {label}"
-    return ", ".join(f"{noun} {number}" for noun, number in (("ring", ring), ("slot", slot))
-                     if number)
 
 
 @dataclass(frozen=True)

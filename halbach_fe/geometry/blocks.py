@@ -269,3 +269,11 @@ def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
                  + block.origin_m)[:, :2] for z in heights])
         smallest = min(smallest, float(np.hypot(*outline.T).min()))
     return max(smallest, 1e-4)
+
+
+def block_in_words(ring: int, slot: int, label: str = "") -> str:
+    """Describe a block by its own label, or else by ring and slot; 0 stands for all of them."""
+    if label and label != f"r{ring:02d}s{slot:02d}":
+        return f"block {label}"
+    return ", ".join(f"{noun} {number}" for noun, number in (("ring", ring), ("slot", slot))
+                     if number)

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import special
 from scipy.spatial import KDTree
-from scipy.stats import binom
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
@@ -277,7 +277,7 @@ def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
         if len(values) and len(steps):
             ratio = float(steps.min()) / noise
             alike *= 1.0 if ratio > COARSE else ratio / (2 * np.sqrt(np.pi))
-    return bool(binom.sf(copies - 1, pairs, alike) < BY_CHANCE)
+    return bool(special.bdtrc(copies - 1, pairs, alike) < BY_CHANCE)
 
 
 def _refuse_repeated(maps: Sequence[Map]) -> None:

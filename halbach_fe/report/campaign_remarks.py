@@ -11,7 +11,7 @@ from itertools import combinations
 from pathlib import PurePath
 from typing import Any
 
-from halbach_fe.diagnosis.summary import block_in_words
+from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.report.campaign_folders import Chapter
 from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.array import BlockException

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
-from halbach_fe.diagnosis.summary import block_in_words
+from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view

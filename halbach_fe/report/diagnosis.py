@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, Separation
 from halbach_fe.diagnosis.loo_residuals import DISCOVERIES, ResidualGroup
 from halbach_fe.diagnosis.model_selection import (
@@ -15,7 +16,6 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.summary import (
-    EMPTY_CELL,
     STUDY_FILE,
     SUMMARY_FILE,
     amounts,

@@ -19,7 +19,8 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.summary import block_in_words, place_in_words, rivals
+from halbach_fe.diagnosis.summary import place_in_words, rivals
+from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.diagnosis_answer import catalogue_titles, title_of

@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.summary import EMPTY_CELL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     POSTERIOR,

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.numbers import decimals as decimals
-from halbach_fe.diagnosis.summary import EMPTY_CELL, block_in_words
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.study.model import Study
 
 SMALL_T, LARGE_T = 1e-3, 1.0
