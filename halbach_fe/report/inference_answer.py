@@ -63,13 +63,23 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
 
 
 def _of_the_probe(result: InferenceResult) -> str:
-    """Say that the error bars take the probe's calibration as exact, unless the study does not."""
+    """Say what the error bars take as exact of the probe: its calibration, and stated offsets."""
     study = result.study
-    known = [study.instrument_sd, *(one.instrument_sd or study.instrument_sd for one in study.maps)]
-    how = " ([instrument_sd] can say how well it is known)" if study.dimension == 3 else ""
-    return "" if any(one.gain for one in known) else (
-        f" The error bars take the calibration of the probe as exact{how}: if its gain is "
-        "0.1\u00a0% off, so is the field of the magnet.")
+    instruments = [(study.instrument, study.instrument_sd), *(
+        (one.instrument or study.instrument, one.instrument_sd or study.instrument_sd)
+        for one in study.maps)]
+    said = ""
+    if not any(known.gain for _, known in instruments):
+        how = " ([instrument_sd] can say how well it is known)" if study.dimension == 3 else ""
+        said = (f" The error bars take the calibration of the probe as exact{how}: if its gain is "
+                "0.1\u00a0% off, so is the field of the magnet.")
+    offset = max((max(map(abs, each.offset_T)) for each, known in instruments
+                  if not known.offset_T), default=0.0)
+    if offset:
+        said += (f" They take its offset of {flux_density(offset, 2)} as exact, too. If that was "
+                 "found from the map (by register, say), a magnet's uniform field may be in it: "
+                 "state the standard deviation that it had before, [instrument_sd] offset_T.")
+    return said
 
 
 def _of_the_solver(result: InferenceResult) -> str:
