@@ -92,6 +92,8 @@ class SimulatedCampaign(ShownInNotebook):
         The magnetizations, hidden effects and other numbers that were drawn, as plain data.
     without_noise : ndarray, shape (n, 3)
         Readings of the map before noise was added, in the field unit of the record.
+    magnet : TrueMagnet
+        The magnet that was measured, with what is hidden in it.
 
     Examples
     --------
@@ -107,6 +109,7 @@ class SimulatedCampaign(ShownInNotebook):
     blocks: BlockTable
     truth: dict[str, object]
     without_noise: Floats
+    magnet: TrueMagnet
 
 
 def simulate_campaign(
@@ -192,7 +195,8 @@ def simulate_campaign(
     maps = [_map(study, recorded[part], readings[part], unit * sigma[part], seal)
             .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
             for part in (slice(len(points)), slice(len(points), None))]
-    return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact)
+    return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact,
+                             magnet)
 
 
 def simulate_delivery(study: Study, seed: int, coil_sd: float = COIL_SD) -> BlockTable:

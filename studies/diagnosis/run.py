@@ -1,9 +1,11 @@
 """Sealed cases of hidden effects, and how often the diagnosis names them.
 
+Each case draws a magnet, a map and sizes of the effects (`halbach_fe.synthetic.drawn_studies`).
 Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted run goes on. Cases are
-independent, and --jobs of them run at a time::
+independent: --jobs of them run at a time, or several processes share them::
 
     python studies/diagnosis/run.py -o results/diagnosis
+    python studies/diagnosis/run.py -o results/diagnosis --part 1 2
 """
 
 from __future__ import annotations
@@ -33,12 +35,14 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import NominalSolver
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.result import HELD_OUT
+from halbach_fe.inference.result import HELD_OUT, InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.report.sealed_cases import write_sealed_cases
+from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_axis
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
@@ -50,9 +54,13 @@ from halbach_fe.stats.stated_probabilities import (
 from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.drawn_studies import drawn_fault, drawn_magnet, drawn_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
+from halbach_fe.synthetic.hidden_effects import RequestedEffect
 from halbach_fe.synthetic.optional_packages import import_extra
-from halbach_fe.synthetic.simulate import simulate_campaign
+from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
+from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 HERE = Path(__file__).parent
 DETECTABLE = 5.0
@@ -67,6 +75,10 @@ NO_BLOCKS = {"magnitude_sd": 1e-5, "direction_sd_deg": 1e-3, "common_mode_sd": 1
 
 FAR_M = 100.0
 
+EXACT = 1e-18
+"""Variance, relative to the largest one, below which a direction of the magnetizations is exactly
+known, as of missing blocks. (Standard deviations of others differ by less than a thousand.)"""
+
 BACK = (0.9, 1.1)
 """chi2 per held-out reading of a model that lacks nothing."""
 
@@ -79,77 +91,122 @@ WANTED = {
 """Rates; of the controls, which must fail, too."""
 
 
+SLOW = ("iron_ring", "knee", "recoil_permeability", "recoil_permeability_across")
+"""Effects whose true field takes minutes, of which no other magnet has one."""
+
+
 @dataclass(frozen=True)
 class Case:
-    """What is hidden in one campaign."""
+    """What is hidden in one campaign, of which magnet.
+
+    With ``with_blocks`` the diagnosis knows the moments of the single blocks.
+    """
 
     seed: int
-    hidden: tuple[str, ...] = ()
+    study: Study
+    faults: tuple[RequestedEffect, ...] = ()
     outside: str = ""
+    with_blocks: bool = False
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect, _ in self.faults)
 
     @property
     def name(self) -> str:
         """Its file."""
-        return f"{self.seed:03d}-{'-'.join(self.hidden) or self.outside or NONE}"
+        hidden = "-".join(self.hidden) or self.outside or NONE
+        return f"{self.seed:04d}-{self.study.name}-{hidden}"
 
 
-def cases(singles: int, clean: int, pairs: int, outside: int) -> list[Case]:
-    """Effects that the campaign can hide, alone and in pairs of small ones; none; others."""
+def drawn_case(seed: int, hidden: Sequence[str], outside: str = "") -> Case:
+    """Draw magnets until one, with its map, can have the effects."""
+    generator = np.random.default_rng([seed, 45])
+    while True:
+        study = drawn_study(drawn_magnet(generator), generator)
+        faults = [drawn_fault(name, study, generator) for name in hidden]
+        with_blocks = bool(generator.integers(2))
+        if None not in faults and (with_blocks or "rings_swapped" not in hidden):
+            return Case(seed, study, tuple(filter(None, faults)), outside, with_blocks)
+
+
+def cases(singles: int, clean: int, pairs: int, outside: int, first: int = 0) -> list[Case]:
+    """Effects that the campaign can hide, alone and in pairs of small ones; none; others.
+
+    They are mixed, so that the first ones are of all kinds; those that take long are the last.
+    ``first`` is the smallest seed, which no other set of cases may have.
+    """
     names = list(CAN_BE_HIDDEN)
-    small = [name for name in names if CAN_BE_HIDDEN[name].group != "gross"]
-    generator = np.random.default_rng(1)
-    drawn = [(name,) for _ in range(singles) for name in names]
-    drawn += [tuple(generator.choice(small, 2, replace=False).tolist()) for _ in range(pairs)]
-    found = [Case(number, hidden) for number, hidden in enumerate(drawn)]
-    found += [Case(len(found) + number) for number in range(clean)]
-    return found + [Case(len(found) + number, outside=list(OUTSIDE)[number % len(OUTSIDE)])
-                    for number in range(outside)]
+    small = [name for name in names if CAN_BE_HIDDEN[name].group != "gross" and name not in SLOW]
+    generator = np.random.default_rng([first, 1])
+    drawn = [((name,), "") for _ in range(singles) for name in names]
+    drawn += [(tuple(generator.choice(small, 2, replace=False).tolist()), "")
+              for _ in range(pairs)]
+    drawn += [((), "") for _ in range(clean)]
+    drawn += [((), list(OUTSIDE)[number % len(OUTSIDE)]) for number in range(outside)]
+    mixed = [drawn[number] for number in generator.permutation(len(drawn))]
+    mixed.sort(key=lambda one: bool(set(one[0]) & set(SLOW)))
+    return [drawn_case(first + number, *each) for number, each in enumerate(mixed)]
 
 
 def coil(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Field (n, 3) in T of a loop of current around the magnet."""
+    """Field (n, 3) of a loop of current around the magnet, in an arbitrary unit."""
     magpylib = import_extra("magpylib")
+    size = float(np.linalg.norm(points, axis=1).max())
     loop = magpylib.current.Circle(
-        current=generator.uniform(50, 200), diameter=generator.uniform(0.4, 0.6),
-        position=(0, 0, generator.uniform(-0.15, 0.15)))
+        current=1.0, diameter=size * generator.uniform(3, 5),
+        position=(0, 0, size * generator.uniform(-1, 1)))
     return np.asarray(loop.getB(points))
 
 
 def ripple(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Error (n, 3) in T of one sensor, periodic along z."""
-    error = np.zeros_like(points)
-    error[:, generator.integers(3)] = generator.uniform(1e-4, 4e-4) * np.sin(
-        2 * np.pi * points[:, 2] / generator.uniform(0.1, 0.25) + generator.uniform(0, 6))
+    """Error (n, 3) of one sensor, periodic along z or, in a plane, along x."""
+    error, along = np.zeros_like(points), points[:, 2 if np.ptp(points[:, 2]) else 0]
+    error[:, generator.integers(2)] = np.sin(
+        2 * np.pi * along / (np.ptp(along) * generator.uniform(0.15, 0.4))
+        + generator.uniform(0, 6))
     return error
 
 
 def quadrupole(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Field (n, 3) in T of a long quadrupole, in T/m of either sign."""
-    strength = generator.choice([-1, 1]) * generator.uniform(2e-3, 1e-2)
-    return np.asarray(strength * points * [1, -1, 0])
+    """Field (n, 3) of a long quadrupole."""
+    return np.asarray(points * [1, -1, 0])
 
 
 OUTSIDE = {"coil": coil, "ripple": ripple, "quadrupole": quadrupole}
+OUTSIDE_SIZES = (5.0, 20.0)
+"""Their rms over all readings, in units of the noise."""
 
 
-def run_case(
-    study: Study, case: Case, session: Session, solver: NominalSolver
-) -> dict[str, Any]:
+def with_outside(case: Case, readings: xr.Dataset) -> xr.Dataset:
+    """Return a map with the cause outside the catalogue of a case."""
+    assert case.study.noise is not None
+    generator = np.random.default_rng(case.seed)
+    added = OUTSIDE[case.outside](points_of(readings), generator)
+    there = np.isfinite(readings["B_T"].values)
+    size = (generator.choice([-1, 1]) * generator.uniform(*OUTSIDE_SIZES)
+            * case.study.noise.regions[0].sigma_T / np.sqrt(np.mean(added[there]**2)))
+    return readings.assign(B_T=readings["B_T"] + size * added)
+
+
+def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, Any]:
     """Simulate, diagnose, and compare with what is sealed."""
-    campaign = simulate_campaign(study, case.seed, hide=[(CAN_BE_HIDDEN[name], None)
-                                                for name in case.hidden])
-    readings = campaign.readings
-    if case.outside:
-        added = OUTSIDE[case.outside](points_of(readings), np.random.default_rng(case.seed))
-        readings = readings.assign(B_T=readings["B_T"] + added)
-    found = diagnose(study, readings, session, campaign.blocks, solver=solver)
-    result = {"case": case.name, "hidden": list(case.hidden), "outside": case.outside,
+    study = case.study
+    campaign = simulate_campaign(study, case.seed, hide=case.faults)
+    readings = with_outside(case, campaign.readings) if case.outside else campaign.readings
+    blocks = campaign.blocks if case.with_blocks else None
+    found = diagnose(study, readings, session, blocks, solver=solver)
+    result = {"case": case.name, "magnet": study.name, "hidden": list(case.hidden),
+              "outside": case.outside, "with_blocks": case.with_blocks,
               "truth": campaign.truth["effects"], **outcome(found),
               "best": own_factors(found, case.hidden)}
+    if found.unknown is None and not found.solver_error:
+        result |= after_update(found, campaign, readings, session, blocks)
     if case.hidden == ("iron_ring",):
         exact = readings.assign(B_T=(readings["B_T"].dims, campaign.without_noise))
         result["fringe_T"] = [fringe(one, readings, exact, replace(
-            session, folder=session.folder / f"fringe-{when}"), campaign.blocks)
+            session, folder=session.folder / f"fringe-{when}"), blocks)
             for when, one in (("before", found.corrected_study), ("after", found.study))]
     if not case.hidden and not case.outside and case.seed % 4 == 0:  # it takes long
         sure = study.with_(prior=study.prior.with_(**NO_BLOCKS))
@@ -168,6 +225,13 @@ def outcome(found: Diagnosis) -> dict[str, Any]:
         ("outliers", found.outliers), ("vibration", found.position_noise)) if there]
     return {
         "named": named + [list(one.selection.effects) for one in found.identified],
+        "identified": [
+            {"effect": one.hypothesis.effect.name, "place": one.place.name,
+             "values": list(map(float, one.reported[0])), "sd": list(map(float, one.reported[1])),
+             "others": [[other.effect, other.place] for other, _ in one.selection.alternatives]}
+            for one in found.identified],
+        "trust": answer(found).trust, "suspected": [list(one.effects) for one in found.suspected],
+        "at_rest": found.is_at_rest,
         "factors": [one.selection.log_bayes_factor for one in found.identified],
         "unknown": None if found.unknown is None else found.unknown.kind,
         "probabilities": found.probabilities,
@@ -175,8 +239,78 @@ def outcome(found: Diagnosis) -> dict[str, Any]:
         "chi2_before": chi2["before"][0], "chi2_after": chi2["after"][0], "rounds": found.rounds}
 
 
+def after_update(
+    found: Diagnosis, campaign: SimulatedCampaign, readings: xr.Dataset, session: Session,
+    blocks: BlockTable | None
+) -> dict[str, Any]:
+    """Return how far the update of the diagnosed study is from the truth, in its error bars.
+
+    ``posterior_chi2`` is the chi-squared per parameter of all blocks; ``axis_z`` has roll, centre
+    and slope of the magnetic axis, as far as they are defined.
+    """
+    session = replace(session, folder=session.folder / "diagnosed")
+    result = infer(build_magnet(found.study), readings, session, blocks)
+    size, count = result.magnet.dimension, len(result.magnet.parameter_names)
+    true = {(body.ring, body.slot): body.magnetization[:size] for body in campaign.magnet.bodies}
+    off = np.concatenate([true[block.ring, block.slot] for block in result.magnet.blocks])
+    off -= result.posterior.mean[:count]
+    variances, axes = np.linalg.eigh(result.posterior.covariance[:count, :count])
+    free = variances > EXACT * variances.max()
+    chi2 = float(np.sum((axes.T @ off)[free]**2 / variances[free]) / free.sum())
+    return {"posterior_chi2": chi2, "axis_z": axis_errors(found, campaign, result, session)}
+
+
+def axis_errors(
+    found: Diagnosis, campaign: SimulatedCampaign, result: InferenceResult, session: Session
+) -> list[float]:
+    """Return roll, centre and slope minus their true values, in standard deviations.
+
+    Roll is that from the nominal field, which must be that of the study.
+    """
+    axis = magnetic_axis(result.magnet, session, result.posterior)
+    if axis is None:
+        return []
+    roll, *true = true_axis(campaign, result.magnet)
+    pairs = [(axis.roll_rad, roll, axis.roll_sd_rad)] if (
+        found.study.array, found.study.external) == (
+            campaign.study.array, campaign.study.external) else []
+    if axis.order > 1 and axis.centre_m and axis.centre_sd_m:
+        places = [*axis.centre_m, *(axis.slope_rad or ())]
+        bars = [*axis.centre_sd_m, *(axis.slope_sd_rad or ())]
+        pairs += list(zip(places, true, bars, strict=True))
+    return [float((value - right) / sd) for value, right, sd in pairs]
+
+
+def true_axis(campaign: SimulatedCampaign, magnet: Magnet) -> list[float]:
+    """Return roll in rad, centre x and y in m and slopes of the true field's magnetic axis.
+
+    Circles and definitions are those of `halbach_fe.response.magnetic_axis`.
+    """
+    order, flat = magnet.array.multipole_order, magnet.dimension == 2
+    heights = np.zeros(1) if flat else np.linspace(-1, 1, HEIGHTS) * (
+        LENGTH * magnet.array_half_length)
+    count, radius = 2 * (order + 2), RADIUS * magnet.bore_radius
+    turns = 2 * np.pi * np.arange(count) / count
+    points = np.array([[radius * np.cos(turn), radius * np.sin(turn), z]
+                       for z in heights for turn in turns])
+
+    def multipole(number: int, source: TrueMagnet) -> np.ndarray:
+        """Complex coefficient at each height."""
+        field = true_field(source, points).reshape(len(heights), count, 3)
+        return (field[..., 1] + 1j * field[..., 0]) @ np.exp(-1j * (number - 1) * turns) / count
+
+    main = multipole(order, campaign.magnet)
+    roll = -float(np.angle(np.conj(multipole(order, magnet_of(campaign.study))) @ main)) / order
+    if order == 1:
+        return [roll]
+    places = -radius / (order - 1) * multipole(order - 1, campaign.magnet) / main
+    line = np.polynomial.polynomial.polyfit(heights, places, 0 if flat else 1)
+    return [roll, *(float(part) for value in line for part in (value.real, value.imag))]
+
+
 def fringe(
-    study: Study, readings: xr.Dataset, exact: xr.Dataset, session: Session, blocks: BlockTable
+    study: Study, readings: xr.Dataset, exact: xr.Dataset, session: Session,
+    blocks: BlockTable | None
 ) -> float:
     """Rms error in T of the fringe field, beyond the magnet's ends, as it is foretold by a model
     that was updated with the readings of the bore alone.
@@ -206,7 +340,13 @@ def own_factors(found: Diagnosis, hidden: Sequence[str]) -> dict[str, float]:
 def known_as(name: str) -> tuple[str, ...]:
     """Names in the catalogue of what the campaign hides: that, or one of each sensor."""
     return tuple(effect.name for effect in catalogue()
-                 if effect.name == name or effect.name[:-2] == name) or (name,)
+                 if effect.name in (name, *SAME.get(name, ())) or effect.name[:-2] == name
+                 ) or (name,)
+
+
+SAME = {"block_put_in_wrongly": ("block_flipped",), "rings_turned": ("ring_twisted",)}
+"""Other names of what is hidden: half a turn may reverse the magnetization, and a ring that is
+turned by a slot is rotated."""
 
 
 def detectable(result: dict[str, Any], name: str) -> bool:
@@ -319,7 +459,7 @@ a scheduler, where this file comes with every case, for one case only.)"""
 
 
 def run_one(
-    study: Study, case: Case, getdp: str | None, time_limit_s: float, processes: int,
+    case: Case, getdp: str | None, time_limit_s: float, processes: int,
     cache: Cache | None,
 ) -> dict[str, Any]:
     """Run a case, on any machine; return what came of it, or why nothing did as ``failure``."""
@@ -329,23 +469,25 @@ def run_one(
             session = Session(find_getdp(getdp), Path(folder.name), time_limit_s=time_limit_s,
                                 cache=cache, processes=processes)
             _known[threading.get_ident()] = folder, session, NominalSolver(session)
-        return run_case(study, case, *_known[threading.get_ident()][1:])
+        return run_case(case, *_known[threading.get_ident()][1:])
     except HalbachError as error:
         return {"failure": str(error)}
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run all cases and print the rates."""
-    study = read_study(arguments.study)
-    chosen = cases(arguments.singles, arguments.clean, arguments.pairs, arguments.outside)
+    chosen = cases(arguments.singles, arguments.clean, arguments.pairs, arguments.outside,
+                   arguments.first)
     if arguments.only:
         chosen = [one for one in chosen if one.seed in arguments.only]
+    part, parts = arguments.part
+    chosen = chosen[part - 1::parts]
     paths = {case: arguments.output / "cases" / f"{case.name}.json" for case in chosen}
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the cases share the cores
     cache = None if arguments.scheduler else common.cache(arguments)  # a folder of this machine
     with common.workers(arguments) as pool:
         waiting = {pool.submit(
-            run_one, study, case, arguments.getdp, arguments.time_limit, arguments.mpi,
+            run_one, case, arguments.getdp, arguments.time_limit, arguments.mpi,
             cache): case
                    for case, path in paths.items() if not path.exists()}
         for number, future in enumerate(as_completed(waiting), start=1):
@@ -356,7 +498,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{case.name} failed: {found['failure']}" if "failure" in found
                 else sentence(found)))
     results = [json.loads(path.read_text()) for path in paths.values() if path.exists()]
-    rates = report(study, results, arguments.output)
+    rates = report(read_study(arguments.study), results, arguments.output)
     missed = [f"{len(paths) - len(results)} cases failed"] * (len(results) < len(paths)) + [
         f"{name} is {rates[name]:.3g}" for name, (low, high) in WANTED.items()
         if not (np.isnan(rates[name]) or low <= rates[name] <= high)]
@@ -400,10 +542,14 @@ def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[st
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    for name, count in (("singles", 2), ("clean", 20), ("pairs", 20), ("outside", 12)):
+    for name, count in (("singles", 1), ("clean", 10), ("pairs", 20), ("outside", 9)):
         parser.add_argument(f"--{name}", type=int, default=count, metavar="N",
                             help="cases (of each effect, for singles; default: %(default)s)")
-    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="numbers of cases")
+    parser.add_argument("--first", type=int, default=0, metavar="N",
+                        help="seed of the first case, for others than the usual ones")
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="seeds of cases")
+    parser.add_argument("--part", type=int, nargs=2, default=(1, 1), metavar=("K", "N"),
+                        help="run every N-th case, from the K-th: processes share the cases")
 
 
 if __name__ == "__main__":
