@@ -15,7 +15,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.hidden_effects import EFFECTS, RequestedEffect
+from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.hidden_effects.effect_types import Site, site_of
 from halbach_fe.synthetic.shapes import CylinderBody, PrismBody
 from halbach_fe.synthetic.true_magnet import Body
@@ -215,7 +215,9 @@ USUAL: Mapping[str, Callable[[Site, Generator], tuple[float, ...]]] = {
 `simulate-measurement` draws them."""
 
 
-def drawn_fault(name: str, study: Study, generator: Generator) -> RequestedEffect | None:
+def drawn_fault(
+    name: str, study: Study, generator: Generator
+) -> tuple[float, ...] | None:
     """Draw the values of an effect; None if this magnet or map cannot have it."""
     magnet = magnet_of(study)
     site, effect = site_of(study, magnet), EFFECTS[name]
@@ -226,8 +228,8 @@ def drawn_fault(name: str, study: Study, generator: Generator) -> RequestedEffec
         if not there:
             return None
         body, turn = there[generator.integers(len(there))]
-        return effect, (float(body.ring), float(body.slot), *map(float, turn))
-    return effect, USUAL.get(name, effect.draw)(site, generator)
+        return float(body.ring), float(body.slot), *map(float, turn)
+    return USUAL.get(name, effect.draw)(site, generator)
 
 
 def _turns(body: Body) -> list[Floats]:

@@ -2,10 +2,9 @@
 
 Each case draws a magnet, a map and sizes of the effects (`halbach_fe.synthetic.drawn_studies`).
 Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted run goes on. Cases are
-independent: --jobs of them run at a time, or several processes share them::
+independent, and --jobs of them run at a time::
 
     python studies/diagnosis/run.py -o results/diagnosis
-    python studies/diagnosis/run.py -o results/diagnosis --part 1 2
 """
 
 from __future__ import annotations
@@ -32,6 +31,7 @@ from halbach_fe.core.errors import CheckFailedError, HalbachError
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.temperature import TYPICAL_COEFFICIENT_PER_K
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import NominalSolver
@@ -57,7 +57,6 @@ from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_studies import drawn_fault, drawn_magnet, drawn_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
-from halbach_fe.synthetic.hidden_effects import RequestedEffect
 from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
@@ -75,6 +74,9 @@ NO_BLOCKS = {"magnitude_sd": 1e-5, "direction_sd_deg": 1e-3, "common_mode_sd": 1
 
 FAR_M = 100.0
 
+WITHIN_95 = 1.96
+"""Standard deviations within which 95 % of normal numbers lie."""
+
 EXACT = 1e-18
 """Variance, relative to the largest one, below which a direction of the magnetizations is exactly
 known, as of missing blocks. (Standard deviations of others differ by less than a thousand.)"""
@@ -86,7 +88,10 @@ WANTED = {
     "naming_rate_single": (0.95, 1.0), "naming_rate_pairs": (0.9, 1.0),
     "false_alarm_rate": (0.0, 0.02), "unknown_rate": (0.9, 1.0),
     "heldout_recovered_rate": (0.95, 1.0), "iron_fringe_reduction": (10.0, np.inf),
-    "control_naming_rate_shuffled_labels": (0.0, 0.2),
+    "false_names_per_case": (0.0, 0.05), "yes_beside_wrong": (0.0, 0.01),
+    "clean_named_rate": (0.0, 0.0), "amplitude_z_rms": (0.9, 1.1),
+    "posterior_chi2_median": (0.9, 1.2), "posterior_chi2_max": (0.0, 2.0),
+    "axis_coverage": (0.9, 1.0), "control_naming_rate_shuffled_labels": (0.0, 0.2),
     "control_false_alarm_rate_without_blocks": (0.5, 1.0)}
 """Rates; of the controls, which must fail, too."""
 
@@ -104,14 +109,14 @@ class Case:
 
     seed: int
     study: Study
-    faults: tuple[RequestedEffect, ...] = ()
+    faults: tuple[tuple[str, tuple[float, ...]], ...] = ()
     outside: str = ""
     with_blocks: bool = False
 
     @property
     def hidden(self) -> tuple[str, ...]:
         """Names of the effects."""
-        return tuple(effect.name for effect, _ in self.faults)
+        return tuple(name for name, _ in self.faults)
 
     @property
     def name(self) -> str:
@@ -125,10 +130,11 @@ def drawn_case(seed: int, hidden: Sequence[str], outside: str = "") -> Case:
     generator = np.random.default_rng([seed, 45])
     while True:
         study = drawn_study(drawn_magnet(generator), generator)
-        faults = [drawn_fault(name, study, generator) for name in hidden]
+        faults = [(name, values) for name in hidden
+                  if (values := drawn_fault(name, study, generator)) is not None]
         with_blocks = bool(generator.integers(2))
-        if None not in faults and (with_blocks or "rings_swapped" not in hidden):
-            return Case(seed, study, tuple(filter(None, faults)), outside, with_blocks)
+        if len(faults) == len(hidden) and (with_blocks or "rings_swapped" not in hidden):
+            return Case(seed, study, tuple(faults), outside, with_blocks)
 
 
 def cases(singles: int, clean: int, pairs: int, outside: int, first: int = 0) -> list[Case]:
@@ -193,13 +199,15 @@ def with_outside(case: Case, readings: xr.Dataset) -> xr.Dataset:
 def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, Any]:
     """Simulate, diagnose, and compare with what is sealed."""
     study = case.study
-    campaign = simulate_campaign(study, case.seed, hide=case.faults)
+    campaign = simulate_campaign(study, case.seed, hide=[
+        (CAN_BE_HIDDEN[name], values) for name, values in case.faults])
     readings = with_outside(case, campaign.readings) if case.outside else campaign.readings
     blocks = campaign.blocks if case.with_blocks else None
     found = diagnose(study, readings, session, blocks, solver=solver)
     result = {"case": case.name, "magnet": study.name, "hidden": list(case.hidden),
               "outside": case.outside, "with_blocks": case.with_blocks,
-              "truth": campaign.truth["effects"], **outcome(found),
+              "labels": labels_of(study, case.faults), "truth": campaign.truth["effects"],
+              **outcome(found),
               "best": own_factors(found, case.hidden)}
     if found.unknown is None and not found.solver_error:
         result |= after_update(found, campaign, readings, session, blocks)
@@ -362,13 +370,109 @@ def detectable(result: dict[str, Any], name: str) -> bool:
 
 def named(result: dict[str, Any], name: str) -> bool:
     """Whether an effect is among those that were named, or named as what they could be instead."""
-    return any(set(known_as(name)) & set(names) for names in result["named"])
+    return any(_means(result, name, number) for number in range(len(result["named"])))
+
+
+def first_named(result: dict[str, Any], name: str) -> bool:
+    """Whether an effect is named itself, and not only as what another could be instead."""
+    return any(names[0] in known_as(name) and _means(result, name, number)
+               for number, names in enumerate(result["named"]))
 
 
 def wrong(result: dict[str, Any]) -> int:
-    """How many were named that are not hidden."""
-    hidden = {one for name in result["hidden"] for one in known_as(name)}
-    return sum(not hidden & set(names) for names in result["named"])
+    """How many were named that are not hidden, or of another block or ring."""
+    return sum(not any(_means(result, name, number) for name in result["hidden"])
+               for number in range(len(result["named"])))
+
+
+def _means(result: dict[str, Any], name: str, number: int) -> bool:
+    """Whether one of what was named, by its number, can be a hidden effect, at its place.
+
+    Gross errors, which come first, have none.
+    """
+    if not set(known_as(name)) & set(result["named"][number]):
+        return False
+    identified = result.get("identified", [])
+    number -= len(result["named"]) - len(identified)
+    labels = result.get("labels", {}).get(name)
+    if number < 0 or not labels:
+        return True
+    one = identified[number]
+    return any(all(label in place for label in labels) for effect, place in (
+        (one["effect"], one["place"]), *one["others"]) if effect in known_as(name))
+
+
+def yes_beside_wrong(result: dict[str, Any]) -> bool:
+    """Whether a diagnosis says yes and is wrong."""
+    return bool(wrong(result)) and result["trust"].startswith("Yes")
+
+
+def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
+              ) -> dict[str, list[str]]:
+    """Return the blocks, or the ring, of hidden effects, as places of the catalogue name them."""
+    names = {(block.ring, block.slot): block.name for block in build_magnet(study).blocks}
+    found = {}
+    for effect, values in faults:
+        given = dict(zip((one.name for one in CAN_BE_HIDDEN[effect].parameters), values,
+                         strict=True))
+        places = [(given.get(f"{other}ring"), given.get(f"{other}slot"))
+                  for other in ("", "other_")]
+        found[effect] = [names[place] for place in places if place in names]
+        if not found[effect] and effect in RINGS:
+            found[effect] = [f"r{given['ring']:02.0f}"]
+    return found
+
+
+RINGS = ("ring_twisted", "ring_shifted", "ring_shifted_along")
+"""Effects whose place in the catalogue is a ring."""
+
+LIKE_HIDDEN = (
+    "gain", "offset", "misalignment", "mapper", "z_scale", "radius_scale", "arm_sag",
+    "sensor_position", "radial_gap", "azimuthal_gap", "inner_radius", "background", "lag",
+    "recoil_permeability", "planar_hall", "quadratic", "cubic", "block_displaced", "block_turned",
+    "block_demagnetized", "ring_twisted", "ring_shifted")
+"""Beginnings of names of effects whose amplitudes are those that are hidden, but for the place."""
+
+
+def true_amplitudes(effect: str, hidden: dict[str, float]) -> list[float]:
+    """Return the true amplitudes of an effect of the catalogue, in its order, from what is hidden.
+
+    Those that are defined in another way are left out.
+    """
+    own = [value for name, value in hidden.items() if name not in ("ring", "slot")]
+    if effect.startswith(LIKE_HIDDEN):
+        return own
+    if effect == "drift":
+        return 3 * own
+    if effect == "eccentric_circle":
+        return [own[0] * np.cos(own[1]), own[0] * np.sin(own[1])]
+    if effect == "temperature":
+        return [own[0] * own[1] / TYPICAL_COEFFICIENT_PER_K]
+    if effect == "slow_readings":
+        return own[:1]
+    if effect == "ring_gap":
+        return [hidden["distance"]]
+    if effect == "magnetization_gradient":
+        return [2 * hidden["fraction"]]
+    return []
+
+
+def amplitude_errors(result: dict[str, Any]) -> list[float]:
+    """Return amplitudes minus their true values in standard deviations, of right names.
+
+    An amplitude that is exactly 0, as another part of an effect was likelier, has none.
+    """
+    found = []
+    for one in result.get("identified", []):
+        for hidden in result["truth"]:
+            labels = result["labels"].get(hidden["name"]) or []
+            if one["effect"] in known_as(hidden["name"]) and all(
+                    label in one["place"] for label in labels):
+                values = {each["name"]: each["value"] for each in hidden["parameters"]}
+                found += [(value - true) / sd for value, true, sd in zip(
+                    one["values"], true_amplitudes(one["effect"], values), one["sd"],
+                    strict=False) if sd > 0]
+    return found
 
 
 def rate(hits: Iterable[bool]) -> float:
@@ -390,7 +494,22 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
     true = np.array([one["hidden"][0] for one in single])
     shuffled = [(one, label) for one, label, own in zip(single, np.roll(true, 1), true, strict=True)
                 if label != own]
+    updates = [one["posterior_chi2"] for one in results if "posterior_chi2" in one]
+    amplitudes = [error for one in results for error in amplitude_errors(one)]
+    axes = [error for one in results for error in one.get("axis_z", [])]
     return {
+        "cases": len(results), "magnets": len({one["magnet"] for one in results}),
+        "first_named_single": rate(first_named(one, one["hidden"][0]) for one in single),
+        "false_names_per_case": float(np.mean(
+            [wrong(one) for one in results if not one["outside"]] or [0])),
+        "inside_cases": sum(not one["outside"] for one in results),
+        "yes_beside_wrong": rate(map(yes_beside_wrong, results)),
+        "clean_named_rate": rate(bool(one["named"]) for one in clean),
+        "amplitude_z_rms": float(np.sqrt(np.mean(np.square(amplitudes or [np.nan])))),
+        "amplitudes": len(amplitudes),
+        "posterior_chi2_median": float(np.median(updates or [np.nan])),
+        "posterior_chi2_max": float(max(updates, default=np.nan)), "updates": len(updates),
+        "axis_coverage": rate(abs(error) < WITHIN_95 for error in axes), "axis_numbers": len(axes),
         "naming_rate_single": rate(named(one, one["hidden"][0]) for one in single),
         "single_cases": len(single),
         "naming_rate_pairs": rate(all(named(one, name) for name in one["hidden"])
@@ -480,24 +599,21 @@ def run(arguments: argparse.Namespace) -> int:
                    arguments.first)
     if arguments.only:
         chosen = [one for one in chosen if one.seed in arguments.only]
-    part, parts = arguments.part
-    chosen = chosen[part - 1::parts]
-    paths = {case: arguments.output / "cases" / f"{case.name}.json" for case in chosen}
+    paths = [arguments.output / "cases" / f"{case.name}.json" for case in chosen]
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the cases share the cores
     cache = None if arguments.scheduler else common.cache(arguments)  # a folder of this machine
     with common.workers(arguments) as pool:
         waiting = {pool.submit(
-            run_one, case, arguments.getdp, arguments.time_limit, arguments.mpi,
-            cache): case
-                   for case, path in paths.items() if not path.exists()}
+            run_one, case, arguments.getdp, arguments.time_limit, arguments.mpi, cache): path
+                   for case, path in zip(chosen, paths, strict=True) if not path.exists()}
         for number, future in enumerate(as_completed(waiting), start=1):
-            case, found = waiting[future], future.result()
+            path, found = waiting[future], future.result()
             if "failure" not in found:
-                write_text(paths[case], json.dumps(found, indent=1) + "\n")
+                write_text(path, json.dumps(found, indent=1) + "\n")
             common.say(f"{number}/{len(waiting)} " + (
-                f"{case.name} failed: {found['failure']}" if "failure" in found
+                f"{path.stem} failed: {found['failure']}" if "failure" in found
                 else sentence(found)))
-    results = [json.loads(path.read_text()) for path in paths.values() if path.exists()]
+    results = [json.loads(path.read_text()) for path in paths if path.exists()]
     rates = report(read_study(arguments.study), results, arguments.output)
     missed = [f"{len(paths) - len(results)} cases failed"] * (len(results) < len(paths)) + [
         f"{name} is {rates[name]:.3g}" for name, (low, high) in WANTED.items()
@@ -548,8 +664,6 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first", type=int, default=0, metavar="N",
                         help="seed of the first case, for others than the usual ones")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="seeds of cases")
-    parser.add_argument("--part", type=int, nargs=2, default=(1, 1), metavar=("K", "N"),
-                        help="run every N-th case, from the K-th: processes share the cases")
 
 
 if __name__ == "__main__":
