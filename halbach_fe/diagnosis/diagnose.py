@@ -45,7 +45,7 @@ from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
-from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_errors import beside_amplitudes, blocks_of, correct_map_errors
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
@@ -223,7 +223,8 @@ def _diagnose(
 
     def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
         nonlocal solved
-        update = infer(build_magnet(changed(identified)), data, _subsession(session, name), blocks,
+        known = beside_amplitudes(blocks, corrected) if identified else blocks
+        update = infer(build_magnet(changed(identified)), data, _subsession(session, name), known,
                        validation_map=validation_map, similar=solved)
         solved = solved if update.response.of_similar else update.magnet
         return update
