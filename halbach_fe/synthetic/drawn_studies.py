@@ -215,13 +215,18 @@ USUAL: Mapping[str, Callable[[Site, Generator], tuple[float, ...]]] = {
 `simulate-measurement` draws them."""
 
 
+OF_CIRCLES = ("eccentric_circle", "radius_scale", "wrong_radius")
+"""Effects of an arm that turns about the axis."""
+
+
 def drawn_fault(
     name: str, study: Study, generator: Generator
 ) -> tuple[float, ...] | None:
     """Draw the values of an effect; None if this magnet or map cannot have it."""
     magnet = magnet_of(study)
     site, effect = site_of(study, magnet), EFFECTS[name]
-    if not all(site.has(need) for need in effect.needs):
+    circles = study.observation.positions.kind == "circles"
+    if not all(site.has(need) for need in effect.needs) or (name in OF_CIRCLES and not circles):
         return None
     if name == "block_put_in_wrongly":
         there = [(body, turn) for body in magnet.bodies for turn in _turns(body)]
