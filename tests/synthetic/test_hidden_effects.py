@@ -72,7 +72,8 @@ NAMES = [
     "misalignment_zy", "planar_hall", "quadratic_nonlinearity", "cubic_nonlinearity",
     "sensor_position_x", "sensor_position_y", "sensor_position_z", "mapper_translation",
     "mapper_roll", "mapper_tilt_x", "mapper_tilt_y", "z_scale", "radius_scale", "arm_sag",
-    "eccentric_circle", "drift", "lag", "slow_readings", "vibration", "outliers", "wrong_radius", "swapped_axes",
+    "eccentric_circle", "drift", "lag", "slow_readings", "vibration", "outliers",
+    "wrong_radius", "swapped_axes",
     "sign_flipped_axis", "millimetres", "millitesla", "reversed_z", "rotated_by_one_block",
     "wrong_ring_count"]
 
