@@ -162,8 +162,11 @@ def drawn_study(name: str, generator: Generator) -> Study:
                                  "relative_permeability": 1000.0}
         half = 0.0
         document["mesh"] = {"block_size_m": (site.outer - bore) / 6}
-    document["observation"] |= {"positions": drawn_positions(
-        "circles" if flat else str(generator.choice(MAPS)), bore, half, generator)}
+    positions = drawn_positions(
+        "circles" if flat else str(generator.choice(MAPS)), bore, half, generator)
+    document["observation"] |= {"positions": positions}
+    if flat:  # no z to hold out
+        document["inference"] = {"held_out": {"radii_m": positions["radius_m"][1:2]}}
     if not flat and generator.random() < 0.1:
         document["observation"]["components"] = [str(generator.choice(["x", "y"]))]
     field = 0.06 if "free_blocks" in array else 0.5
