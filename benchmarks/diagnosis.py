@@ -14,7 +14,6 @@ COUNTED = {
     "naming_rate_pairs": ("ratio", "pair_cases", "pairs that can be seen"),
     "others_named_per_case": ("names per case", "effects_cases", "cases with effects"),
     "yes_beside_wrong": ("ratio", "cases", "cases"),
-    "false_alarm_rate": ("ratio", "clean_cases", "clean cases"),
     "clean_named_rate": ("ratio", "clean_cases", "clean cases"),
     "amplitude_z_rms": ("sd", "amplitudes", "amplitudes of right names; 1 if the bars are right"),
     "posterior_chi2": ("ratio", "updates", "updates, median; 1 if their bars are right"),
