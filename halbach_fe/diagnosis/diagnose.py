@@ -47,7 +47,7 @@ from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
-from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_errors import beside_amplitudes, blocks_of, correct_map_errors
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
@@ -199,8 +199,12 @@ def _diagnose(
     study: Study, data: Data, session: Session, blocks: BlockTable | None,
     effects: Sequence[Effect], validation_map: xr.Dataset | None, say: Say,
     solver: NominalSolver | None, floor_T: Floor | None, time_limit_s: float | None,
+    left: tuple[Outlier, ...] | None = None,
 ) -> Diagnosis:
-    """See `diagnose`; the session has a cache."""
+    """See `diagnose`; the session has a cache.
+
+    The outliers are those that an earlier run has ``left``, if there was one.
+    """
     pace = Pace(say, session.progress, time_limit_s)
     session = replace(session, progress=pace.advance)
     pace.begin("looking for gross errors of the map")
@@ -230,7 +234,8 @@ def _diagnose(
 
     def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
         nonlocal solved
-        update = infer(build_magnet(changed(identified)), data, _subsession(session, name), blocks,
+        known = beside_amplitudes(blocks, corrected) if identified else blocks
+        update = infer(build_magnet(changed(identified)), data, _subsession(session, name), known,
                        validation_map=validation_map, similar=solved)
         solved = solved if update.response.of_similar else update.magnet
         return update
@@ -248,7 +253,8 @@ def _diagnose(
         pace.begin(f"round {number + 1}, solving")
         update = updated(identified, f"round-{number + 1}")
         if number == 0:
-            outliers = outliers_of(update, campaign)
+            with_all = corrected
+            outliers = outliers_of(update, campaign) if left is None else left
         if number == 0 and outliers:
             say(f"outliers: {len(outliers)} readings are excluded")
             corrected = excluding(corrected, outliers)
@@ -312,6 +318,16 @@ def _diagnose(
             best.number, best.update, best.search, best.judgement, best.identified)
         if not identified:  # what explains the map is none of the effects
             judgement = replace(judgement, best=judgement.without)
+    if outliers and identified and left is None and not pace.is_over:
+        # near a block that is wrong, readings had seemed to disagree with their neighbours
+        left = outliers_of(infer(
+            build_magnet(with_position_noise(apply_effects(with_all, identified), position_noise)),
+            data, _subsession(session, "all-readings"), beside_amplitudes(blocks, corrected),
+            validation_map=validation_map), campaign)
+        if {_place_of(one) for one in left} != {_place_of(one) for one in outliers}:
+            say(f"outliers: with these effects in the model they are {len(left)} readings; again")
+            return _diagnose(study, data, session, blocks, effects, validation_map, say, solver,
+                             floor_T, time_limit_s, left)
     unknown: UnknownCause | None = None
     suspected: tuple[Suspicion, ...] = ()
     if not solver_error:
@@ -338,6 +354,11 @@ def _diagnose(
         solver_error=solver_error, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)
+
+
+def _place_of(outlier: Outlier) -> tuple[str | None, int, str]:
+    """Return where an outlier is in the maps."""
+    return outlier.map, outlier.row, outlier.component
 
 
 def _held_out_misfit(update: InferenceResult, search: Search, first: InferenceResult) -> float:

@@ -71,6 +71,17 @@ def blocks_of(blocks: BlockTable | None, study: Study, corrected: Study) -> Bloc
     return replace(blocks, ring=unplaced, slot=unplaced)
 
 
+def beside_amplitudes(blocks: BlockTable | None, study: Study) -> BlockTable | None:
+    """Return the measured blocks for a study with effects, whose sizes may be off for a while.
+
+    The first amplitudes can be far from the last ones. Volumes, with which sizes were compared
+    before, are left out, unless the length of a cross-section comes from them.
+    """
+    if blocks is None or (study.dimension == 2 and not study.array.ring_length_m):
+        return blocks
+    return replace(blocks, volume=np.full_like(blocks.volume, np.nan))
+
+
 def _errors_of(
     study: Study, data: Data, name: str | None, blocks: BlockTable | None
 ) -> tuple[GrossError, ...]:

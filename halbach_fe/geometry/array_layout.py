@@ -108,8 +108,7 @@ def _with_exceptions(
     block = replace(
         block, easy_axis=vector(easy_axis), remanence=remanence * factor,
         recoil_permeability=permeability, recoil_permeability_across=across, **changed)
-    if (block.gradient or block.corner_loss) and (
-            len(block.outline) != 4 or block.outline[0].arc):
+    if (block.gradient or block.corner_loss) and not block.has_four_edges:
         raise StudyError(
             f"Input `array.exceptions` of study must give magnetization_gradient and "
             f"inner_corner_loss for blocks with four edges only, of which two are straight; "

@@ -85,6 +85,11 @@ class MagnetBlock:
     facing_deg: float = 0.0
 
     @property
+    def has_four_edges(self) -> bool:
+        """Whether its outline has four edges, of which those at its sides are straight."""
+        return len(self.outline) == 4 and not self.outline[0].arc
+
+    @property
     def in_place(self) -> bool:
         """Whether the block is neither displaced nor rotated."""
         return not (any(self.displacement_m) or any(self.rotation_rad))

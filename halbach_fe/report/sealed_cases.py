@@ -42,6 +42,8 @@ RATES = {
     "clean campaigns with a false name": ("false_alarm_rate", "clean_cases"),
     "causes outside the catalogue noticed": ("unknown_rate", "outside_cases"),
     "held-out readings explained afterwards": ("heldout_recovered_rate", "recovered_of"),
+    "wrong names beside a yes": ("yes_beside_wrong", "cases"),
+    "rolls, centres and slopes within 95 % error bars": ("axis_coverage", "axis_numbers"),
     "control: named with shuffled labels": ("control_naming_rate_shuffled_labels", ""),
     "control: false alarms without tolerances of the blocks":
         ("control_false_alarm_rate_without_blocks", "")}

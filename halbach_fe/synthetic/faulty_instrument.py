@@ -37,6 +37,9 @@ class FaultyInstrument:
         the square of the distance from its near end.
     vibration : float
         Standard deviation of the probe's position along each axis.
+    lag : float
+        Distance by which the probe is behind on its way along a line. Where a line begins the stage
+        has stopped.
     sensors : tuple of three tuples
         Displacements of the sensors of B_x, B_y and B_z, along the mapper's axes.
     axes : tuple of three tuples
@@ -49,6 +52,9 @@ class FaultyInstrument:
         A sensor shows (1 + gain) times its reading, plus the offset.
     drift : float
         Growth of all readings from the first to the last point of the map, linear in time.
+    memory : tuple
+        Fraction of every reading that comes from those before, and number of rows within which
+        these are forgotten; 0 if it is the last one alone.
     outliers : tuple
         Fraction of the readings that are outliers, and their typical deviation.
     reversed_z : bool
@@ -67,6 +73,7 @@ class FaultyInstrument:
     run_out: tuple[float, float] = (0.0, 0.0)
     sag: Vector = ZERO_VECTOR
     vibration: float = 0.0
+    lag: float = 0.0
     sensors: tuple[Vector, Vector, Vector] = (ZERO_VECTOR, ZERO_VECTOR, ZERO_VECTOR)
     axes: tuple[Vector, Vector, Vector] = IDEAL_AXES
     planar_hall: float = 0.0
@@ -75,6 +82,7 @@ class FaultyInstrument:
     gain: Vector = ZERO_VECTOR
     offset: Vector = ZERO_VECTOR
     drift: float = 0.0
+    memory: tuple[float, float] = (0.0, 0.0)
     outliers: tuple[float, float] = (0.0, 0.0)
     reversed_z: bool = False
     order: tuple[int, int, int] = (0, 1, 2)
@@ -98,7 +106,7 @@ class FaultyInstrument:
         probe = np.column_stack([
             x + outward * np.cos(angle),
             y + outward * np.sin(angle) - depth * along**2,
-            (1 + self.z_scale) * height])
+            (1 + self.z_scale) * height]) - self.lag * _way(points)
         turn = Rotation.from_rotvec(self.rotation)
         shaken = self.vibration * generator.standard_normal(points.shape)
         return np.array([turn.apply(probe + sensor) + self.translation + shaken
@@ -122,7 +130,7 @@ class FaultyInstrument:
             shown += self.quadratic * shown**2 + self.cubic * shown**3
             columns.append((1 + self.gain[sensor]) * shown + self.offset[sensor])
         fraction, size = self.outliers
-        shown = np.column_stack(columns)
+        shown = _remembering(np.column_stack(columns), time, *self.memory)
         is_outlier = generator.random(shown.shape) < fraction
         jump = size * generator.uniform(0.5, 1.5, shown.shape) * generator.choice(
             [-1.0, 1.0], shown.shape)
@@ -135,3 +143,33 @@ class FaultyInstrument:
         """
         return (points * self.length_unit,
                 readings[:, self.order] * self.signs * self.field_unit)
+
+
+def _way(points: Floats) -> Floats:
+    """Return the direction (n, 3) in which a stage came to each point; 0 where a line begins.
+
+    Points go on in a line if the next step has nearly the same direction as the last one.
+    """
+    step = np.diff(points, axis=0)
+    way = step / np.maximum(np.linalg.norm(step, axis=1), np.finfo(float).tiny)[:, None]
+    goes_on = np.sum(way[1:] * way[:-1], axis=1) > np.cos(np.pi / 3)
+    in_line = np.append(False, goes_on) | np.append(goes_on, False)
+    return np.vstack([np.zeros((1, 3)), way * in_line[:, None]])
+
+
+def _remembering(readings: Floats, time: Floats, fraction: float, rows: float) -> Floats:
+    """Return readings (n, 3) as a slow instrument shows them, which starts at the first reading.
+
+    What it remembers approaches the readings by the part ``1 - exp(-1 / rows)`` from row to row. A
+    second map, at times beyond 1, starts anew.
+    """
+    if not fraction:
+        return readings
+    kept = np.exp(-1 / rows) if rows else 0.0
+    shown, memory = readings.copy(), readings[0]
+    for row in range(1, len(readings)):
+        memory = kept * memory + (1 - kept) * readings[row - 1]
+        if time[row] > 1 >= time[row - 1]:
+            memory = readings[row]
+        shown[row] += fraction * (memory - readings[row])
+    return shown

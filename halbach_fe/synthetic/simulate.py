@@ -93,6 +93,8 @@ class SimulatedCampaign(ShownInNotebook):
     without_noise : ndarray, shape (n, 3)
         Readings of the map before noise was added, in the field unit of the record; (n, 1) of a map
         of |B|.
+    magnet : TrueMagnet
+        The magnet that was measured, with what is hidden in it.
 
     Examples
     --------
@@ -108,6 +110,7 @@ class SimulatedCampaign(ShownInNotebook):
     blocks: BlockTable
     truth: dict[str, object]
     without_noise: Floats
+    magnet: TrueMagnet
 
 
 def simulate_campaign(
@@ -200,7 +203,8 @@ def simulate_campaign(
     maps = [_map(study, recorded[part], readings[part], unit * sigma[part], seal)
             .assign(time_s=("point", SECONDS * np.arange(len(recorded))[part]))
             for part in (slice(len(points)), slice(len(points), None))]
-    return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact)
+    return SimulatedCampaign(study, maps[0], maps[1] if len(others) else None, table, truth, exact,
+                             magnet)
 
 
 def simulate_delivery(study: Study, seed: int, coil_sd: float = COIL_SD) -> BlockTable:

@@ -7,23 +7,29 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
+from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.assembly import BlocksSwappedEffect
 from halbach_fe.diagnosis.effects.base import InstrumentEffect, Parameter, Place
 from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.map_errors import beside_amplitudes
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
+from halbach_fe.diagnosis.outliers import Outlier
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import possible
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.simulate import simulate_delivery
 from tests.diagnosis.campaign import (
     CIRCLES,
     DOCUMENT,
@@ -44,6 +50,40 @@ class Restless(BlocksSwappedEffect):
     def shortlist(self, study, mean, information, score):
         self.looked += 7
         return super().shortlist(study, mean, information, score)[:self.looked]
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_outliers_are_judged_again_with_the_effects(still, session, generator, monkeypatch):
+    """Without them a reading may seem to be one; if it still is, it is excluded."""
+    study = with_array(rings=1)
+    shown = uniform(measured(study, generator, CIRCLES[::5]))
+    said, judged = (Outlier(7, "x", tuple(CIRCLES[30]), 1e-3, 5e-5),), []
+
+    def outliers_of(update, campaign):
+        judged.append(update.study.instrument.offset_T[0])
+        return said if still or len(judged) == 1 else ()
+
+    monkeypatch.setattr(module, "outliers_of", outliers_of)
+    effects = [effect for effect in catalogue() if effect.name in ("offset_x", "gain_z")]
+    found = diagnose(study, shown, session, effects=effects)
+    assert [one.hypothesis.effect.name for one in found.identified] == ["offset_x"]
+    assert found.outliers == (said if still else ())
+    assert len(found.study.inference.excluded_readings) == still
+    assert judged == [0.0, pytest.approx(4e-4, abs=5e-5)]
+
+
+def test_sizes_of_a_round_are_not_compared_with_those_of_a_table():
+    """The first amplitudes may be far off: of blocks 15 % narrower than those of the table."""
+    blocks = simulate_delivery(STUDY, 1)
+    narrower = build_magnet(with_array(block={"shape": "cuboid", "width_m": 0.034}))
+    with pytest.raises(MeasurementError, match="volume_m3 of block B0001"):
+        prior_from_blocks(narrower, blocks)
+    with pytest.warns(HalbachWarning, match="14 % stronger"):
+        prior = prior_from_blocks(narrower, beside_amplitudes(blocks, STUDY))
+    # with the moments that were measured
+    moment = prior.gaussian.mean.reshape(-1, 3)[0] * 0.05 * 0.034 * 0.06
+    assert np.linalg.norm(moment) == pytest.approx(np.linalg.norm(blocks.moment[0]), rel=1e-6)
+    assert beside_amplitudes(None, STUDY) is None
 
 
 def uniform(data):

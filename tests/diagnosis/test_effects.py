@@ -17,6 +17,7 @@ from halbach_fe.measurement.instrument import nonlinear_part, sensor_model, with
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.drawn_studies import drawn_study
 from tests.conftest import DIPOLE, changed, circle
 
 STUDY = parse_study(changed(
@@ -182,3 +183,14 @@ def test_losses_of_corners_add_up_and_are_no_gains():
         pytest.approx(0.3))
     with pytest.raises(ValidationError, match="inner_corner_loss"):
         corners.apply(study, Place(), [-0.3])
+
+
+@pytest.mark.parametrize(("magnet", "uneven"), [("rods", False), ("cubes", True)])
+def test_only_blocks_of_four_edges_have_corners(magnet, uneven):
+    """The outline of a rod has four arcs, of which none is a side."""
+    study = drawn_study(magnet, np.random.default_rng(1))
+    for name in ("corners_demagnetized", "magnetization_gradient"):
+        places = EFFECTS[name].places(study)
+        assert bool(places) == uneven
+        for place in places[:1]:
+            build_magnet(EFFECTS[name].apply(study, place, [0.01]))

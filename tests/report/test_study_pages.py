@@ -15,7 +15,8 @@ from tests.support.results import STUDY
 RATES = {
     "naming_rate_single": 0.95, "single_cases": 40, "naming_rate_pairs": 0.9, "pair_cases": 10,
     "false_alarm_rate": 0.0, "clean_cases": 20, "unknown_rate": 1.0, "outside_cases": 12,
-    "heldout_recovered_rate": 1.0, "recovered_of": 45,
+    "heldout_recovered_rate": 1.0, "recovered_of": 45, "yes_beside_wrong": 0.0, "cases": 80,
+    "axis_coverage": 0.95, "axis_numbers": 200,
     "control_naming_rate_shuffled_labels": 0.05, "control_false_alarm_rate_without_blocks": 0.8}
 CASES = [{"case": "000-gain", "hidden": ["gain"], "outside": "", "named": [["gain_x"]],
           "unknown": None, "chi2_before": 40.0, "chi2_after": 1.0}]

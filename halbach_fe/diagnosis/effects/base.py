@@ -353,8 +353,8 @@ def place_of(block: MagnetBlock, other: MagnetBlock | None = None) -> Place:
 
 
 def can_be_uneven(block: MagnetBlock) -> bool:
-    """Tell whether a block can have a gradient or lost corners: its outline has four edges."""
-    return len(block.outline) == 4
+    """Tell whether a block can have a gradient or lost corners."""
+    return block.has_four_edges
 
 
 def each_ring(study: Study) -> list[Place]:

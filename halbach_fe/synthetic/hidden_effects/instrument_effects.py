@@ -155,6 +155,17 @@ def drift(instrument: FaultyInstrument, site: Site, value: float) -> FaultyInstr
     return replace(instrument, drift=instrument.drift + value)
 
 
+def lag(instrument: FaultyInstrument, site: Site, distance: float) -> FaultyInstrument:
+    """Read the field behind where the stage is on its way."""
+    return replace(instrument, lag=instrument.lag + distance)
+
+
+def slow_readings(instrument: FaultyInstrument, site: Site, fraction: float,
+                  rows: float) -> FaultyInstrument:
+    """Let every reading contain a fraction of those before, forgotten within some ``rows``."""
+    return replace(instrument, memory=(fraction, rows))
+
+
 def vibration(instrument: FaultyInstrument, site: Site, distance: float) -> FaultyInstrument:
     """Displace the probe at random at each point; ``distance`` is the standard deviation."""
     return replace(instrument, vibration=distance)
@@ -203,6 +214,13 @@ def _effects() -> Iterator[HiddenEffect]:
                        instrument=eccentric_circle, needs=("circles",))
     yield HiddenEffect("drift", "instrument", (HiddenParameter("value", "T"),),
                        draw_number(1e-4, 1e-3), instrument=drift)
+    yield HiddenEffect("lag", "instrument", (HiddenParameter("distance", "m"),),
+                       draw_length(1e-4, 5e-4, False), instrument=lag, needs=("3d",))
+    yield HiddenEffect("slow_readings", "instrument",
+                       (HiddenParameter("fraction", least=-0.5, most=0.5),
+                        HiddenParameter("rows", least=0.0)),
+                       lambda site, generator: (log_uniform(generator, 1e-3, 1e-2), 0.0),
+                       instrument=slow_readings)
     yield HiddenEffect("vibration", "instrument", (HiddenParameter("distance", "m", 0.0, 0.1),),
                        draw_length(5e-5, 5e-4, False), instrument=vibration)
     yield HiddenEffect("outliers", "instrument",

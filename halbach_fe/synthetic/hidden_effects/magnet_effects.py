@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -190,6 +190,11 @@ def ring_shifted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float
     return _bodies(magnet, lambda body: _moved(body, (x, y, 0.0)), _of_ring(ring))
 
 
+def ring_shifted_along(magnet: TrueMagnet, site: Site, ring: float, z: float) -> TrueMagnet:
+    """Displace one ring along the axis."""
+    return _bodies(magnet, lambda body: _moved(body, (0.0, 0.0, z)), _of_ring(ring))
+
+
 def inner_radius(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
     """Increase the inner radius of all blocks by ``more``; their outer faces stay."""
     def shorter(body: Body) -> Body:
@@ -223,17 +228,50 @@ def magnet_length(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet
 def blocks_swapped(magnet: TrueMagnet, site: Site, ring: float, slot: float, other_ring: float,
                    other_slot: float) -> TrueMagnet:
     """Exchange two blocks; each keeps its magnetization in the axes of its faces."""
-    bodies = {(float(body.ring), float(body.slot)): body for body in magnet.bodies}
-    first, second = (ring, slot), (other_ring, other_slot)
+    first, second = (int(ring), int(slot)), (int(other_ring), int(other_slot))
+    return _exchanged(magnet, {first: second, second: first})
+
+
+def _exchanged(magnet: TrueMagnet, sources: Mapping[tuple[int, int], tuple[int, int]]
+               ) -> TrueMagnet:
+    """Return the magnet with blocks from other places, by ring and slot."""
+    bodies = {(body.ring, body.slot): body for body in magnet.bodies}
 
     def as_other(body: Body) -> Body:
-        other = bodies[second if (body.ring, body.slot) == first else first]
+        other = bodies[sources[body.ring, body.slot]]
         turn = body.carried_from(other)
         return replace(body, remanence=vector(turn.apply(other.remanence)),
                        easy_axis=vector(turn.apply(other.easy_axis)),
                        along=other.along, across=other.across, parts=other.parts)
 
-    return _bodies(magnet, as_other, lambda body: (body.ring, body.slot) in (first, second))
+    return _bodies(magnet, as_other, lambda body: (body.ring, body.slot) in sources)
+
+
+def rings_swapped(magnet: TrueMagnet, site: Site, ring: float, other_ring: float) -> TrueMagnet:
+    """Exchange two rings of as many blocks, slot by slot."""
+    first, second = int(ring), int(other_ring)
+    sources = {(here, slot): (there, slot) for here, there in ((first, second), (second, first))
+               for slot in site.slots_of(first)}
+    return _exchanged(magnet, sources)
+
+
+def rings_turned(magnet: TrueMagnet, site: Site, ring: float, slots: float) -> TrueMagnet:
+    """Turn one ring about the axis by whole slots."""
+    own = site.slots_of(ring)
+    return _exchanged(magnet, {(int(ring), slot): (int(ring), own[number - int(slots)])
+                               for number, slot in enumerate(own)})
+
+
+def block_put_in_wrongly(magnet: TrueMagnet, site: Site, ring: float, slot: float, radial: float,
+                         azimuthal: float, z: float) -> TrueMagnet:
+    """Turn one block in its slot by a rotation vector along its own axes, after which it fits.
+
+    The body's faces stay where they are; its magnetization turns.
+    """
+    turn = Rotation.from_rotvec([radial, azimuthal, z])
+    return _bodies(magnet, lambda body: replace(
+        body, remanence=vector(turn.apply(body.remanence)),
+        easy_axis=vector(turn.apply(body.easy_axis))), _at(ring, slot))
 
 
 def block_flipped(magnet: TrueMagnet, site: Site, ring: float, slot: float) -> TrueMagnet:
@@ -366,6 +404,12 @@ def _draw_swap(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
     return ring, slot, ring, float(slots[(slots.index(int(slot)) + step) % len(slots)])
 
 
+def _draw_two(count: int, generator: np.random.Generator) -> tuple[float, ...]:
+    """Draw two different numbers from 1."""
+    first, second = 1 + generator.choice(count, 2, replace=False)
+    return float(first), float(second)
+
+
 def _draw_shift(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
     amount = site.scale * log_uniform(generator, 1e-4, 5e-4)
     ring, _ = draw_place(site, generator)
@@ -411,9 +455,25 @@ EFFECTS = (
     HiddenEffect("ring_shifted", "field",
                  (HiddenParameter("ring"), HiddenParameter("x", M), HiddenParameter("y", M)),
                  _draw_shift, ring_shifted, needs=("3d", "rings")),
+    HiddenEffect("ring_shifted_along", "field",
+                 (HiddenParameter("ring"), HiddenParameter("z", M)),
+                 lambda site, generator: (draw_place(site, generator)[0],
+                                          site.scale * signed_log_uniform(generator, 2e-4, 1e-3)),
+                 ring_shifted_along, needs=("3d", "rings")),
     HiddenEffect("blocks_swapped", "field",
                  (*BLOCK, HiddenParameter("other_ring"), HiddenParameter("other_slot")), _draw_swap,
                  blocks_swapped),
+    HiddenEffect("block_put_in_wrongly", "field",
+                 (*BLOCK, *(HiddenParameter(name, RAD) for name in OWN_AXES)),
+                 lambda site, generator: (*draw_place(site, generator), np.pi, 0.0, 0.0),
+                 block_put_in_wrongly),
+    HiddenEffect("rings_swapped", "field",
+                 (HiddenParameter("ring"), HiddenParameter("other_ring")),
+                 lambda site, generator: _draw_two(site.rings, generator), rings_swapped,
+                 needs=("3d", "rings", "equal rings")),
+    HiddenEffect("rings_turned", "field", (HiddenParameter("ring"), HiddenParameter("slots")),
+                 lambda site, generator: (draw_place(site, generator)[0], 1.0), rings_turned,
+                 needs=("3d", "rings")),
     HiddenEffect("block_flipped", "field", BLOCK, draw_place, block_flipped),
     HiddenEffect("block_missing", "field", BLOCK, draw_place, block_missing),
     HiddenEffect("block_demagnetized", "field", (*BLOCK, LOST),
