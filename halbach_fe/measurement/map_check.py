@@ -470,7 +470,7 @@ def check_map(
     redundancy = 1 - whole.used / (3 * int(chosen.sum()))
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
-        model.noise_left(whole, chosen, fit.sigma**2 / fit.penalty), LEAST_LEFT))
+        model.noise_left(whole, chosen, fit.sigma**2 / fit.penalty)[1], LEAST_LEFT))
     scatter = scatter_of(charges.gradient(points[chosen], whole.amplitudes), left)
     (as_given,) = fit_fields(charges, places, [readings])
     given = readings - charges.fields(places) @ as_given.amplitudes

@@ -224,26 +224,19 @@ class ProbeModel:
             found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
 
-    def noise_left(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> Floats:
-        """Return the variance (n, 3) of residuals that noise makes, relative to its own.
+    def noise_left(
+        self, at: ProbeFit, rows: NDArray[np.bool_], width2: float
+    ) -> tuple[Floats, Floats]:
+        """Return how much of each reading (n, 3), and of its variance, the fit of the field leaves.
 
-        The rest the field takes along, the most at the edges of a map. With the matrix H that makes
-        fitted values of readings, for the prior variance ``width2`` of the amplitudes in T^2, it is
-        the diagonal of (1 - H) (1 - H)^T. The few numbers of the instrument are left out.
+        The rest the field takes along, the most at the edges of a map. For the prior variance
+        ``width2`` of the amplitudes in T^2 they are the diagonals of P and P^2 of `FreeField`. A
+        residual divided by the first one is that of a fit without the reading. The few numbers of
+        the instrument are left out.
         """
         by_amplitude = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
-        information = by_amplitude.T @ by_amplitude
-        with_prior = information.copy()
-        with_prior[np.diag_indices(len(with_prior))] += (
-            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
-        factor = linalg.cho_factor(with_prior)
-        left = np.empty(len(by_amplitude))
-        for first in range(0, len(left), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            solved = linalg.cho_solve(factor, by_amplitude[part].T)
-            left[part] = 1 - 2 * np.sum(by_amplitude[part].T * solved, axis=0) + np.sum(
-                solved * (information @ solved), axis=0)
-        return left.reshape(-1, 3)
+        once, twice = FreeField(by_amplitude, at.sigma**2 / width2).diagonals()
+        return once.reshape(-1, 3), twice.reshape(-1, 3)
 
     def expected(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.
@@ -306,6 +299,66 @@ def fit_probe(
     return state.at
 
 
+class FreeField:
+    """What the prior field of the charges leaves of readings: ``P = (1 + A A^T / penalty)^-1``.
+
+    ``A`` (m, k) are the readings by amplitude, and ``penalty`` is the ratio of the variances of
+    noise and amplitudes. ``P`` follows from the smaller one of A A^T and A^T A.
+    """
+
+    def __init__(self, by_amplitude: Floats, penalty: float, gram: Floats | None = None) -> None:
+        self.by_amplitude = by_amplitude
+        self.dual = len(by_amplitude) <= by_amplitude.shape[1]
+        tall = by_amplitude if self.dual else by_amplitude.T
+        self.gram = tall @ tall.T if gram is None else gram
+        self.penalty = penalty + ROUNDING * float(np.trace(self.gram)) / by_amplitude.shape[1]
+        with_prior = self.gram.copy()
+        with_prior[np.diag_indices(len(with_prior))] += self.penalty
+        self.factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
+
+    def of_noise(self, penalty: float) -> FreeField:
+        """Return the same for another penalty."""
+        return FreeField(self.by_amplitude, penalty, self.gram)
+
+    def left(self, readings: Floats) -> Floats:
+        """Return P times readings (m,) or (m, p)."""
+        if self.dual:
+            return np.asarray(self.penalty * linalg.cho_solve(self.factor, readings))
+        return np.asarray(readings - self.by_amplitude @ self.amplitudes(readings))
+
+    def amplitudes(self, readings: Floats) -> Floats:
+        """Return the most probable amplitudes (k,) or (k, p)."""
+        if self.dual:
+            return np.asarray(self.by_amplitude.T @ linalg.cho_solve(self.factor, readings))
+        return np.asarray(linalg.cho_solve(self.factor, self.by_amplitude.T @ readings))
+
+    @property
+    def trace(self) -> float:
+        """Trace of P: the number of readings that the field does not use up."""
+        inverse, info = linalg.lapack.dpotri(self.factor[0], lower=1)
+        assert info == 0  # the factor is that of a Cholesky decomposition
+        rest = 0 if self.dual else len(self.by_amplitude) - self.by_amplitude.shape[1]
+        return rest + self.penalty * float(np.trace(inverse))
+
+    def diagonals(self) -> tuple[Floats, Floats]:
+        """Return the diagonals (m,) of P and of P^2."""
+        once, twice = np.empty((2, len(self.by_amplitude)))
+        for first in range(0, len(once), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            if self.dual:
+                unit = np.zeros((len(once), len(once[part])))
+                unit[part] = np.eye(unit.shape[1])
+                columns = self.left(unit)
+                once[part], twice[part] = np.diag(columns[part]), np.sum(columns**2, axis=0)
+                continue
+            rows = self.by_amplitude[part]
+            solved = linalg.cho_solve(self.factor, rows.T)
+            taken = np.sum(rows.T * solved, axis=0)
+            once[part] = 1 - taken
+            twice[part] = 1 - 2 * taken + np.sum(solved * (self.gram @ solved), axis=0)
+        return once, twice
+
+
 @dataclass(frozen=True)
 class _State:
     """The field of largest probability for an instrument and a noise.
@@ -316,13 +369,8 @@ class _State:
     chi2 : float
         With the prior of amplitudes and instrument.
     left : ndarray, shape (m,), in T
-    by_amplitude : ndarray, shape (m, k)
-    information : ndarray, shape (k, k)
-        Of the amplitudes, without their prior and in units of 1 / sigma^2.
-    projected : ndarray, shape (k,)
-        Product of ``by_amplitude`` with the readings.
-    factor : tuple
-        Cholesky factor of the information with the prior.
+    target : ndarray, shape (m,), in T
+    free : FreeField
     """
 
     model: ProbeModel
@@ -331,41 +379,33 @@ class _State:
     at: ProbeFit
     chi2: float
     left: Floats
-    by_amplitude: Floats
-    information: Floats
-    projected: Floats
-    factor: tuple[Floats, bool]
+    target: Floats
+    free: FreeField
 
     @classmethod
     def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> _State:
         """Fit the field for the instrument and the noise of ``at``."""
         by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
-        target = model.target(at, rows)
-        return cls._solved(model, rows, width2, at, target, by_amplitude,
-                           by_amplitude.T @ by_amplitude, by_amplitude.T @ target)
+        return cls._solved(model, rows, width2, at, model.target(at, rows),
+                           FreeField(by_amplitude, at.sigma**2 / width2))
 
     @classmethod
     def _solved(
         cls, model: ProbeModel, rows: NDArray[np.bool_], width2: float, at: ProbeFit,
-        target: Floats, by_amplitude: Floats, information: Floats, projected: Floats,
+        target: Floats, free: FreeField,
     ) -> _State:
         """Solve for the amplitudes."""
-        with_prior = information.copy()
-        with_prior[np.diag_indices(len(with_prior))] += (
-            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
-        factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
-        amplitudes = linalg.cho_solve(factor, projected)
-        left = target - by_amplitude @ amplitudes
+        amplitudes = free.amplitudes(target)
+        left = target - free.by_amplitude @ amplitudes
         chi2 = (float(left @ left) / at.sigma**2 + float(amplitudes @ amplitudes) / width2
                 + float(at.instrument @ at.instrument))
-        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left,
-                   by_amplitude, information, projected, factor)
+        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left, target,
+                   free)
 
     def with_noise(self, sigma: float, at: ProbeFit) -> _State:
         """Return the state of the same instrument for another noise in T."""
-        target = self.left + self.by_amplitude @ self.at.amplitudes
-        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma), target,
-                            self.by_amplitude, self.information, self.projected)
+        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma),
+                            self.target, self.free.of_noise(sigma**2 / self.width2))
 
     def step(self) -> tuple[Floats, Floats, float]:
         """Return the step (p,) of the instrument, its covariance / sigma^2, and `ProbeFit.used`.
@@ -375,15 +415,12 @@ class _State:
         """
         noise2, count = self.at.sigma**2, len(PRIOR_SD)
         design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
-        mixed = self.by_amplitude.T @ design
-        solved = linalg.cho_solve(self.factor, mixed)
-        inverse = np.linalg.inv(design.T @ design - mixed.T @ solved + noise2 * np.eye(count))
+        left = self.free.left(design)
+        information = design.T @ left
+        inverse = np.linalg.inv(information + noise2 * np.eye(count))
         step = inverse @ (design.T @ self.left - noise2 * self.at.instrument)
         # traces of the blocks of the inverse of all normal equations
-        amplitudes, info = linalg.lapack.dpotri(self.factor[0], lower=1)
-        assert info == 0  # the factor is that of a Cholesky decomposition
-        by_amplitude = float(np.trace(amplitudes)) + float(np.sum((solved @ inverse) * solved))
-        used = (len(mixed) - noise2 / self.width2 * by_amplitude
+        used = (len(design) - self.free.trace - float(np.sum(inverse * (information - left.T @ left)))
                 + count - noise2 * float(np.trace(inverse)))
         return step, inverse, used
 

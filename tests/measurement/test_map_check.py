@@ -89,7 +89,7 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
     model = ProbeModel(charges, points, field, np.linspace(-1, 1, len(points)), 0 * points)
     at, rows = model.start(fit), np.ones(len(points), bool)
     width2 = fit.sigma**2 / fit.penalty
-    left = model.noise_left(at, rows, width2)
+    left = model.noise_left(at, rows, width2)[1]
     by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(charges))
     information = by_amplitude.T @ by_amplitude
     prior = at.sigma**2 / width2 + probe_in_field.ROUNDING * np.trace(information) / len(charges)
