@@ -18,6 +18,7 @@ from scipy import linalg
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_readings
+from halbach_fe.measurement.suspect_rows import scatter_around
 
 ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
 """Largest number of steps of the fit of field and instrument, while orientations are tried, and
@@ -48,12 +49,32 @@ TURNS = slice(18, 18 + 3 * WAVES)
 OFFSETS = slice(TURNS.stop, TURNS.stop + 3)
 GAINS = slice(OFFSETS.stop, OFFSETS.stop + WAVES)
 LAG = GAINS.stop
-"""Places of the parameters: coordinates of the sensors, elements of the matrix between the axes of
-probe and stage, turns, changes of offsets, changes of the gain, and the lag."""
+"""Places of the parameters: coordinates of the sensors, the matrix between the axes of probe and
+stage (see `MATRICES`), turns, changes of offsets, changes of the gain, and the lag."""
 
-PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 9, *(0.01,) * (3 * WAVES), *(2e-3,) * 3, *(0.01,) * WAVES,
-            1e-3)
-"""Prior standard deviations: in m, 1, rad, of the largest field, 1, and m."""
+PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 3, *(0.02,) * 6, *(0.01,) * (3 * WAVES), *(2e-3,) * 3,
+            *(0.01,) * WAVES, 1e-3)
+"""Prior standard deviations: in m, rad, rad, 1, rad, of the largest field, 1, and m."""
+
+PAIRS = tuple(((axis + 1) % 3, (axis + 2) % 3) for axis in range(3))
+"""The other two axes of every axis."""
+
+
+def _matrices() -> Floats:
+    """Return the matrices (9, 3, 3) of turns about the axes, of angles between them, and gains.
+
+    An angle is by how much less than 90 degrees two sensors are apart.
+    """
+    found = np.zeros((9, 3, 3))
+    for axis, (first, second) in enumerate(PAIRS):
+        found[axis, first, second], found[axis, second, first] = 1.0, -1.0
+        found[3 + axis, first, second] = found[3 + axis, second, first] = 0.5
+        found[6 + axis, axis, axis] = 1.0
+    found[6:] -= np.eye(3) / 3  # a common gain is no error that a map can show
+    return found
+
+
+MATRICES = _matrices()
 
 
 @dataclass(frozen=True)
@@ -96,51 +117,68 @@ class ProbeFit:
         Its trace is 0, because a common gain is no error that a map can show. (Where one component
         is most of the field, that changes the field's size: `ProbeModel.ideal` takes it back.)
         """
-        matrix = (self.instrument * self.prior_sd)[MIXING].reshape(3, 3)
-        return np.asarray(matrix - np.eye(3) * np.trace(matrix) / 3)
+        return np.einsum("m,mij->ij", (self.instrument * self.prior_sd)[MIXING], MATRICES)
 
 
-LEAST_ERROR = 0.03
-"""Smallest standard deviation by which a reading is weighted, relative to the rms residual: the
+LEAST_ERROR = 0.3
+"""Smallest standard deviation by which a reading is weighted, relative to the median one: the
 flattest readings of a small map may be fitted by chance."""
+
+LEAST_OWN = 0.05
+"""Smallest share of a reading that the fit counts to leave: beyond, its residual is rounding."""
+
+
+def weights_of(scatter: Floats) -> Floats:
+    """Return weights (n, 3), whose median is 1, of readings that scatter by as much (n,) in T."""
+    median = float(np.median(scatter))
+    if not median:
+        return np.ones((len(scatter), 3))
+    return np.repeat(median / np.maximum(scatter, LEAST_ERROR * median)[:, None], 3, axis=1)
 
 
 class ProbeModel:
     """Readings of a three-axis probe in a harmonic field.
 
-    ``weights`` (n, 3) multiply the residuals; they are 1 until `weighted`.
+    ``weights`` (n, 3) multiply the residuals. They follow from ``scatter`` (n,) in T, by which
+    readings are expected to be off a field without sources.
     """
 
     def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
-                 directions: Floats) -> None:
+                 directions: Floats, scatter: Floats) -> None:
         self.charges, self.points, self.field = charges, points, field
         self.time, self.directions = time, directions
         self.waves = np.polynomial.legendre.legvander(time, WAVES)[:, 1:]
         sd = np.array(PRIOR_SD)
         sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
+        step = np.linalg.norm(np.diff(points, axis=0), axis=1)[directions[1:].any(axis=1)]
+        sd[LAG] = max(sd[LAG], float(np.median(step)) if len(step) else 0.0)  # a row late
         self.prior_sd = sd
-        self.weights = np.ones_like(field)
+        self.scatter, self.weights = scatter, weights_of(scatter)
 
-    def without(self, group: slice) -> ProbeModel:
-        """Return a model whose instrument has none of a group of parameters."""
+    def with_terms(self, kept: NDArray[np.bool_]) -> ProbeModel:
+        """Return a model whose instrument has some of the parameters (p,) only."""
         other = copy(self)
-        other.prior_sd = self.prior_sd.copy()
-        other.prior_sd[group] = 0.0
+        other.prior_sd = np.where(kept, self.prior_sd, 0.0)
         return other
 
-    def weighted(self, at: ProbeFit, rows: NDArray[np.bool_]) -> ProbeModel:
-        """Return a model that weights readings by their expected residuals, see `expected`.
+    def weighted(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> ProbeModel:
+        """Return a model that weights readings by how far those around are off the field of others.
 
         Near edges of magnets charges follow the field less well than the probe reads it. There are
         few such readings, but without weights they are what decides on the instrument: it is given
         errors of many standard deviations that it does not have.
         """
-        other, expected = copy(self), self.expected(at, rows)
-        rms = float(np.sqrt(np.mean((self.field - self.readings(at))[rows]**2)))
-        if rms:
-            expected = np.maximum(expected, LEAST_ERROR * rms)
-            other.weights = 1 / (expected * np.sqrt(np.mean(expected[rows]**-2)))
+        other = copy(self)
+        other.scatter = scatter_around(self.points, self.points[rows],
+                                       self.unexpected(at, rows, width2)[rows])
+        other.weights = weights_of(other.scatter)
         return other
+
+    def unexpected(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> Floats:
+        """Return how far all readings (n, 3) are in T off the field of the others among ``rows``."""
+        off = self.field - self.readings(at)
+        off[rows] /= np.maximum(self.noise_left(at, rows, width2)[0], LEAST_OWN)
+        return np.asarray(off)
 
     def allowed(self, at: ProbeFit) -> ProbeFit:
         """Return a fit to start from, with 0 for the parameters that this model leaves out."""
@@ -201,9 +239,7 @@ class ProbeModel:
             for other in range(3):  # of the mean of the sensors, which stays where it is
                 found[:, sensor, 3 * other:3 * other + 3] = gradient * (
                     (sensor == other) - 1 / 3)
-            found[:, sensor, 9 + 3 * sensor:12 + 3 * sensor] = field
-            for other in range(3):
-                found[:, sensor, 9 + 4 * other] -= field[:, sensor] / 3
+            found[:, sensor, MIXING] = field @ MATRICES[:, sensor].T
             found[:, sensor, TURNS] = np.einsum(
                 "nw,na->nwa", self.waves[rows], np.cross(np.eye(3)[sensor], field)
             ).reshape(len(found), -1)
@@ -237,16 +273,6 @@ class ProbeModel:
         by_amplitude = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
         once, twice = FreeField(by_amplitude, at.sigma**2 / width2).diagonals()
         return once.reshape(-1, 3), twice.reshape(-1, 3)
-
-    def expected(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.
-
-        Residuals are larger where the field is steep. Those of lines that are not fitted are no
-        measure of a single reading: at the edge of the map the field there is extrapolated.
-        """
-        gradient = self.charges.gradient(self.points, at.amplitudes)
-        noise, displaced = noise_of(gradient[rows], (self.field - self.readings(at))[rows])
-        return np.sqrt(noise**2 + displaced**2 * np.sum(gradient**2, axis=2))
 
     def ideal(self, at: ProbeFit) -> Floats:
         """Return what a probe without errors would have read (n, 3) in T.
@@ -282,7 +308,8 @@ def fit_probe(
     width2 = fit.sigma**2 / fit.penalty
     state = _State.of(model, at, rows, width2)
     for _ in range(iterations):
-        step, covariance, used = state.step()
+        design, by_field, covariance = state.normal()
+        step, used = state.step(design, covariance), state.used(design, by_field, covariance)
         for halving in range(HALVINGS):
             after = _State.of(model, replace(
                 state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
@@ -359,6 +386,18 @@ class FreeField:
         return once, twice
 
 
+def fit_part(
+    model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, fit: HarmonicFit
+) -> tuple[Floats, Floats]:
+    """Return the instrument (p,) and its covariance (p, p) by some rows alone, near a fit of all.
+
+    They are in units of `PRIOR_SD`. The field is that of these rows, too.
+    """
+    state = _State.of(model, at, rows, fit.sigma**2 / fit.penalty)
+    design, _, inverse = state.normal()
+    return at.instrument + state.step(design, inverse), at.sigma**2 * inverse
+
+
 @dataclass(frozen=True)
 class _State:
     """The field of largest probability for an instrument and a noise.
@@ -407,22 +446,28 @@ class _State:
         return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma),
                             self.target, self.free.of_noise(sigma**2 / self.width2))
 
-    def step(self) -> tuple[Floats, Floats, float]:
-        """Return the step (p,) of the instrument, its covariance / sigma^2, and `ProbeFit.used`.
+    def normal(self) -> tuple[Floats, Floats, Floats]:
+        """Return the design (m, p) of the instrument, what the field leaves of it, its covariance.
 
         The amplitudes, which are the best for the present instrument, are eliminated from the
-        normal equations.
+        normal equations. The covariance (p, p) is relative to sigma^2.
         """
-        noise2, count = self.at.sigma**2, len(PRIOR_SD)
+        count = len(PRIOR_SD)
         design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
         left = self.free.left(design)
-        information = design.T @ left
-        inverse = np.linalg.inv(information + noise2 * np.eye(count))
-        step = inverse @ (design.T @ self.left - noise2 * self.at.instrument)
-        # traces of the blocks of the inverse of all normal equations
-        used = (len(design) - self.free.trace - float(np.sum(inverse * (information - left.T @ left)))
-                + count - noise2 * float(np.trace(inverse)))
-        return step, inverse, used
+        return design, left, np.linalg.inv(
+            design.T @ left + self.at.sigma**2 * np.eye(count))
+
+    def step(self, design: Floats, inverse: Floats) -> Floats:
+        """Return the step (p,) of the instrument, see `normal`."""
+        return np.asarray(inverse @ (
+            design.T @ self.left - self.at.sigma**2 * self.at.instrument))
+
+    def used(self, design: Floats, left: Floats, inverse: Floats) -> float:
+        """Return `ProbeFit.used`, by the traces of the inverse of all normal equations."""
+        by_field = len(design) - self.free.trace - float(
+            np.sum(inverse * (design.T @ left - left.T @ left)))
+        return by_field + len(inverse) - self.at.sigma**2 * float(np.trace(inverse))
 
 
 def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:

@@ -46,10 +46,10 @@ def _within(radius: float) -> Callable[[Floats], Floats]:
 
 
 def dipole(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], Floats]:
-    """Two rings of sectors of 20 mm, a bore of 40 mm, through their ends; 4 or 5 mm apart."""
-    magnets, step = truth(generator), generator.choice([0.004, 0.005])
-    across = step * np.arange(-4, 5)
-    points = serpentine(across, across, 0.006 * np.arange(-5, 9),
+    """Two rings of sectors of 20 mm, a bore of 40 mm, through their ends."""
+    magnets, step = truth(generator), generator.choice([0.005, 0.0055, 0.006])
+    across = step * np.arange(-3, 4)
+    points = serpentine(across, across, 0.008 * np.arange(-2, 6),
                         _within(generator.uniform(0.016, 0.018)))
     return lambda at: field_of(magnets, at), points
 
@@ -65,9 +65,8 @@ def cubes(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], F
                 polarization=(1.27 * (1 + 0.01 * generator.standard_normal()), 0.0, 0.0))
             one.rotate_from_angax(60.0 * slot + 0.5 * generator.standard_normal(), "z")
             sources.append(one)
-    step = generator.uniform(0.008, 0.012)
-    across = step * np.arange(-6, 7)
-    points = serpentine(across, across, 0.008 * np.arange(-4, 5),
+    across = generator.uniform(0.013, 0.0155) * np.arange(-3, 4)
+    points = serpentine(across, across, 0.010 * np.arange(-2, 5),
                         _within(generator.uniform(0.0476, 0.0488)))
     return magpylib.Collection(sources).getB, points
 
@@ -83,8 +82,8 @@ def quadrupole(generator: np.random.Generator) -> tuple[Callable[[Floats], Float
             polarization=(1.3 * (1 + 0.01 * generator.standard_normal()), 0.0, 0.0))
         one.rotate_from_angax(3 * 22.5 * slot + 0.5 * generator.standard_normal(), "z")
         sources.append(one)
-    across = generator.uniform(0.004, 0.005) * np.arange(-5, 6)
-    points = serpentine(across, across, 0.006 * np.arange(-3, 8),
+    across = generator.uniform(0.0055, 0.0067) * np.arange(-3, 4)
+    points = serpentine(across, across, 0.007 * np.arange(-1, 6),
                         _within(generator.uniform(0.020, 0.021)))
     return magpylib.Collection(sources).getB, points
 
@@ -95,8 +94,8 @@ def coils(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], F
                                     current=1000.0, position=(
                                         *(5e-4 * generator.standard_normal(2)), z))
             for z in (-0.025, 0.025)]
-    across = generator.uniform(0.0085, 0.0095) * np.arange(-5, 6)
-    points = serpentine(across, across, 0.010 * np.arange(-4, 5),
+    across = generator.uniform(0.013, 0.0155) * np.arange(-3, 4)
+    points = serpentine(across, across, 0.011 * np.arange(-2, 5),
                         _within(generator.uniform(0.046, 0.049)))
     return magpylib.Collection(pair).getB, points
 
@@ -114,7 +113,7 @@ def hard_map(seed: int, error: str = "") -> xr.Dataset:
     at = points - (LAG_M if error == "lag" else 0.0) * np.sign(way)
     read = field(at)
     if error == "apart":
-        read[:, 0] = field(at + [0.0, APART_M, 0.0])[:, 0]
+        read[:, 0] = field(at + np.array([0.0, APART_M, 0.0]))[:, 0]
     if error == "roll":
         read = read @ np.array([[1, -ROLL_RAD, 0], [ROLL_RAD, 1, 0], [0, 0, 1]])
     if error == "gain":
