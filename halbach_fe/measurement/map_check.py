@@ -52,9 +52,9 @@ from halbach_fe.measurement.probe_in_field import (
     OFFSETS,
     PAIRS,
     TURNS,
+    Evidence,
     ProbeFit,
     ProbeModel,
-    fit_part,
     fit_probe,
     scatter_of,
     weights_of,
@@ -104,6 +104,15 @@ the first weights, 3.3 with these, and 3.3 with more."""
 
 FEWEST_IN_PART = 40
 """Smallest number of readings of a part of the map that tells of the instrument by itself."""
+
+ROUNDS = 2
+"""Number of times that parameters are chosen: weights and linearization are those of the choice
+before."""
+
+AS_CERTAIN = 0.7
+"""Share of the largest certainty from which a parameter is as good an explanation: in a field along
+one axis, a turn of the probe and an angle between its sensors differ by little. The one that is
+nearer to 0, by what instruments do, is taken."""
 
 SEEN = 2.0
 """Standard deviations of a part from which it can tell whether a parameter is there."""
@@ -184,7 +193,7 @@ class InstrumentTerm:
     plausible : bool
         Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
     predictive : bool
-        Whether no part of the map contradicts the others about it, see `_supported`.
+        Whether no part of the map contradicts the others about it, see `_term`.
     """
 
     name: str
@@ -737,6 +746,10 @@ class _Parameter:
     row: Floats
     own: tuple[int, ...]
 
+    def away(self, value: float) -> float:
+        """Return how many prior standard deviations a value is from 0."""
+        return abs(value) / max(float(np.linalg.norm(self.row)), 1e-300)
+
 
 def _parameters(prior_sd: Floats, shares: Floats) -> list[_Parameter]:
     """Return all parameters of the instrument.
@@ -784,29 +797,53 @@ def _stated(
 ) -> tuple[_Fitted, tuple[InstrumentTerm, ...]]:
     """Return the fit by what all parts of the map show of the instrument, and what they show.
 
-    What is left of a field that is steeper than the charges, and positions that are off together
-    along a line, is no white noise. The parameters of an instrument take to it with certainty, but
-    differently in every part of the map.
+    Parameters are added to a perfect instrument one by one, the most certain first. What is left of
+    a field that is steeper than the charges, and positions that are off together along a line, is
+    no white noise: parameters take to it with certainty, but differently in every part of the map.
     """
-    model, at = fitted.model, fitted.at
-    pairs = _parts(model, at, rows)
-    parts = []
-    for number, part in enumerate(pairs, 1):
-        parts.append(fit_part(model, part, at, fitted.fit))
-        pace.advance(number, len(pairs))
-    parameters = _parameters(model.prior_sd, model.shares(at))
-    terms = [_term(parameter, at, parts) for parameter in parameters]
-    kept = np.zeros(len(at.instrument), bool)
-    for parameter, term in zip(parameters, terms, strict=True):
-        kept[list(parameter.own)] |= term.found
-    fitted = fitted.only(kept, rows)
+    no_terms = np.zeros(len(fitted.at.instrument), bool)
+    fitted = replace(fitted, at=replace(fitted.at, instrument=np.zeros(len(no_terms))))
+    terms: tuple[InstrumentTerm, ...] = ()
+    for number in range(ROUNDS):
+        model = fitted.model.with_terms(~no_terms)
+        pairs = [rows, *_parts(model, fitted.at, rows)]
+        told = []
+        for part in pairs:
+            told.append(Evidence.of(model, part, fitted.at, fitted.width2))
+            pace.advance(number * len(pairs) + len(told), ROUNDS * len(pairs))
+        parameters = _parameters(model.prior_sd, model.shares(fitted.at))
+        kept, terms = _selected(parameters, told)
+        fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
     return fitted, tuple(
         replace(term, value=float(parameter.row @ fitted.at.instrument)) if term.found else term
         for parameter, term in zip(parameters, terms, strict=True))
 
 
+def _selected(
+    parameters: list[_Parameter], told: list[Evidence]
+) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
+    """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
+
+    ``told`` is what the whole map tells, and what its halves do.
+    """
+    kept = np.zeros(len(told[0].sums), bool)
+    while True:
+        terms = [_term(parameter, kept, told) for parameter in parameters]
+        new = [(abs(term.value) / term.sd, parameter.away(term.value), parameter.own)
+               for parameter, term in zip(parameters, terms, strict=True)
+               if term.found and not kept[list(parameter.own)].all()]
+        if not new:
+            return kept, tuple(
+                replace(term, predictive=term.predictive and (
+                    not term.found or bool(kept[list(parameter.own)].all())))
+                for parameter, term in zip(parameters, terms, strict=True))
+        enough = AS_CERTAIN * max(certain for certain, *_ in new)
+        _, own = min(each[1:] for each in new if each[0] >= enough)
+        kept[list(own)] = True
+
+
 def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return the halves of the map, two by two: along x, y and z, and where the field is steeper."""
+    """Return halves of the map, two by two: along x, y and z, and by how steep the field is."""
     steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
     found = []
     for values in (*model.points.T, steepness):
@@ -819,27 +856,29 @@ def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDA
 
 
 def _term(
-    parameter: _Parameter, at: ProbeFit, parts: list[tuple[Floats, Floats]]
+    parameter: _Parameter, kept: NDArray[np.bool_], told: list[Evidence]
 ) -> InstrumentTerm:
-    """Return what the whole map and its halves show of a parameter.
+    """Return what the whole map and its halves show of a parameter, besides those that are kept.
 
     If the halves scatter about the whole by more than their bars, its bar is as much longer. They
     support it if both of a pair could tell whether it is there, and none that could contradicts it.
     """
-    row = parameter.row
-    value, prior = float(row @ at.instrument), float(np.linalg.norm(row))
-    sd = float(np.sqrt(row @ at.covariance @ row))
-    values = np.array([row @ each for each, _ in parts])
-    sds = np.sqrt([row @ covariance @ row for _, covariance in parts])
+    used = np.flatnonzero(kept | (np.isin(np.arange(len(kept)), parameter.own)))
+    row = parameter.row[used]
+    estimates = [each.estimate(used) for each in told]
+    value, *of_parts = (float(row @ mean) for mean, _ in estimates)
+    sd, *sd_of_parts = (float(np.sqrt(row @ covariance @ row)) for _, covariance in estimates)
+    values, sds = np.array(of_parts), np.array(sd_of_parts)
     alone = np.sqrt(np.maximum(sds**2 - sd**2, 0.1 * sds**2))
-    beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if parts else 1.0
+    beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if of_parts else 1.0
     sees = SEEN * beyond * sds < abs(value)
-    off = np.abs(values - value) > np.maximum(SEEN * beyond * sds, UNLIKE * abs(value))
+    off = np.abs(values - value) > np.maximum(SEEN * sds, UNLIKE * abs(value))
     supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any())
-    significant = abs(value) > SIGNIFICANT * beyond * sd
+    prior = float(np.linalg.norm(row))
     return InstrumentTerm(
         parameter.name, parameter.unit, value, beyond * sd, beyond * sd < DETERMINED * prior,
-        abs(value) <= doubted_from(len(row)) * prior, supported or not significant)
+        parameter.away(value) <= doubted_from(len(kept)),
+        supported or abs(value) <= SIGNIFICANT * beyond * sd)
 
 
 # --- what remains -------------------------------------------------------------------------------

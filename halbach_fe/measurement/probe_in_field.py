@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_readings
 from halbach_fe.measurement.suspect_rows import scatter_around
 
@@ -152,13 +152,13 @@ class ProbeModel:
         sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
         step = np.linalg.norm(np.diff(points, axis=0), axis=1)[directions[1:].any(axis=1)]
         sd[LAG] = max(sd[LAG], float(np.median(step)) if len(step) else 0.0)  # a row late
-        self.prior_sd = sd
+        self.prior_sd = self.any_sd = sd
         self.scatter, self.weights = scatter, weights_of(scatter)
 
     def with_terms(self, kept: NDArray[np.bool_]) -> ProbeModel:
-        """Return a model whose instrument has some of the parameters (p,) only."""
+        """Return a model whose instrument has some of all parameters (p,) only."""
         other = copy(self)
-        other.prior_sd = np.where(kept, self.prior_sd, 0.0)
+        other.prior_sd = np.where(kept, self.any_sd, 0.0)
         return other
 
     def weighted(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> ProbeModel:
@@ -386,16 +386,35 @@ class FreeField:
         return once, twice
 
 
-def fit_part(
-    model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, fit: HarmonicFit
-) -> tuple[Floats, Floats]:
-    """Return the instrument (p,) and its covariance (p, p) by some rows alone, near a fit of all.
+@dataclass(frozen=True)
+class Evidence:
+    """What some readings tell of the instrument, linearized: ``information @ instrument = sums``.
 
-    They are in units of `PRIOR_SD`. The field is that of these rows, too.
+    Attributes
+    ----------
+    information : ndarray, shape (p, p)
+    sums : ndarray, shape (p,)
+        The instrument is in units of `PRIOR_SD`. The field is that of these readings, too.
     """
-    state = _State.of(model, at, rows, fit.sigma**2 / fit.penalty)
-    design, _, inverse = state.normal()
-    return at.instrument + state.step(design, inverse), at.sigma**2 * inverse
+
+    information: Floats
+    sums: Floats
+
+    @classmethod
+    def of(
+        cls, model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, width2: float
+    ) -> Evidence:
+        """Return what some rows tell, near a fit, for the prior variance of amplitudes in T^2."""
+        state = _State.of(model, at, rows, width2)
+        design, left, _ = state.normal()
+        information = design.T @ left / at.sigma**2
+        return cls(information, design.T @ state.left / at.sigma**2
+                   + information @ at.instrument)
+
+    def estimate(self, kept: Ints) -> tuple[Floats, Floats]:
+        """Return the values (k,) and covariance (k, k) of an instrument of some parameters only."""
+        covariance = np.linalg.inv(self.information[np.ix_(kept, kept)] + np.eye(len(kept)))
+        return covariance @ self.sums[kept], covariance
 
 
 @dataclass(frozen=True)
