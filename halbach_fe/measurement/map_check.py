@@ -109,11 +109,6 @@ ROUNDS = 2
 """Number of times that parameters are chosen: weights and linearization are those of the choice
 before."""
 
-AS_CERTAIN = 0.7
-"""Share of the largest certainty from which a parameter is as good an explanation: in a field along
-one axis, a turn of the probe and an angle between its sensors differ by little. The one that is
-nearer to 0, by what instruments do, is taken."""
-
 SEEN = 2.0
 """Standard deviations of a part from which it can tell whether a parameter is there."""
 
@@ -663,8 +658,9 @@ def _orientation(
 ) -> tuple[Floats, tuple[tuple[str, str, str], ...]]:
     """Return the matrix of the orientation, and others that fit as well.
 
-    If orientations fit about equally well with a perfect instrument, each gets its own instrument.
-    The axes are taken as they are given if nothing speaks against them.
+    If orientations fit about equally well with a perfect instrument, each gets its own instrument,
+    which must be a possible one. The axes are taken as they are given if nothing speaks against
+    them.
     """
     spacing = point_spacing(scan.points)
     scan = scan.of(_some_points(scan.points))
@@ -680,8 +676,9 @@ def _orientation(
     for number in left.tolist():
         model = scan.turned(matrices[number]).model(charges)
         fitted = fit_probe(model, every, fits[number], iterations=FEW_ITERATIONS)
-        against[number] = float(3 * len(every) * np.log(fitted.sigma)
-                                + fitted.instrument @ fitted.instrument / 2)
+        impossible = np.abs(fitted.instrument).max() > doubted_from(len(fitted.instrument))
+        against[number] = np.inf if impossible and number else float(
+            3 * len(every) * np.log(fitted.sigma) + fitted.instrument @ fitted.instrument / 2)
         pace.advance(len(against), len(left))
     alike = [number for number in against if against[number] <= min(against.values()) + ALIKE]
     best = 0 if 0 in alike else min(alike, key=lambda number: against[number])
@@ -745,10 +742,6 @@ class _Parameter:
     unit: str
     row: Floats
     own: tuple[int, ...]
-
-    def away(self, value: float) -> float:
-        """Return how many prior standard deviations a value is from 0."""
-        return abs(value) / max(float(np.linalg.norm(self.row)), 1e-300)
 
 
 def _parameters(prior_sd: Floats, shares: Floats) -> list[_Parameter]:
@@ -824,22 +817,21 @@ def _selected(
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
     """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
 
-    ``told`` is what the whole map tells, and what its halves do.
+    ``told`` is what the whole map tells, and what its halves do. In a field along one axis, a turn
+    of the probe and an angle between its sensors differ by little: of what explains the map, it is
+    what is certain, and near to 0 by what instruments do.
     """
     kept = np.zeros(len(told[0].sums), bool)
     while True:
-        terms = [_term(parameter, kept, told) for parameter in parameters]
-        new = [(abs(term.value) / term.sd, parameter.away(term.value), parameter.own)
-               for parameter, term in zip(parameters, terms, strict=True)
-               if term.found and not kept[list(parameter.own)].all()]
+        terms, away = zip(*(_term(parameter, kept, told) for parameter in parameters), strict=True)
+        known = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
+        new = [(abs(term.value) / term.sd / (1 + far), parameter.own)
+               for parameter, term, far, old in zip(parameters, terms, away, known, strict=True)
+               if term.found and not old]
         if not new:
-            return kept, tuple(
-                replace(term, predictive=term.predictive and (
-                    not term.found or bool(kept[list(parameter.own)].all())))
-                for parameter, term in zip(parameters, terms, strict=True))
-        enough = AS_CERTAIN * max(certain for certain, *_ in new)
-        _, own = min(each[1:] for each in new if each[0] >= enough)
-        kept[list(own)] = True
+            return kept, tuple(replace(term, predictive=term.predictive and (not term.found or old))
+                               for term, old in zip(terms, known, strict=True))
+        kept[list(max(new)[1])] = True
 
 
 def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
@@ -857,8 +849,10 @@ def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDA
 
 def _term(
     parameter: _Parameter, kept: NDArray[np.bool_], told: list[Evidence]
-) -> InstrumentTerm:
+) -> tuple[InstrumentTerm, float]:
     """Return what the whole map and its halves show of a parameter, besides those that are kept.
+
+    The second number is how many prior standard deviations it is from 0.
 
     If the halves scatter about the whole by more than their bars, its bar is as much longer. They
     support it if both of a pair could tell whether it is there, and none that could contradicts it.
@@ -875,10 +869,11 @@ def _term(
     off = np.abs(values - value) > np.maximum(SEEN * sds, UNLIKE * abs(value))
     supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any())
     prior = float(np.linalg.norm(row))
+    away = float(np.abs(estimates[0][0][np.isin(used, parameter.own)]).max())
     return InstrumentTerm(
         parameter.name, parameter.unit, value, beyond * sd, beyond * sd < DETERMINED * prior,
-        parameter.away(value) <= doubted_from(len(kept)),
-        supported or abs(value) <= SIGNIFICANT * beyond * sd)
+        away <= doubted_from(len(kept)),
+        supported or abs(value) <= SIGNIFICANT * beyond * sd), away
 
 
 # --- what remains -------------------------------------------------------------------------------
