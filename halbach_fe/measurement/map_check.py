@@ -429,9 +429,9 @@ def check_map(
     fitted, terms = _stated(fitted, train, pace)
     _begin(pace, 4, "fitting all scan lines")
     whole = fitted.by(chosen)
-    far_off = spikes(scan.points, whole.unexpected(chosen) / whole.model.scatter[:, None], usable)
+    far_off = spikes(scan.points, whole.left / whole.model.scatter[:, None], usable)
     if far_off.any():
-        broken["spike"] = sorted({*broken.get("spike", ()), *(1 + np.flatnonzero(far_off)).tolist()})
+        broken["spike"] = sorted([*broken.get("spike", ()), *(1 + np.flatnonzero(far_off)).tolist()])
         usable, chosen = usable & ~far_off, chosen & ~far_off
         held_out = _held_out(lines, chosen)
         fitted = fitted.weighted(chosen & ~held_out)  # the spikes took part in the weights
@@ -458,7 +458,7 @@ def _remaining(
     floor = model.field[held_out] - model.readings(fitted.at, held_out)
     unseen = np.full(given.field.shape, np.nan)
     unseen[held_out] = floor
-    residual = model.field - model.readings(whole.at)
+    residual = whole.left
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
         model.noise_left(whole.at, chosen, whole.width2)[1], LEAST_LEFT))
@@ -571,9 +571,10 @@ class _Fitted:
         """Return the fit of other rows."""
         return replace(self, at=fit_probe(self.model, rows, self.fit, self.at, NEXT_ITERATIONS))
 
-    def unexpected(self, rows: NDArray[np.bool_]) -> Floats:
-        """Return how far all readings (n, 3) are off the field of the others among ``rows``."""
-        return self.model.unexpected(self.at, rows, self.width2)
+    @property
+    def left(self) -> Floats:
+        """What the fit leaves of all readings (n, 3) in T."""
+        return np.asarray(self.model.field - self.model.readings(self.at))
 
     def only(self, kept: NDArray[np.bool_], rows: NDArray[np.bool_]) -> _Fitted:
         """Return the fit of some rows by an instrument that has some of the parameters (p,)."""
@@ -612,7 +613,7 @@ def _scan_of(
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     broken = broken_rows(points, field)
     usable = np.isfinite(field).all(axis=1)
-    for rows in broken.values():
+    for rows in (*broken.values(), contradicted_rows(data)):
         usable[np.array(rows, int) - 1] = False
     if usable.sum() < FEWEST_POINTS:
         raise MeasurementError(must_be(

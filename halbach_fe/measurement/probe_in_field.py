@@ -168,17 +168,12 @@ class ProbeModel:
         few such readings, but without weights they are what decides on the instrument: it is given
         errors of many standard deviations that it does not have.
         """
+        left = (self.field - self.readings(at))[rows] / np.maximum(
+            self.noise_left(at, rows, width2)[0], LEAST_OWN)
         other = copy(self)
-        other.scatter = scatter_around(self.points, self.points[rows],
-                                       self.unexpected(at, rows, width2)[rows])
+        other.scatter = scatter_around(self.points, self.points[rows], left)
         other.weights = weights_of(other.scatter)
         return other
-
-    def unexpected(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> Floats:
-        """Return how far all readings (n, 3) are in T off the field of the others among ``rows``."""
-        off = self.field - self.readings(at)
-        off[rows] /= np.maximum(self.noise_left(at, rows, width2)[0], LEAST_OWN)
-        return np.asarray(off)
 
     def allowed(self, at: ProbeFit) -> ProbeFit:
         """Return a fit to start from, with 0 for the parameters that this model leaves out."""

@@ -219,7 +219,7 @@ def sentences(check: MapCheck) -> list[str]:
         found.append(
             f"The map's column of |B| contradicts its components in {len(check.contradicted)} "
             f"row{'s' if len(check.contradicted) > 1 else ''}, which one of the two has wrong: "
-            f"{_numbers(check.contradicted)}. Exclude them, unless you know which.")
+            f"{_numbers(check.contradicted)}. They are left out.")
     terms = sorted((term for term in check.terms if term.found),
                    key=lambda term: -abs(term.value) / term.sd)
     if terms:
@@ -288,7 +288,8 @@ def _where(check: MapCheck, reach: Reach) -> str:
 
 def _impossible(check: MapCheck) -> list[str]:
     """Return the names of the parameters of a probe that no probe has."""
-    return [term.name for term in check.terms if term.determined and not term.plausible]
+    return [term.name for term in check.terms
+            if term.determined and term.predictive and not term.plausible]
 
 
 def _violates(check: MapCheck) -> bool:
@@ -313,16 +314,16 @@ def instrument_table(check: MapCheck) -> list[dict[str, str]]:
     return [{"parameter": term.name,
              "value": f"{with_error(term.value, term.sd)}\u00a0{term.unit}",
              "": "found" if term.found else ""}
-            for term in check.terms if term.determined]
+            for term in check.terms if term.determined and term.predictive]
 
 
 def undetermined(check: MapCheck) -> str:
     """Say which parameters of the instrument the map does not tell, in a sentence; or nothing."""
     said = []
-    for words, predictive in (("Left out, because scan lines are predicted as well without them",
-                               False), ("What this map cannot tell", True)):
-        names = [term.name for term in check.terms
-                 if not term.determined and term.predictive == predictive]
+    for words, predictive in (("Not stated, because parts of the map contradict each other about "
+                               "it", False), ("What this map cannot tell", True)):
+        names = [term.name for term in check.terms if term.predictive == predictive
+                 and not (term.determined and predictive)]
         if names:
             said.append(f"{words}: {'; '.join(names)}.")
     return " ".join(said)

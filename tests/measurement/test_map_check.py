@@ -31,6 +31,7 @@ from halbach_fe.report.map_check import (
     verdict,
     weighted_note,
 )
+from tests.support.hard_maps import ERRORS, hard_map
 from tests.support.short_dipole import FRINGE, truth
 
 NOISE_T = 2e-5
@@ -86,7 +87,8 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
     field = read_by(generator)[::3]
     charges = Charges.around(points, 2.5 * STEP_M)
     (fit,) = fit_fields(charges, points, [field])
-    model = ProbeModel(charges, points, field, np.linspace(-1, 1, len(points)), 0 * points)
+    model = ProbeModel(charges, points, field, np.linspace(-1, 1, len(points)), 0 * points,
+                       np.ones(len(points)))
     at, rows = model.start(fit), np.ones(len(points), bool)
     width2 = fit.sigma**2 / fit.penalty
     left = model.noise_left(at, rows, width2)[1]
@@ -198,12 +200,12 @@ def test_an_imperfect_instrument(generator):
 
 
 def trust_white_noise(monkeypatch):
-    """Let the check believe that whatever the charges do not follow is white noise."""
-    terms = map_check._terms
-    monkeypatch.setattr(map_check, "_terms",
-                        lambda fitted, _, shares: terms(fitted, 1.0, shares))
-    monkeypatch.setattr(map_check, "_confirmed",
-                        lambda model, rows, left_out, fit, start, pace: (model, start))
+    """Let the check believe that whatever the charges do not follow is white noise: the parts of
+    the map tell what the whole map does.
+    """
+    selected = map_check._selected
+    monkeypatch.setattr(map_check, "_selected", lambda parameters, told: selected(
+        parameters, [told[0]] * 3))
 
 
 def far_dipole(points, place):
@@ -214,11 +216,26 @@ def far_dipole(points, place):
     return 3 * away * (away @ moment)[:, None] / distance**5 - moment / distance**3
 
 
-@pytest.mark.parametrize("confirmed", [True, False])
-def test_what_charges_cannot_follow_is_no_error_of_the_probe(generator, monkeypatch, confirmed):
-    """Readings exact to 1 uT of the field of a far dipole. The control asks no line left out."""
-    if not confirmed:
+@pytest.mark.parametrize("asked", [True, False])
+def test_what_parts_of_the_map_contradict_is_no_error_of_the_probe(monkeypatch, asked):
+    """A perfect probe near cubes. The control does not ask the parts: sensors are then apart."""
+    if not asked:
         trust_white_noise(monkeypatch)
+    check = check_map(hard_map(1))
+    assert any(term.found for term in check.terms) != asked
+
+
+@pytest.mark.parametrize("error", ["roll", "lag"])
+def test_an_error_of_the_probe_is_found_near_cubes(error):
+    """Each is found as what it is, and nothing besides."""
+    (term,) = [term for term in check_map(hard_map(1, error)).terms if term.found]
+    name, value = ERRORS[error]
+    assert term.name == name
+    assert abs(term.value - value) < 4 * term.sd
+
+
+def test_what_charges_cannot_follow_is_no_error_of_the_probe(generator):
+    """Readings exact to 1 uT of the field of a far dipole."""
     steps = 0.01 * np.arange(-3, 4)
     points = np.stack(np.meshgrid(steps[1:-1], steps[1:-1], steps, indexing="ij"),
                       axis=-1).reshape(-1, 3)
@@ -226,23 +243,18 @@ def test_what_charges_cannot_follow_is_no_error_of_the_probe(generator, monkeypa
     for place in ([0.3, 0.2, -0.4], [0.1, -0.3, 0.2], [-0.4, 0.1, 0.1]):
         field = far_dipole(points, np.array(place)) + 1e-6 * generator.standard_normal(points.shape)
         found += sum(term.found for term in check_map(field_map(points, field)).terms)
-    assert (found == 0) == confirmed
+    assert found == 0
 
 
-@pytest.mark.parametrize("weighted", [True, False])
-def test_edges_of_magnets_are_no_errors_of_the_probe(generator, monkeypatch, weighted):
+def test_edges_of_magnets_are_no_errors_of_the_probe(generator):
     """A map that ends 6 mm from edges of magnets, which charges follow less well than the probe.
 
-    Nothing is wrong with it. Without weights and without lines that are predicted, the control, the
-    probe is said to have errors.
+    Nothing is wrong with it.
     """
-    if not weighted:
-        monkeypatch.setattr(ProbeModel, "weighted", lambda model, at, rows: model)
-        trust_white_noise(monkeypatch)
     field = truth(generator).getB(FRINGE) + NOISE_T * generator.standard_normal(FRINGE.shape)
     check = check_map(field_map(FRINGE, field))
     assert check.broken == {}
-    assert any(term.found for term in check.terms) != weighted
+    assert not any(term.found for term in check.terms)
 
 
 @pytest.mark.parametrize("spoiled", ["shuffled lines", "curl"])
@@ -420,8 +432,12 @@ def test_a_change_during_the_scan_must_predict_lines(generator):
     assert gain.found
     assert abs(gain.value - 2) < 4 * gain.sd
     assert not [term for term in check.terms if term.name.startswith("turn") and term.found]
-    assert named(check, "change of the offset of Bx from start to end").predictive is False
-    assert "scan lines are predicted as well without them" in undetermined(check)
+    offset = named(check, "change of the offset of Bx from start to end")
+    assert abs(offset.value) < 4 * offset.sd
+    assert not offset.found
+    assert "Not stated" not in undetermined(check)
+    unlike = replace(check, terms=(replace(gain, determined=False, predictive=False),))
+    assert undetermined(unlike).startswith("Not stated, because parts of the map contradict")
 
 
 def test_a_region_in_which_lines_are_not_predicted_is_named(generator):

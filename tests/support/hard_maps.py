@@ -22,7 +22,7 @@ ROLL_RAD, LAG_M, APART_M, GAIN, DRIFT = 0.02, 1e-3, 2e-3, 0.02, 0.02
 ERRORS = {"roll": ("probe turned about z", 1e3 * ROLL_RAD),
           "lag": ("lag of the readings behind the stage", 1e3 * LAG_M),
           "apart": ("y of the Bx sensor from the mean of all", 1e3 * APART_M * 2 / 3),
-          "gain": ("", 100 * GAIN),
+          "gain": ("gain of one component relative to that of |B|", 100 * GAIN),
           "drift": ("change of the gain from start to end", 100 * DRIFT)}
 """The term that each of them is, and its value; a gain counts relative to that of |B|."""
 
