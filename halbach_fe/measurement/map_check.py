@@ -153,6 +153,9 @@ FAR_OFF = 5.0
 the map is wrong. It was 1.1 to 2.9 in four maps by magpylib that end some spacings from magnets,
 and 16 to 36 in the outer lines of three maps in steps of 20 mm that end 30 mm from magnets."""
 
+SAME_M = 2e-6
+"""Difference of places that are the same: points of a ring differ by rounding."""
+
 FEWEST_KEPT = 0.1
 """Smallest part of the held-out readings that makes a region in which they are well predicted."""
 
@@ -231,6 +234,13 @@ class Reach:
     inside_T: float
     beyond_T: float
     noise_T: float
+
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Tell whether points (n, 3) in m, which span the map, are in it."""
+        place = (distance_from_middle(points, points) if self.along == "r"
+                 else points[:, COMPONENTS.index(self.along)])
+        inside = place <= self.limit_m + SAME_M if self.below else place >= self.limit_m - SAME_M
+        return np.asarray(inside)
 
     @property
     def times(self) -> float:
@@ -334,6 +344,13 @@ class MapCheck:
         return float(np.sqrt(np.mean(self.floor_T**2)))
 
     @property
+    def obeys(self) -> bool:
+        """Whether the field that is left is small, everywhere or in the region of `reach`."""
+        if self.reach is not None and np.isfinite(self.reach.limit_m):
+            return self.reach.inside_T <= VIOLATED * self.size_T
+        return self.floor_rms_T <= VIOLATED * self.size_T
+
+    @property
     def uneven(self) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
         """The parts with the least and with the most residual, if these are not of one noise.
 
@@ -413,59 +430,46 @@ def check_map(
     data = _checkable(data)
     scan, usable, broken = _scan_of(data)
     lines = scan_lines(scan.points)
-    chosen = usable & _some_lines(lines, usable)
-    held_out = _held_out(lines, chosen)  # nothing that follows sees them, until the floor
-    train = chosen & ~held_out
+    rows = _Rows(lines, usable, usable & _some_lines(lines, usable))
     pace = Pace(say, progress)
     _begin(pace, 1, "comparing the orientations of the probe")
-    matrix, alike = _orientation(scan.of(train), pace)
-    given, scan = scan, scan.turned(matrix)
+    matrix, alike = _orientation(scan.of(rows.train), pace)
     _begin(pace, 2, "fitting the field and the instrument")
-    gap, sensors, fit = _gap(scan.of(train), pace)
-    # around all rows, of which those that are not fitted are read too
-    model = scan.model(Charges.around(_read_at(scan.points[usable], sensors), gap))
-    fitted = _Fitted(model, fit_probe(model, train, fit), fit).weighted(train)
+    fitted = _first_fit(scan.turned(matrix), rows, pace)
     _begin(pace, 3, "asking every part of the map for each error of the instrument")
-    fitted, terms = _stated(fitted, train, pace)
+    fitted, terms = _stated(fitted, rows.train, pace)
     _begin(pace, 4, "fitting all scan lines")
-    whole = fitted.by(chosen)
-    far_off = spikes(scan.points, whole.left / whole.model.scatter[:, None], usable)
-    if far_off.any():
-        broken["spike"] = sorted([*broken.get("spike", ()), *(1 + np.flatnonzero(far_off)).tolist()])
-        usable, chosen = usable & ~far_off, chosen & ~far_off
-        held_out = _held_out(lines, chosen)
-        fitted = fitted.weighted(chosen & ~held_out)  # the spikes took part in the weights
-        whole = fitted.by(chosen)
+    whole, fitted, rows = _without_spikes(fitted, rows, broken)
     return MapCheck(
-        readings=int(np.isfinite(given.field).sum()), points=len(usable),
-        spacing_m=point_spacing(given.points[chosen]),
-        size_T=float(np.linalg.norm(given.field[usable], axis=1).max()),
-        orientation=_named(matrix), alike=alike, terms=terms,
-        broken=broken, excluded=~usable, contradicted=contradicted_rows(data),
+        readings=int(np.isfinite(scan.field).sum()), points=len(usable),
+        spacing_m=point_spacing(scan.points[rows.chosen]),
+        size_T=float(np.linalg.norm(scan.field[rows.usable], axis=1).max()),
+        orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
+        excluded=~rows.usable, contradicted=contradicted_rows(data),
         corrected_T=fitted.model.ideal(fitted.at),
-        **_remaining(fitted, whole, given, matrix, chosen, held_out))
+        **_remaining(fitted, whole, scan.field, matrix, rows))
 
 
 def _remaining(
-    fitted: _Fitted, whole: _Fitted, given: _Scan, matrix: Floats, chosen: NDArray[np.bool_],
-    held_out: NDArray[np.bool_],
+    fitted: _Fitted, whole: _Fitted, given: Floats, matrix: Floats, rows: _Rows
 ) -> dict[str, Any]:
     """Return what `MapCheck` has of residuals.
 
-    ``fitted`` is the fit of the rows that are not held out, ``whole`` that of all that are chosen.
+    ``fitted`` is the fit of the rows that are not held out, ``whole`` that of all that are chosen,
+    ``given`` (n, 3) in T are the columns of the map, which ``matrix`` (3, 3) turns.
     """
-    model, points = whole.model, given.points
+    model, points, chosen, held_out = whole.model, whole.model.points, rows.chosen, rows.held_out
     floor = model.field[held_out] - model.readings(fitted.at, held_out)
-    unseen = np.full(given.field.shape, np.nan)
+    unseen = np.full(given.shape, np.nan)
     unseen[held_out] = floor
     residual = whole.left
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
         model.noise_left(whole.at, chosen, whole.width2)[1], LEAST_LEFT))
     scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
-    (as_given,) = fit_fields(model.charges, points[chosen], [given.field[chosen]])
+    (as_given,) = fit_fields(model.charges, points[chosen], [given[chosen]])
     return {
-        "rms_as_given_T": _rms(given.field[chosen]
+        "rms_as_given_T": _rms(given[chosen]
                                - model.charges.fields(points[chosen]) @ as_given.amplitudes),
         "rms_T": _rms(residual[chosen] @ np.abs(matrix)), "floor_T": _rms(floor @ np.abs(matrix)),
         "windows": _windows(points[chosen], residual[chosen] @ np.abs(matrix)),
@@ -580,6 +584,50 @@ class _Fitted:
         """Return the fit of some rows by an instrument that has some of the parameters (p,)."""
         model = self.model.with_terms(kept)
         return replace(self, model=model, at=model.allowed(self.at)).by(rows)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The scan line (n,) of every row, and whether it is usable, and chosen to be fitted."""
+
+    lines: Ints
+    usable: NDArray[np.bool_]
+    chosen: NDArray[np.bool_]
+
+    @property
+    def held_out(self) -> NDArray[np.bool_]:
+        """Chosen rows that nothing sees until the floor."""
+        return _held_out(self.lines, self.chosen)
+
+    @property
+    def train(self) -> NDArray[np.bool_]:
+        """Chosen rows that are not held out."""
+        return self.chosen & ~self.held_out
+
+
+def _first_fit(scan: _Scan, rows: _Rows, pace: Pace) -> _Fitted:
+    """Return the fit of the field and of all parameters of the instrument."""
+    gap, sensors, fit = _gap(scan.of(rows.train), pace)
+    # around all rows, of which those that are not fitted are read too
+    model = scan.model(Charges.around(_read_at(scan.points[rows.usable], sensors), gap))
+    return _Fitted(model, fit_probe(model, rows.train, fit), fit).weighted(rows.train)
+
+
+def _without_spikes(
+    fitted: _Fitted, rows: _Rows, broken: dict[str, list[int]]
+) -> tuple[_Fitted, _Fitted, _Rows]:
+    """Return the fits of all chosen rows and of those that are not held out, and the rows.
+
+    Spikes among the rows are added to ``broken`` and left out.
+    """
+    whole = fitted.by(rows.chosen)
+    spike = spikes(whole.model.points, whole.left / whole.model.scatter[:, None], rows.usable)
+    if not spike.any():
+        return whole, fitted, rows
+    broken["spike"] = sorted([*broken.get("spike", ()), *(1 + np.flatnonzero(spike)).tolist()])
+    rows = _Rows(rows.lines, rows.usable & ~spike, rows.chosen & ~spike)
+    fitted = fitted.weighted(rows.train)  # the spikes took part in the weights
+    return fitted.by(rows.chosen), fitted, rows
 
 
 def _checkable(data: xr.Dataset) -> xr.Dataset:
@@ -838,7 +886,7 @@ def _selected(
 def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     """Return halves of the map, two by two: along x, y and z, and by how steep the field is."""
     steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
-    found = []
+    found: list[NDArray[np.bool_]] = []
     for values in (*model.points.T, steepness):
         middle = (float(np.median(values[rows])) if values is steepness
                   else (values[rows].max() + values[rows].min()) / 2)
@@ -908,9 +956,7 @@ def _reach(
     limit = (FAR_OFF * noise_T) ** 2
     if not noise_T or squares.mean() <= limit:
         return None
-    middle = (every.max(axis=0) + every.min(axis=0)) / 2
-    across = np.delete(points - middle, int(np.argmax(np.ptp(every, axis=0))), axis=1)
-    families = [("r", True, np.linalg.norm(across, axis=1))]
+    families = [("r", True, distance_from_middle(points, every))]
     families += [(name, below, column if below else -column) for below in (True, False)
                  for name, column in zip(COMPONENTS, points.T, strict=True)]
     best, most = Reach("r", True, np.nan, np.nan, float(np.sqrt(squares.mean())), noise_T), (
@@ -928,6 +974,16 @@ def _reach(
                                   for part in (inside, ~inside))
                 best = Reach(along, below, float(end if below else -end), within, beyond, noise_T)
     return best
+
+
+def distance_from_middle(points: Floats, every: Floats) -> Floats:
+    """Return the distances (n,) in m from the middle of a map of ``every`` point (m, 3).
+
+    It is the line through its middle along its longest axis.
+    """
+    middle = (every.max(axis=0) + every.min(axis=0)) / 2
+    return np.asarray(np.linalg.norm(np.delete(
+        points - middle, int(np.argmax(np.ptp(every, axis=0))), axis=1), axis=1))
 
 
 def _structure(points: Floats, residual: Floats) -> float:

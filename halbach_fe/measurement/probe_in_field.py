@@ -409,7 +409,7 @@ class Evidence:
     def estimate(self, kept: Ints) -> tuple[Floats, Floats]:
         """Return the values (k,) and covariance (k, k) of an instrument of some parameters only."""
         covariance = np.linalg.inv(self.information[np.ix_(kept, kept)] + np.eye(len(kept)))
-        return covariance @ self.sums[kept], covariance
+        return covariance @ self.sums[kept], np.asarray(covariance)
 
 
 @dataclass(frozen=True)
@@ -469,8 +469,8 @@ class _State:
         count = len(PRIOR_SD)
         design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
         left = self.free.left(design)
-        return design, left, np.linalg.inv(
-            design.T @ left + self.at.sigma**2 * np.eye(count))
+        return design, left, np.asarray(np.linalg.inv(
+            design.T @ left + self.at.sigma**2 * np.eye(count)))
 
     def step(self, design: Floats, inverse: Floats) -> Floats:
         """Return the step (p,) of the instrument, see `normal`."""
