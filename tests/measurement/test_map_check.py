@@ -13,6 +13,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement import map_check, probe_in_field
 from halbach_fe.measurement.field_map import (
+    checked_map,
     field_map,
     points_of,
     read_map,
@@ -24,7 +25,9 @@ from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
 from halbach_fe.measurement.suspect_rows import broken_rows
 from halbach_fe.report.map_check import (
+    OPEN_SIGN,
     answer,
+    inner,
     oriented,
     sentences,
     undetermined,
@@ -456,6 +459,15 @@ def test_a_region_in_which_lines_are_not_predicted_is_named(generator):
         assert said.trust.startswith(f"Only {'within 1' if along == 'r' else 'at z of 6'}")
         assert "times what noise" in said.trust
         assert "beyond that" in said.said
+        kept = inner(field_map(GRID, noise + 1e-3), replace(CLEAN, reach=reach))
+        assert len(points_of(kept)) == np.sum(~worse)  # the region holds no other rows
+        far = answer(replace(CLEAN, reach=reach, floor_T=np.full(3, 0.03 * CLEAN.size_T)))
+        assert far.said.startswith("Passed. ")  # in that region, to 2 % of the largest field
+        assert far.command == "halbach-fe check DIR/inner_map.csv -o DIR2"
+    assert inner(field_map(GRID, noise + 1e-3), CLEAN) is None
+    failed = answer(replace(CLEAN, floor_T=np.full(3, 0.03 * CLEAN.size_T)))
+    assert failed.said.startswith("Failed. ")  # control: it obeys nowhere
+    assert "not described by a field without sources within its region" in failed.said
     everywhere = map_check._reach(GRID, 40 * noise, GRID, NOISE_T)
     assert np.isnan(everywhere.limit_m)
     assert answer(replace(CLEAN, reach=everywhere)).trust.startswith("Only roughly. Everywhere")
@@ -555,3 +567,31 @@ def test_a_map_on_a_stage_is_registered_first():
                  for start in (-0.1, -0.7))
     assert "infer STUDY --measurements MAP" in answer(near).command
     assert "register STUDY --measurements MAP" in answer(far).command
+
+
+def test_what_depends_on_the_common_sign_is_said():
+    assert OPEN_SIGN in sentences(replace(CLEAN, orientation=("x", "y", "-z")))
+    assert OPEN_SIGN not in sentences(CLEAN)
+
+
+@pytest.mark.parametrize("lag_m", [1e-3, 0.0])
+def test_a_lag_along_the_shortest_lines_is_found(generator, lag_m):
+    """The stage goes to and fro along x, of which the map has fewest points; control: no lag."""
+    lines = np.moveaxis(GRID.reshape(5, 7, 9, 3), 0, 2)[:, ::2].reshape(-1, 5, 3).copy()
+    lines[1::2] = lines[1::2, ::-1]
+    way = np.diff(lines, axis=1, prepend=lines[:, :1])
+    points = lines.reshape(-1, 3)
+    field = source().getB(points - lag_m * np.sign(way.reshape(-1, 3)))
+    check = check_map(field_map(points, field + NOISE_T * generator.standard_normal(field.shape)))
+    lag = named(check, "lag of the readings behind the stage")
+    assert [term for term in check.terms if term.found] == ([lag] if lag_m else [])
+    assert abs(lag.value - 1e3 * lag_m) < 4 * lag.sd
+
+
+def test_a_place_may_be_read_twice(generator):
+    """As the middle is at the end of a scan; rows that are copies are none."""
+    again = np.vstack([GRID, GRID[157:158]])
+    field = source().getB(again) + NOISE_T * generator.standard_normal(again.shape)
+    assert len(checked_map(field_map(again, field), "map")["B_T"]) == len(GRID) + 1
+    with pytest.raises(MeasurementError, match="no copy of another row"):
+        checked_map(field_map(np.vstack([GRID, GRID]), np.vstack([field[:-1], field[:-1]])), "map")
