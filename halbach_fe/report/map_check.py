@@ -58,11 +58,6 @@ def answer(check: MapCheck) -> Answer:
             "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
-    trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. More "
-             f"than {100 * VIOLATED:g}\u00a0% of the largest field would fail. A model of the "
-             "magnet that predicts readings worse than this fit lacks something; close to the "
-             "edges of blocks, where the field varies more than the fit can follow, it can do "
-             "better.")
     if _violates(check):
         return Answer(
             question, f"{verdict(check)} {_noise(check)}",
@@ -71,24 +66,7 @@ def answer(check: MapCheck) -> Answer:
             "that are not what the map says, or leave out what is near to magnets and conductors, "
             "and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)
-    if check.structure > REMAINS:
-        trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
-                 f"correlation of {check.structure:.2f}. Something that this check does not know, "
-                 "such as a probe that moves in its holder, is still in the map.")
-    elif check.is_displaced:
-        trust = "No, not as it stands: the field obeys, but readings are not where the map says."
-    elif check.uneven is not None:
-        trust = ("Yes, that it passes: no magnet is assumed, and the lines that were held out were "
-                 "not fitted. No, as a measure of the noise: what is left is not noise alone.")
-    if (reach := check.reach) is not None:
-        trust = (f"Only {_where(check, reach)}. " if np.isfinite(reach.limit_m) else
-                 "Only roughly. ") + (
-            f"{'Beyond that,' if np.isfinite(reach.limit_m) else 'Everywhere,'} held-out lines are "
-            f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
-            "either the field is steeper there than the lines show, as near edges of magnets, or "
-            "these readings are wrong. An update of the magnet tells which."
-            + (" DIR/inner_map.csv is the map without them."
-               if np.isfinite(reach.limit_m) else ""))
+    trust = _trust(check)
     used = "DIR/oriented_map.csv" if better else "MAP"
     named = ("oriented_map.csv, which has the right axes and no broken rows" if better
              else "this map")
@@ -111,6 +89,34 @@ def answer(check: MapCheck) -> Answer:
         question, said, trust, f"Update the magnet with {named}. If you do not know where the map "
         "lies in the magnet, let halbach-fe register find it first.",
         f"halbach-fe infer STUDY --measurements {used} -o DIR")
+
+
+def _trust(check: MapCheck) -> str:
+    """Say how far the answer that a map passes can be trusted."""
+    trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. More "
+             f"than {100 * VIOLATED:g}\u00a0% of the largest field would fail. A model of the "
+             "magnet that predicts readings worse than this fit lacks something; close to the "
+             "edges of blocks, where the field varies more than the fit can follow, it can do "
+             "better.")
+    if check.structure > REMAINS:
+        trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
+                 f"correlation of {check.structure:.2f}. Something that this check does not know, "
+                 "such as a probe that moves in its holder, is still in the map.")
+    elif check.is_displaced:
+        trust = "No, not as it stands: the field obeys, but readings are not where the map says."
+    elif check.uneven is not None:
+        trust = ("Yes, that it passes: no magnet is assumed, and the lines that were held out were "
+                 "not fitted. No, as a measure of the noise: what is left is not noise alone.")
+    if (reach := check.reach) is not None:
+        trust = (f"Only {_where(check, reach)}. " if np.isfinite(reach.limit_m) else
+                 "Only roughly. ") + (
+            f"{'Beyond that,' if np.isfinite(reach.limit_m) else 'Everywhere,'} held-out lines are "
+            f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
+            "either the field is steeper there than the lines show, as near edges of magnets, or "
+            "these readings are wrong. An update of the magnet tells which."
+            + (" DIR/inner_map.csv is the map without them."
+               if np.isfinite(reach.limit_m) else ""))
+    return trust
 
 
 def total_answer(check: TotalCheck) -> Answer:

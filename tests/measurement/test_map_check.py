@@ -574,9 +574,11 @@ def test_what_depends_on_the_common_sign_is_said():
     assert OPEN_SIGN not in sentences(CLEAN)
 
 
-@pytest.mark.parametrize("lag_m", [1e-3, 0.0])
+@pytest.mark.parametrize("lag_m", [STEP_M, 1e-3, 0.0])
 def test_a_lag_along_the_shortest_lines_is_found(generator, lag_m):
-    """The stage goes to and fro along x, of which the map has fewest points; control: no lag."""
+    """The stage goes to and fro along x, of which the map has fewest points; the readings are late
+    by 1 mm, or by a row. Control: no lag.
+    """
     lines = np.moveaxis(GRID.reshape(5, 7, 9, 3), 0, 2)[:, ::2].reshape(-1, 5, 3).copy()
     lines[1::2] = lines[1::2, ::-1]
     way = np.diff(lines, axis=1, prepend=lines[:, :1])
