@@ -77,7 +77,8 @@ def answer(check: MapCheck) -> Answer:
                       "halbach-fe check MAP -o DIR", sound=False)
     if check.floor_rms_T > VIOLATED * check.size_T:
         return Answer(
-            question, f"{verdict(check)} {_noise(check)}", trust, "Cut the map back: inner_map.csv has the readings "
+            question, f"{verdict(check)} {_noise(check)}", trust,
+            "Cut the map back: inner_map.csv has the readings "
             f"{_where(check, check.reach)} only. Check it alone."
             if check.reach is not None else "", "halbach-fe check DIR/inner_map.csv -o DIR2")
     if _on_a_stage(check):
