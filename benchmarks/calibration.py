@@ -1,4 +1,4 @@
-"""Calibration of the posteriors: the p-values that `make verify-calibration` has found."""
+"""Calibration: p-values that `make verify-calibration` has found, and instruments by `check`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 
 from benchmarks.note import Note
 from halbach_fe.core.errors import StudyError
+from halbach_fe.measurement.map_check import check_map
+from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 
 RESULTS = Path(__file__).parent.parent / "results" / "calibration" / "calibration.json"
 NAMES = {
@@ -28,3 +30,31 @@ def run(note: Note) -> None:
     for name, short in NAMES.items():
         note(f"calibration.{short}_p", found[name]["p_value"], "p-value",
              f"ranks of {found[name]['repeats']} truths of make verify-calibration: {name}")
+
+
+MAPS = 40
+"""Number of maps with a perfect instrument, and of those with an instrument that has one error."""
+
+
+def instrument(note: Note) -> None:
+    """Note how often `check` finds errors of a probe that are not there, and those that are."""
+    false = sum(any(term.found for term in check_map(hard_map(seed)).terms)
+                for seed in range(MAPS))
+    found = within = 0
+    for seed in range(MAPS):
+        error = list(ERRORS)[seed // 4 % len(ERRORS)]
+        data = hard_map(seed, error)
+        name, value = ERRORS[error]
+        if error == "gain":
+            own, share = gain_of(data["B_T"].values)
+            name, value = f"gain of B{'xyz'[own]} relative to that of |B|", 100 * GAIN * (1 - share)
+        (term,) = [term for term in check_map(data).terms if term.name == name]
+        found += term.found
+        within += abs(term.value - value) <= 2 * term.sd
+    against = f"of {MAPS} maps near blocks and coils by magpylib"
+    note("check.instrument_false_rate", false / MAPS, "ratio",
+         f"{against}, with a perfect probe; asked: 0.02 at most")
+    note("check.instrument_found_rate", found / MAPS, "ratio",
+         f"{against}, with one error of usual size; asked: 0.9 at least")
+    note("check.instrument_within_2sd", within / MAPS, "ratio",
+         "the same maps: share whose error is within 2 sd, found or not")

@@ -39,13 +39,14 @@ RESULTS = Path(__file__).parent / "results.json"
 PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "inference": inference.run, "diagnosis": diagnosis.run, "recovery": recovery.run,
          "scaling": scaling.run, "moments": moments.run, "iron3d": iron3d.run,
-         "calibration": calibration.run, "unknown": unknown.run, "suspicion": suspicion.run,
+         "calibration": calibration.run, "check": calibration.instrument, "unknown": unknown.run,
+         "suspicion": suspicion.run,
          "campaign_kinds": campaign_kinds.run, "campaign_knee": campaign_kinds.run_knee,
          "real": real.emphatic, "real_mri": real.mri, "faser": real.faser,
          "design": design.run, "mri": mri.run, "speed": speed.run, "speed_small": speed.small,
          "speed_full": speed.full, "speed_permeability": speed.permeability,
          "speed_solvers": speed.solvers}
-ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "unknown", "suspicion",
+ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "check", "unknown", "suspicion",
          "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
          "design", "mri", "speed", "speed_small", "speed_full", "speed_permeability",
          "speed_solvers")

@@ -5,8 +5,9 @@ three-axis probe. Says which signs or exchanged axes make the map obey div B = 0
 where the sensors are, how the probe is turned, which rows are broken, and which noise remains: no
 model of a magnet can explain the map any better. With an output folder, also writes check.json,
 check.csv (the residual of every reading), check.html and its figures, oriented_map.csv, the
-map without broken rows and with its components along the right axes, and corrected_map.csv, what a
-probe without errors would have read. Of a map of |B| alone only rows that are broken, repeated
+map without broken rows and with its components along the right axes, inner_map.csv, its region that
+a field without sources describes, if it is not all, and corrected_map.csv, what a probe without
+errors would have read. Of a map of |B| alone only rows that are broken, repeated
 places and noise are checked, and the folder has check.json alone.
 """
 

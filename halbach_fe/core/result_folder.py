@@ -66,7 +66,8 @@ WRITES = {
     "demagnetization": ("demagnetization.*", "demagnetization_*.png"),
     "simulate-measurement": ("blocks.csv", "map.csv", "map.h5", "held-out.csv", "held-out.h5",
                              "truth/truth.json", "campaign.html", "campaign_*.png"),
-    "check": ("check.*", "check_*.png", "oriented_map.csv", "corrected_map.csv"),
+    "check": ("check.*", "check_*.png", "oriented_map.csv", "inner_map.csv",
+              "corrected_map.csv"),
     "register": ("registration.*", "*/registration.*", "*/page.json", "study.registered.toml"),
     "report": ("report.html",)}
 """Names of the results of every command, beside page.json: what it must not find in its folder

@@ -68,6 +68,9 @@ LENGTH_OFF = 0.1
 """Part by which |B| may differ from the length of the components beside it where they are strong:
 gains of two probes differ by a few per cent, units by factors of 10."""
 
+COPIES = 0.1
+"""Share of rows from which rows that are alike in all numbers are copies, and no chance."""
+
 
 def field_map(
     points: Floats, flux_density: Floats, sigma: Floats | None = None,
@@ -569,16 +572,22 @@ def check_magnitudes(data: xr.Dataset) -> None:
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
-    """Raise MeasurementError if a point occurs twice at the same time and in the same scan."""
-    keys = [points]
-    if "time_s" in data:
-        keys.append(data["time_s"].values[:, None])
+    """Raise MeasurementError if rows are copies of others: of the same place, time and readings.
+
+    A place that is read again, as the middle at the end of a scan, is none: its readings differ by
+    their noise, but for a few that rounding makes alike.
+    """
+    keys = [points, np.nan_to_num(data["B_T"].values)]
+    for name in ("time_s", *TOTAL_COLUMNS):
+        if name in data:
+            keys.append(np.nan_to_num(data[name].values)[:, None])
     if "scan" in data:
         keys.append(np.unique(data["scan"].values, return_inverse=True)[1][:, None].astype(float))
-    unique, first = np.unique(np.hstack(keys), axis=0, return_index=True)
-    if len(unique) < len(points):
-        row = int(np.setdiff1d(np.arange(len(points)), first)[0])
-        x, y, z = points[row]
+    _, first = np.unique(np.hstack(keys), axis=0, return_index=True)
+    copies = np.setdiff1d(np.arange(len(points)), first)
+    if len(copies) > COPIES * len(points):
+        x, y, z = points[copies[0]]
         raise MeasurementError(must_be(
-            f"reading {row + 1}", where, "at a point of its own", f"({x:g}, {y:g}, {z:g}) m again",
-            "Remove it, or distinguish repeated readings by time_s or scan."))
+            f"reading {copies[0] + 1}", where, "no copy of another row", f"({x:g}, {y:g}, {z:g}) m "
+            f"with the same readings again, as {len(copies)} rows are",
+            "Remove them, or distinguish repeated readings by time_s or scan."))

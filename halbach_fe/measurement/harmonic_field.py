@@ -190,6 +190,9 @@ class HarmonicFit:
     used: float
 
 
+ROUNDING = 1e-14
+"""Relative size of eigenvalues below which they are rounding."""
+
 PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
 """Penalties among which the evidence chooses, in units of the mean information per amplitude."""
 
@@ -206,22 +209,29 @@ def fit_fields(charges: Charges, points: Floats, fields: Sequence[Floats]) -> li
 
 def fit_readings(design: Floats, readings: Sequence[Floats]) -> list[HarmonicFit]:
     """Fit each of some readings (m,) in T, of which ``design`` (m, k) is that per amplitude."""
-    values, vectors = np.linalg.eigh(design.T @ design)
-    values = np.maximum(values, 0.0)
-    return [_most_probable(values, vectors, vectors.T @ (design.T @ each), each)
+    count = design.shape[1]
+    if len(design) < count:  # the same by the smaller matrix
+        values, left = np.linalg.eigh(design @ design.T)
+        kept = values > ROUNDING * values[-1]
+        values, left = values[kept], left[:, kept]
+        vectors, projections = design.T @ (left / np.sqrt(values)), left * np.sqrt(values)
+    else:
+        values, vectors = np.linalg.eigh(design.T @ design)
+        values, projections = np.maximum(values, 0.0), design @ vectors
+    return [_most_probable(values, vectors, projections.T @ each, each, count)
             for each in readings]
 
 
 def _most_probable(
-    values: Floats, vectors: Floats, projected: Floats, readings: Floats
+    values: Floats, vectors: Floats, projected: Floats, readings: Floats, count: int
 ) -> HarmonicFit:
     """Return the fit of largest evidence.
 
-    ``values`` (k,) and ``vectors`` (k, k) belong to the information, and ``projected`` (k,) are the
-    products of the vectors with it.
+    ``values`` and ``vectors`` belong to the information of ``count`` amplitudes, but for values of
+    0, and ``projected`` are the products of the vectors with it.
     """
     best: HarmonicFit | None = None
-    for penalty in PENALTIES * values.sum() / len(values):
+    for penalty in PENALTIES * values.sum() / count:
         rest = float(readings @ readings - np.sum(projected**2 / (values + penalty)))
         sigma = np.sqrt(max(rest, 1e-30) / len(readings))
         evidence = (-len(readings) * np.log(sigma)

@@ -15,8 +15,9 @@ magnet is as good as that of the magnet).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import permutations, product
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -34,28 +35,45 @@ from halbach_fe.measurement.field_map import (
     refuse_total_field,
     refuse_undirected,
 )
-from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_fields, spacing_of
+from halbach_fe.measurement.harmonic_field import (
+    Charges,
+    HarmonicFit,
+    fit_fields,
+    fit_readings,
+    spacing_of,
+)
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,
     GAINS,
     LAG,
+    MATRICES,
     MIXING,
     NEXT_ITERATIONS,
     OFFSETS,
-    SENSORS,
+    PAIRS,
     TURNS,
+    Evidence,
     ProbeFit,
     ProbeModel,
     fit_probe,
     scatter_of,
+    weights_of,
 )
 from halbach_fe.measurement.scan_lines import (
     HELD_OUT_EVERY,
     held_out_lines,
+    motion,
     point_spacing,
     scan_lines,
 )
-from halbach_fe.measurement.suspect_rows import broken_rows, contradicted_rows, rough_rows, spikes
+from halbach_fe.measurement.suspect_rows import (
+    broken_rows,
+    contradicted_rows,
+    quadratic_residual,
+    rough_rows,
+    scatter_around,
+    spikes,
+)
 from halbach_fe.study.types import COMPONENTS
 
 SMALLEST_FIELD_T = 1e-12
@@ -84,16 +102,18 @@ WEIGHTINGS = 2
 millimetres apart, the largest of nine errors of their places was 5 to 19 standard deviations with
 the first weights, 3.3 with these, and 3.3 with more."""
 
-PREDICTS = 1.02
-"""Factor by which the error of lines that are left out must grow without a change of the instrument
-for it to be kept. Without any drift it changed by -2 % to +1.3 % in four maps of 315 points."""
+FEWEST_IN_PART = 40
+"""Smallest number of readings of a part of the map that tells of the instrument by itself."""
 
-GROUPS = (slice(None), GAINS, OFFSETS, TURNS, SENSORS, MIXING)
-"""Parameters that must help to predict: all together, those that change during the scan, places of
-the sensors, and their directions and gains."""
+ROUNDS = 2
+"""Number of times that parameters are chosen: weights and linearization are those of the choice
+before."""
 
-CONFIRMATIONS = 1 + len(GROUPS)
-"""Number of fits that compare what the parameters predict."""
+SEEN = 2.0
+"""Standard deviations of a part from which it can tell whether a parameter is there."""
+
+UNLIKE = 0.5
+"""Share of a parameter by which a part may be off it, if its bar does not allow more."""
 
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
@@ -133,6 +153,9 @@ FAR_OFF = 5.0
 the map is wrong. It was 1.1 to 2.9 in four maps by magpylib that end some spacings from magnets,
 and 16 to 36 in the outer lines of three maps in steps of 20 mm that end 30 mm from magnets."""
 
+SAME_M = 2e-6
+"""Difference of places that are the same: points of a ring differ by rounding."""
+
 FEWEST_KEPT = 0.1
 """Smallest part of the held-out readings that makes a region in which they are well predicted."""
 
@@ -168,7 +191,7 @@ class InstrumentTerm:
     plausible : bool
         Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
     predictive : bool
-        Whether scan lines that are left out are predicted better with it.
+        Whether no part of the map contradicts the others about it, see `_term`.
     """
 
     name: str
@@ -182,7 +205,8 @@ class InstrumentTerm:
     @property
     def found(self) -> bool:
         """Whether it differs from 0 with certainty."""
-        return self.determined and abs(self.value) > SIGNIFICANT * self.sd
+        return (self.determined and self.plausible and self.predictive
+                and abs(self.value) > SIGNIFICANT * self.sd)
 
 
 @dataclass(frozen=True)
@@ -210,6 +234,13 @@ class Reach:
     inside_T: float
     beyond_T: float
     noise_T: float
+
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Tell whether points (n, 3) in m, which span the map, are in it."""
+        place = (distance_from_middle(points, points) if self.along == "r"
+                 else points[:, COMPONENTS.index(self.along)])
+        inside = place <= self.limit_m + SAME_M if self.below else place >= self.limit_m - SAME_M
+        return np.asarray(inside)
 
     @property
     def times(self) -> float:
@@ -313,6 +344,13 @@ class MapCheck:
         return float(np.sqrt(np.mean(self.floor_T**2)))
 
     @property
+    def obeys(self) -> bool:
+        """Whether the field that is left is small, everywhere or in the region of `reach`."""
+        if self.reach is not None and np.isfinite(self.reach.limit_m):
+            return self.reach.inside_T <= VIOLATED * self.size_T
+        return self.floor_rms_T <= VIOLATED * self.size_T
+
+    @property
     def uneven(self) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
         """The parts with the least and with the most residual, if these are not of one noise.
 
@@ -389,106 +427,59 @@ def check_map(
     >>> hf.check_map(field_map(points, field)).suffices
     True
     """
-    data = checked_map(data, "`data`")
-    refuse_undirected(data)
-    refuse_total_field(data, "Maxwell's check")
-    check_magnitudes(data)
-    points, field = points_of(data), np.asarray(data["B_T"].values, float)
-    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
-    broken = broken_rows(points, field)
-    usable = np.isfinite(field).all(axis=1)
-    for rows in broken.values():
-        usable[np.array(rows, int) - 1] = False
-    missing = [f"B{name}" for name, column in zip(COMPONENTS, field.T, strict=True)
-               if not np.isfinite(column).any()]
-    if missing:
-        raise MeasurementError(must_be(
-            where, "Maxwell's check", "with all three components of B",
-            f"a map without {' and '.join(missing)}", "How B changes along the magnet is not in a "
-            "map of a cross-section: test that by the chi² of `halbach-fe infer`."))
-    if usable.sum() < FEWEST_POINTS:
-        raise MeasurementError(must_be(
-            where, "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
-            "components, neither all zero nor repeated", f"{int(usable.sum())}",
-            "A line of one component obeys Maxwell's equations whatever it is."))
-    if (np.ptp(points[usable], axis=0) > point_spacing(points[usable]) / 2).sum() < 2:
-        raise MeasurementError(must_be(
-            where, "Maxwell's check", "of points in a plane or a volume", "points on a line",
-            "Along a line any field has div B = 0 and curl B = 0."))
-    if np.abs(field[usable]).max() < SMALLEST_FIELD_T:
-        raise MeasurementError(must_be(
-            where, "Maxwell's check", f"of a field of at least {SMALLEST_FIELD_T:g} T somewhere",
-            f"{np.abs(field[usable]).max():.3g} T", "Is it in tesla?"))
-    rough = rough_rows(points, field, usable)
-    usable &= ~rough
-    lines = scan_lines(points)
-    chosen = usable & _some_lines(lines, usable)
-    time = _time(data, len(points))
+    data = _checkable(data)
+    scan, usable, broken = _scan_of(data)
+    lines = scan_lines(scan.points)
+    rows = _Rows(lines, usable, usable & _some_lines(lines, usable))
     pace = Pace(say, progress)
     _begin(pace, 1, "comparing the orientations of the probe")
-    places, readings = points[chosen], field[chosen]
-    spacing = point_spacing(places)
-    directions = _directions(points, lines)
-    held_out = _held_out(lines, chosen)  # nothing that follows sees them, until the floor
-    train_rows = chosen & ~held_out
-    seen = points[train_rows], field[train_rows], time[train_rows], directions[train_rows]
-    matrix, alike = _orientation(*seen, spacing, pace)
+    matrix, alike = _orientation(scan.of(rows.train), pace)
     _begin(pace, 2, "fitting the field and the instrument")
-    gap, sensors, first_fit = _gap(seen[0], seen[1] @ matrix.T, *seen[2:], spacing, pace)
-    # around all rows, of which those that are not fitted are read too
-    charges = Charges.around(_read_at(points[usable], sensors), gap)
-    turned = field @ matrix.T
-    model = ProbeModel(charges, points, turned, time, directions)
-    train = fit_probe(model, train_rows, first_fit)
-    model = model.weighted(train, train_rows)
-    # the prior width of the field, now that the instrument no longer counts as noise
-    fit = model.fit(train, train_rows)
-    _begin(pace, 3, "asking each change of the instrument to predict scan lines")
-    model, train = _confirmed(model, train_rows, _held_out(lines, train_rows), fit, train, pace)
-    for number in range(WEIGHTINGS):
-        model = model.weighted(train, train_rows)
-        train = fit_probe(model, train_rows, fit, train)
-        pace.advance(CONFIRMATIONS + number + 1, CONFIRMATIONS + WEIGHTINGS)
+    fitted = _first_fit(scan.turned(matrix), rows, pace)
+    _begin(pace, 3, "asking every part of the map for each error of the instrument")
+    fitted, terms = _stated(fitted, rows.train, pace)
     _begin(pace, 4, "fitting all scan lines")
-    whole = fit_probe(model, chosen, fit, train)
-    far_off = spikes(points, (turned - model.readings(whole)) / model.expected(whole, chosen),
-                     usable)
-    if rough.any() or far_off.any():
-        broken["spike"] = (1 + np.flatnonzero(rough | far_off)).tolist()
-    if far_off.any():
-        usable, chosen = usable & ~far_off, chosen & ~far_off
-        held_out = _held_out(lines, chosen)
-        for _ in range(WEIGHTINGS):  # the spikes took part in the weights
-            model = model.weighted(train, chosen & ~held_out)
-            train = fit_probe(model, chosen & ~held_out, fit, train)
-        whole = fit_probe(model, chosen, fit, train)
-    floor = turned[held_out] - model.readings(train, held_out)
-    unseen = np.full(field.shape, np.nan)
+    whole, fitted, rows = _without_spikes(fitted, rows, broken)
+    return MapCheck(
+        readings=int(np.isfinite(scan.field).sum()), points=len(usable),
+        spacing_m=point_spacing(scan.points[rows.chosen]),
+        size_T=float(np.linalg.norm(scan.field[rows.usable], axis=1).max()),
+        orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
+        excluded=~rows.usable, contradicted=contradicted_rows(data),
+        corrected_T=fitted.model.ideal(fitted.at),
+        **_remaining(fitted, whole, scan.field, matrix, rows))
+
+
+def _remaining(
+    fitted: _Fitted, whole: _Fitted, given: Floats, matrix: Floats, rows: _Rows
+) -> dict[str, Any]:
+    """Return what `MapCheck` has of residuals.
+
+    ``fitted`` is the fit of the rows that are not held out, ``whole`` that of all that are chosen,
+    ``given`` (n, 3) in T are the columns of the map, which ``matrix`` (3, 3) turns.
+    """
+    model, points, chosen, held_out = whole.model, whole.model.points, rows.chosen, rows.held_out
+    floor = model.field[held_out] - model.readings(fitted.at, held_out)
+    unseen = np.full(given.shape, np.nan)
     unseen[held_out] = floor
-    residual = turned - model.readings(whole)
-    beyond = _rms(floor * model.weights[held_out]) / _rms(residual[chosen] * model.weights[chosen])
-    redundancy = 1 - whole.used / (3 * int(chosen.sum()))
+    residual = whole.left
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
-        model.noise_left(whole, chosen, fit.sigma**2 / fit.penalty), LEAST_LEFT))
-    scatter = scatter_of(charges.gradient(points[chosen], whole.amplitudes), left)
-    (as_given,) = fit_fields(charges, places, [readings])
-    given = readings - charges.fields(places) @ as_given.amplitudes
-    return MapCheck(
-        readings=int(np.isfinite(field).sum()), points=len(points), spacing_m=spacing,
-        size_T=float(np.linalg.norm(field[usable], axis=1).max()),
-        orientation=_named(matrix), alike=alike,
-        rms_as_given_T=_rms(given), rms_T=_rms(residual[chosen] @ np.abs(matrix)),
-        floor_T=_rms(floor @ np.abs(matrix)),
-        terms=_terms(whole, max(float(beyond.max()), 1.0), model.shares(whole)), broken=broken,
-        windows=_windows(points[chosen], residual[chosen] @ np.abs(matrix)),
-        noise_T=scatter.noise_T, position_noise_m=scatter.position_m,
-        position_noise_sd_m=scatter.position_sd_m, position_noise_at_most=scatter.at_most,
-        structure=_structure(points[chosen], residual[chosen]),
-        reach=_reach(points[held_out], floor, points[chosen], float(np.sqrt(np.mean(left**2)))),
-        redundancy=redundancy, excluded=~usable,
-        residual_T=residual @ matrix, unseen_T=unseen @ matrix, corrected_T=model.ideal(train),
-        contradicted=contradicted_rows(data))
+        model.noise_left(whole.at, chosen, whole.width2)[1], LEAST_LEFT))
+    scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
+    (as_given,) = fit_fields(model.charges, points[chosen], [given[chosen]])
+    return {
+        "rms_as_given_T": _rms(given[chosen]
+                               - model.charges.fields(points[chosen]) @ as_given.amplitudes),
+        "rms_T": _rms(residual[chosen] @ np.abs(matrix)), "floor_T": _rms(floor @ np.abs(matrix)),
+        "windows": _windows(points[chosen], residual[chosen] @ np.abs(matrix)),
+        "noise_T": scatter.noise_T, "position_noise_m": scatter.position_m,
+        "position_noise_sd_m": scatter.position_sd_m, "position_noise_at_most": scatter.at_most,
+        "structure": _structure(points[chosen], (residual * model.weights)[chosen]),
+        "reach": _reach(points[held_out], floor, points[chosen],
+                        float(1.4826 * np.median(np.abs(left)))),
+        "redundancy": 1 - whole.at.used / (3 * int(chosen.sum())),
+        "residual_T": residual @ matrix, "unseen_T": unseen @ matrix}
 
 
 def _begin(pace: Pace, step: int, what: str) -> None:
@@ -527,13 +518,171 @@ def _some_lines(lines: Ints, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(lines % every == 0)
 
 
-def _directions(points: Floats, lines: Ints) -> Floats:
-    """Return the direction (n, 3) in which the stage moved to every point, 0 at jumps."""
-    step = np.diff(points, axis=0, prepend=points[:1])
-    size = np.linalg.norm(step, axis=1)
-    same = np.diff(lines, prepend=lines[:1]) == 0
-    return np.asarray(np.where((same & (size > 0))[:, None],
-                               step / np.maximum(size, 1e-12)[:, None], 0.0))
+# --- what is fitted -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Readings (n, 3) in T at points (n, 3) in m.
+
+    ``scatter`` (n,) in T is by how much readings around are off functions through neighbours,
+    ``directions`` (n, 3) are those along which the stage came, ``time`` (n,) is from -1 to 1.
+    """
+
+    points: Floats
+    field: Floats
+    time: Floats
+    directions: Floats
+    scatter: Floats
+
+    def of(self, rows: NDArray[np.bool_] | Ints) -> _Scan:
+        """Return some of the rows."""
+        return _Scan(*(values[rows] for values in self.__dict__.values()))
+
+    def turned(self, matrix: Floats) -> _Scan:
+        """Return the components that a matrix (3, 3) makes of the columns."""
+        return replace(self, field=self.field @ matrix.T)
+
+    def model(self, charges: Charges) -> ProbeModel:
+        """Return the model of the readings."""
+        return ProbeModel(charges, *self.__dict__.values())
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A model, its fit, and the fit of the field alone that has the width of its prior."""
+
+    model: ProbeModel
+    at: ProbeFit
+    fit: HarmonicFit
+
+    @property
+    def width2(self) -> float:
+        """Prior variance of the amplitudes in T^2."""
+        return self.fit.sigma**2 / self.fit.penalty
+
+    def weighted(self, rows: NDArray[np.bool_]) -> _Fitted:
+        """Return the fit of some rows that are weighted anew."""
+        fitted = self
+        for _ in range(WEIGHTINGS):
+            model = fitted.model.weighted(fitted.at, rows, fitted.width2)
+            # the prior width of the field, now that the instrument no longer counts as noise
+            fit = model.fit(fitted.at, rows)
+            fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, NEXT_ITERATIONS), fit)
+        return fitted
+
+    def by(self, rows: NDArray[np.bool_]) -> _Fitted:
+        """Return the fit of other rows."""
+        return replace(self, at=fit_probe(self.model, rows, self.fit, self.at, NEXT_ITERATIONS))
+
+    @property
+    def left(self) -> Floats:
+        """What the fit leaves of all readings (n, 3) in T."""
+        return np.asarray(self.model.field - self.model.readings(self.at))
+
+    def only(self, kept: NDArray[np.bool_], rows: NDArray[np.bool_]) -> _Fitted:
+        """Return the fit of some rows by an instrument that has some of the parameters (p,)."""
+        model = self.model.with_terms(kept)
+        return replace(self, model=model, at=model.allowed(self.at)).by(rows)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The scan line (n,) of every row, and whether it is usable, and chosen to be fitted."""
+
+    lines: Ints
+    usable: NDArray[np.bool_]
+    chosen: NDArray[np.bool_]
+
+    @property
+    def held_out(self) -> NDArray[np.bool_]:
+        """Chosen rows that nothing sees until the floor."""
+        return _held_out(self.lines, self.chosen)
+
+    @property
+    def train(self) -> NDArray[np.bool_]:
+        """Chosen rows that are not held out."""
+        return self.chosen & ~self.held_out
+
+
+def _first_fit(scan: _Scan, rows: _Rows, pace: Pace) -> _Fitted:
+    """Return the fit of the field and of all parameters of the instrument."""
+    gap, sensors, fit = _gap(scan.of(rows.train), pace)
+    # around all rows, of which those that are not fitted are read too
+    model = scan.model(Charges.around(_read_at(scan.points[rows.usable], sensors), gap))
+    return _Fitted(model, fit_probe(model, rows.train, fit), fit).weighted(rows.train)
+
+
+def _without_spikes(
+    fitted: _Fitted, rows: _Rows, broken: dict[str, list[int]]
+) -> tuple[_Fitted, _Fitted, _Rows]:
+    """Return the fits of all chosen rows and of those that are not held out, and the rows.
+
+    Spikes among the rows are added to ``broken`` and left out.
+    """
+    whole = fitted.by(rows.chosen)
+    spike = spikes(whole.model.points, whole.left / whole.model.scatter[:, None], rows.usable)
+    if not spike.any():
+        return whole, fitted, rows
+    broken["spike"] = sorted([*broken.get("spike", ()), *(1 + np.flatnonzero(spike)).tolist()])
+    rows = _Rows(rows.lines, rows.usable & ~spike, rows.chosen & ~spike)
+    fitted = fitted.weighted(rows.train)  # the spikes took part in the weights
+    return fitted.by(rows.chosen), fitted, rows
+
+
+def _checkable(data: xr.Dataset) -> xr.Dataset:
+    """Return the map as it is checked; MeasurementError if it holds what no map does."""
+    data = checked_map(data, "`data`")
+    refuse_undirected(data)
+    refuse_total_field(data, "Maxwell's check")
+    check_magnitudes(data)
+    missing = [f"B{name}" for name, column in zip(COMPONENTS, data["B_T"].values.T, strict=True)
+               if not np.isfinite(column).any()]
+    if missing:
+        raise MeasurementError(must_be(
+            _where(data), "Maxwell's check", "with all three components of B",
+            f"a map without {' and '.join(missing)}", "How B changes along the magnet is not in a "
+            "map of a cross-section: test that by the chi² of `halbach-fe infer`."))
+    return data
+
+
+def _where(data: xr.Dataset) -> str:
+    """Return how error messages call the map."""
+    return f"map {data.encoding['source']}" if "source" in data.encoding else "map"
+
+
+def _scan_of(
+    data: xr.Dataset
+) -> tuple[_Scan, NDArray[np.bool_], dict[str, list[int]]]:
+    """Return the readings, which of them are usable, and the rows that are broken.
+
+    MeasurementError if too few are usable, see `check_map`.
+    """
+    points, field = points_of(data), np.asarray(data["B_T"].values, float)
+    broken = broken_rows(points, field)
+    usable = np.isfinite(field).all(axis=1)
+    for rows in (*broken.values(), contradicted_rows(data)):
+        usable[np.array(rows, int) - 1] = False
+    if usable.sum() < FEWEST_POINTS:
+        raise MeasurementError(must_be(
+            _where(data), "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
+            "components, neither all zero nor repeated", f"{int(usable.sum())}",
+            "A line of one component obeys Maxwell's equations whatever it is."))
+    if (np.ptp(points[usable], axis=0) > point_spacing(points[usable]) / 2).sum() < 2:
+        raise MeasurementError(must_be(
+            _where(data), "Maxwell's check", "of points in a plane or a volume",
+            "points on a line", "Along a line any field has div B = 0 and curl B = 0."))
+    if np.abs(field[usable]).max() < SMALLEST_FIELD_T:
+        raise MeasurementError(must_be(
+            _where(data), "Maxwell's check", f"of a field of at least {SMALLEST_FIELD_T:g} T "
+            "somewhere", f"{np.abs(field[usable]).max():.3g} T", "Is it in tesla?"))
+    rough = rough_rows(points, field, usable)
+    if rough.any():
+        broken["spike"] = (1 + np.flatnonzero(rough)).tolist()
+    usable &= ~rough
+    off, sd = quadratic_residual(points[usable], field[usable])
+    scatter = scatter_around(points, points[usable], off / sd[:, None])
+    return _Scan(points, field, _time(data, len(points)), motion(points), scatter), usable, broken
 
 
 # --- orientation --------------------------------------------------------------------------------
@@ -554,59 +703,58 @@ def _named(matrix: Floats) -> tuple[str, str, str]:
 
 
 def _orientation(
-    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float, pace: Pace
+    scan: _Scan, pace: Pace
 ) -> tuple[Floats, tuple[tuple[str, str, str], ...]]:
     """Return the matrix of the orientation, and others that fit as well.
 
-    If orientations fit about equally well with a perfect instrument, each gets its own instrument.
-    The axes are taken as they are given if nothing speaks against them.
+    If orientations fit about equally well with a perfect instrument, each gets its own instrument,
+    which must be a possible one. The axes are taken as they are given if nothing speaks against
+    them.
     """
-    some = _some_points(points)
-    charges = Charges.around(points[some], GAPS[-2] * spacing)
+    spacing = point_spacing(scan.points)
+    scan = scan.of(_some_points(scan.points))
+    charges, weights = Charges.around(scan.points, GAPS[-2] * spacing), weights_of(scan.scatter)
     matrices = _orientations()
-    fits = fit_fields(charges, points[some], [field[some] @ matrix.T for matrix in matrices])
+    fits = fit_readings((weights[..., None] * charges.fields(scan.points)).reshape(
+        -1, len(charges)), [(weights * (scan.field @ matrix.T)).ravel() for matrix in matrices])
     sigma = np.array([fit.sigma for fit in fits])
     left = np.flatnonzero(sigma <= WORTH_TRYING * sigma.min())
     if len(left) == 1:
         return matrices[left[0]], ()
-    every, against = np.ones(len(some), bool), {}
+    every, against = np.ones(len(scan.points), bool), {}
     for number in left.tolist():
-        model = ProbeModel(charges, points[some], field[some] @ matrices[number].T, time[some],
-                       directions[some])
+        model = scan.turned(matrices[number]).model(charges)
         fitted = fit_probe(model, every, fits[number], iterations=FEW_ITERATIONS)
-        against[number] = float(3 * len(some) * np.log(fitted.sigma)
-                                + fitted.instrument @ fitted.instrument / 2)
+        impossible = np.abs(fitted.instrument).max() > doubted_from(len(fitted.instrument))
+        against[number] = np.inf if impossible and number else float(
+            3 * len(every) * np.log(fitted.sigma) + fitted.instrument @ fitted.instrument / 2)
         pace.advance(len(against), len(left))
     alike = [number for number in against if against[number] <= min(against.values()) + ALIKE]
     best = 0 if 0 in alike else min(alike, key=lambda number: against[number])
     return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
 
 
-def _gap(
-    points: Floats, field: Floats, time: Floats, directions: Floats, spacing: float, pace: Pace
-) -> tuple[float, Floats, HarmonicFit]:
+def _gap(scan: _Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
     """Return the distance in m of the charges, where the sensors are, and the fit of the field.
 
-    The distance is that from where sensors at (3, 3) in m read the field at points (n, 3) in m. The
-    instrument is perfect, or is first fitted with some points and charges that are neither near nor
-    far: those of a map near edges of magnets, fitted by far charges, gave sensors 10 mm off.
+    The distance is that from where sensors at (3, 3) in m read the field. The instrument is
+    perfect, or is first fitted with some points and charges that are neither near nor far: those of
+    a map near edges of magnets, fitted by far charges, gave sensors 10 mm off.
     """
-    every = np.ones(len(points), bool)
-    some = _some_points(points)
-    start = ProbeModel(Charges.around(points[some], GAPS[-2] * spacing), points[some], field[some],
-                       time[some], directions[some])
-    (perfect,) = fit_fields(start.charges, points[some], [field[some]])
-    instrument = fit_probe(start, np.ones(len(some), bool), perfect)
+    spacing, some = point_spacing(scan.points), scan.of(_some_points(scan.points))
+    start = some.model(Charges.around(some.points, GAPS[-2] * spacing))
+    every = np.ones(len(some.points), bool)
+    perfect = start.fit(start.start(HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)), every)
+    instrument = fit_probe(start, every, perfect)
+    every = np.ones(len(scan.points), bool)
     found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
     probes = instrument, start.start(perfect)
     for number, probe in enumerate(probes):
-        read_at = _read_at(points, probe.sensors_m)
+        read_at = _read_at(scan.points, probe.sensors_m)
         for place, gap in enumerate(GAPS):
             near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
             if near or gap == GAPS[-1]:
-                model = ProbeModel(Charges.around(read_at, gap * spacing), points, field, time,
-                                   directions)
-                fit = model.fit(probe, every)
+                fit = scan.model(Charges.around(read_at, gap * spacing)).fit(probe, every)
                 evidence = fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
                 found.append((evidence, gap, probe, fit))
             pace.advance(number * len(GAPS) + place + 1, len(probes) * len(GAPS))
@@ -624,32 +772,7 @@ def _read_at(points: Floats, sensors: Floats) -> Floats:
     return np.asarray((points[:, None] + sensors).reshape(-1, 3))
 
 
-def _confirmed(
-    model: ProbeModel, rows: NDArray[np.bool_], left_out: NDArray[np.bool_], fit: HarmonicFit,
-    start: ProbeFit, pace: Pace,
-) -> tuple[ProbeModel, ProbeFit]:
-    """Return the model without the parameters that do not help to predict some of the rows.
-
-    What is left of a field that is steeper than the charges, and positions that are off together
-    along a line, is no white noise. Slow functions of time take to it with certainty, and fail
-    where they were not fitted.
-    """
-    def predicted(trial: ProbeModel) -> tuple[float, ProbeFit]:
-        """Return the rms error in T of the rows that are left out, and the fit of the others."""
-        fitted = fit_probe(trial, rows & ~left_out, fit, trial.allowed(start), NEXT_ITERATIONS)
-        off = model.field[left_out] - trial.readings(fitted, left_out)
-        return float(np.linalg.norm(_rms(off))), fitted
-
-    error, start = predicted(model)
-    for number, group in enumerate(GROUPS, 1):
-        pace.advance(number, CONFIRMATIONS + WEIGHTINGS)
-        trial = model.without(group)
-        other, fitted = predicted(trial)
-        if other <= error * PREDICTS:
-            error, model, start = other, trial, fitted
-        if not model.prior_sd.any():
-            break
-    return model, start
+# --- instrument ---------------------------------------------------------------------------------
 
 
 CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
@@ -657,51 +780,149 @@ CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
 """Differences of the Legendre polynomials 1 to 4 between times of the scan."""
 
 
-def _terms(fitted: ProbeFit, beyond: float, shares: Floats) -> tuple[InstrumentTerm, ...]:
-    """Return the parameters of the instrument in the units of people.
+@dataclass(frozen=True)
+class _Parameter:
+    """A parameter in the unit of people: the product of ``row`` (p,) and `ProbeFit.instrument`.
 
-    ``beyond`` is how many times farther off held-out lines are than fitted ones. What the charges
-    cannot follow is no white noise: it moves the parameters by as much more. ``shares`` (3, 3) is
-    how much each element of the matrix of gains and crosstalk changes |B|, see `ProbeModel.shares`.
+    It is left out of a model without the parameters ``own`` of a `ProbeFit`.
     """
-    value, found = fitted.instrument * fitted.prior_sd, []
-    scaled = fitted.prior_sd[:, None] * fitted.covariance * fitted.prior_sd
 
-    limit = doubted_from(len(fitted.prior_sd))
+    name: str
+    unit: str
+    row: Floats
+    own: tuple[int, ...]
 
-    def add(name: str, unit: str, factor: float, weights: dict[int, float]) -> None:
-        row = np.zeros(len(value))
+
+def _parameters(prior_sd: Floats, shares: Floats) -> list[_Parameter]:
+    """Return all parameters of the instrument.
+
+    ``shares`` (3, 3) is how much each element of the matrix of gains and crosstalk changes |B|, see
+    `ProbeModel.shares`.
+    """
+    found = []
+
+    def add(name: str, unit: str, factor: float, weights: dict[int, float],
+            own: tuple[int, ...] = ()) -> None:
+        row = np.zeros(len(prior_sd))
         row[list(weights)] = factor * np.array(list(weights.values()))
-        sd = beyond * float(np.sqrt(row @ scaled @ row))
-        prior = float(np.linalg.norm(row * fitted.prior_sd))
-        found.append(InstrumentTerm(name, unit, float(row @ value), sd, sd < DETERMINED * prior,
-                                    abs(float(row @ value)) <= limit * prior, prior > 0))
+        found.append(_Parameter(name, unit, row * prior_sd, own or tuple(weights)))
 
     for sensor, along in product(range(3), repeat=2):
         add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",
-            1e3, {3 * other + along: (sensor == other) - 1 / 3 for other in range(3)})
-    pairs = [((axis + 1) % 3, (axis + 2) % 3) for axis in range(3)]
-    mixed = [(9 + 3 * first + second, 9 + 3 * second + first) for first, second in pairs]
-    for axis, (one, other) in zip(COMPONENTS, mixed, strict=True):
-        add(f"probe turned about {axis}", "mrad", 1e3, {one: 0.5, other: -0.5})
-    for (first, second), (one, other) in zip(pairs, mixed, strict=True):
+            1e3, {3 * other + along: (sensor == other) - 1 / 3 for other in range(3)},
+            (3 * sensor + along,))
+    for axis in range(3):
+        add(f"probe turned about {COMPONENTS[axis]}", "mrad", 1e3, {MIXING.start + axis: 1.0})
+    for axis, (first, second) in enumerate(PAIRS):
         add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
-            {one: 1.0, other: 1.0})
+            {MIXING.start + 3 + axis: 1.0})
+    of_size = np.einsum("mij,ij->m", MATRICES, shares)
     for own in np.flatnonzero(np.diag(shares) < ALL_OF_IT).tolist():
+        weights = MATRICES[:, own, own] - of_size
         add(f"gain of B{COMPONENTS[own]} relative to that of |B|", "%", 100.0,
-            {9 + 3 * first + second: float((own == first == second) - shares[first, second])
-             for first, second in product(range(3), repeat=2)})
-    for (when, weights), own in product(CHANGES.items(), range(3)):
+            dict(enumerate(weights.tolist(), MIXING.start)), (MIXING.start + 6 + own,))
+    for (when, by_wave), own in product(CHANGES.items(), range(3)):
         add(f"turn about {COMPONENTS[own]} {when}", "mrad", 1e3,
-            {TURNS.start + 3 * wave + own: weight for wave, weight in weights.items()})
+            {TURNS.start + 3 * wave + own: weight for wave, weight in by_wave.items()})
     for own in range(3):
         add(f"change of the offset of B{COMPONENTS[own]} from start to end", "mT", 2e3,
             {OFFSETS.start + own: 1.0})
-    for when, weights in CHANGES.items():
+    for when, by_wave in CHANGES.items():
         add(f"change of the gain {when}", "%", 100.0,
-            {GAINS.start + wave: weight for wave, weight in weights.items()})
+            {GAINS.start + wave: weight for wave, weight in by_wave.items()})
     add("lag of the readings behind the stage", "mm", 1e3, {LAG: 1.0})
-    return tuple(found)
+    return found
+
+
+def _stated(
+    fitted: _Fitted, rows: NDArray[np.bool_], pace: Pace
+) -> tuple[_Fitted, tuple[InstrumentTerm, ...]]:
+    """Return the fit by what all parts of the map show of the instrument, and what they show.
+
+    Parameters are added to a perfect instrument one by one, the most certain first. What is left of
+    a field that is steeper than the charges, and positions that are off together along a line, is
+    no white noise: parameters take to it with certainty, but differently in every part of the map.
+    """
+    no_terms = np.zeros(len(fitted.at.instrument), bool)
+    fitted = replace(fitted, at=replace(fitted.at, instrument=np.zeros(len(no_terms))))
+    terms: tuple[InstrumentTerm, ...] = ()
+    for number in range(ROUNDS):
+        model = fitted.model.with_terms(~no_terms)
+        pairs = [rows, *_parts(model, fitted.at, rows)]
+        told = []
+        for part in pairs:
+            told.append(Evidence.of(model, part, fitted.at, fitted.width2))
+            pace.advance(number * len(pairs) + len(told), ROUNDS * len(pairs))
+        parameters = _parameters(model.prior_sd, model.shares(fitted.at))
+        kept, terms = _selected(parameters, told)
+        fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
+    return fitted, tuple(
+        replace(term, value=float(parameter.row @ fitted.at.instrument)) if term.found else term
+        for parameter, term in zip(parameters, terms, strict=True))
+
+
+def _selected(
+    parameters: list[_Parameter], told: list[Evidence]
+) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
+    """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
+
+    ``told`` is what the whole map tells, and what its halves do. In a field along one axis, a turn
+    of the probe and an angle between its sensors differ by little: of what explains the map, it is
+    what is certain, and near to 0 by what instruments do.
+    """
+    kept = np.zeros(len(told[0].sums), bool)
+    while True:
+        terms, away = zip(*(_term(parameter, kept, told) for parameter in parameters), strict=True)
+        known = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
+        new = [(abs(term.value) / term.sd / (1 + far), parameter.own)
+               for parameter, term, far, old in zip(parameters, terms, away, known, strict=True)
+               if term.found and not old]
+        if not new:
+            return kept, tuple(replace(term, predictive=term.predictive and (not term.found or old))
+                               for term, old in zip(terms, known, strict=True))
+        kept[list(max(new)[1])] = True
+
+
+def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Return halves of the map, two by two: along x, y and z, and by how steep the field is."""
+    steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
+    found: list[NDArray[np.bool_]] = []
+    for values in (*model.points.T, steepness):
+        middle = (float(np.median(values[rows])) if values is steepness
+                  else (values[rows].max() + values[rows].min()) / 2)
+        halves = rows & (values <= middle), rows & (values > middle)
+        if min(half.sum() for half in halves) >= FEWEST_IN_PART:
+            found += halves
+    return found
+
+
+def _term(
+    parameter: _Parameter, kept: NDArray[np.bool_], told: list[Evidence]
+) -> tuple[InstrumentTerm, float]:
+    """Return what the whole map and its halves show of a parameter, besides those that are kept.
+
+    The second number is how many prior standard deviations it is from 0.
+
+    If the halves scatter about the whole by more than their bars, its bar is as much longer. They
+    support it if both of a pair could tell whether it is there, and none that could contradicts it.
+    """
+    used = np.flatnonzero(kept | (np.isin(np.arange(len(kept)), parameter.own)))
+    row = parameter.row[used]
+    estimates = [each.estimate(used) for each in told]
+    value, *of_parts = (float(row @ mean) for mean, _ in estimates)
+    sd, *sd_of_parts = (float(np.sqrt(row @ covariance @ row)) for _, covariance in estimates)
+    values, sds = np.array(of_parts), np.array(sd_of_parts)
+    alone = np.sqrt(np.maximum(sds**2 - sd**2, 0.1 * sds**2))
+    beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if of_parts else 1.0
+    sees = SEEN * beyond * sds < abs(value)
+    off = np.abs(values - value) > np.maximum(SEEN * sds, UNLIKE * abs(value))
+    supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any())
+    prior = float(np.linalg.norm(row))
+    away = float(np.abs(estimates[0][0][np.isin(used, parameter.own)]).max())
+    return InstrumentTerm(
+        parameter.name, parameter.unit, value, beyond * sd, beyond * sd < DETERMINED * prior,
+        away <= doubted_from(len(kept)),
+        supported or abs(value) <= SIGNIFICANT * beyond * sd), away
 
 
 # --- what remains -------------------------------------------------------------------------------
@@ -735,9 +956,7 @@ def _reach(
     limit = (FAR_OFF * noise_T) ** 2
     if not noise_T or squares.mean() <= limit:
         return None
-    middle = (every.max(axis=0) + every.min(axis=0)) / 2
-    across = np.delete(points - middle, int(np.argmax(np.ptp(every, axis=0))), axis=1)
-    families = [("r", True, np.linalg.norm(across, axis=1))]
+    families = [("r", True, distance_from_middle(points, every))]
     families += [(name, below, column if below else -column) for below in (True, False)
                  for name, column in zip(COMPONENTS, points.T, strict=True)]
     best, most = Reach("r", True, np.nan, np.nan, float(np.sqrt(squares.mean())), noise_T), (
@@ -755,6 +974,16 @@ def _reach(
                                   for part in (inside, ~inside))
                 best = Reach(along, below, float(end if below else -end), within, beyond, noise_T)
     return best
+
+
+def distance_from_middle(points: Floats, every: Floats) -> Floats:
+    """Return the distances (n,) in m from the middle of a map of ``every`` point (m, 3).
+
+    It is the line through its middle along its longest axis.
+    """
+    middle = (every.max(axis=0) + every.min(axis=0)) / 2
+    return np.asarray(np.linalg.norm(np.delete(
+        points - middle, int(np.argmax(np.ptp(every, axis=0))), axis=1), axis=1))
 
 
 def _structure(points: Floats, residual: Floats) -> float:

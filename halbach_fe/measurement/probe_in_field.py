@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_readings
+from halbach_fe.measurement.suspect_rows import scatter_around
 
 ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
 """Largest number of steps of the fit of field and instrument, while orientations are tried, and
@@ -48,12 +49,32 @@ TURNS = slice(18, 18 + 3 * WAVES)
 OFFSETS = slice(TURNS.stop, TURNS.stop + 3)
 GAINS = slice(OFFSETS.stop, OFFSETS.stop + WAVES)
 LAG = GAINS.stop
-"""Places of the parameters: coordinates of the sensors, elements of the matrix between the axes of
-probe and stage, turns, changes of offsets, changes of the gain, and the lag."""
+"""Places of the parameters: coordinates of the sensors, the matrix between the axes of probe and
+stage (see `MATRICES`), turns, changes of offsets, changes of the gain, and the lag."""
 
-PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 9, *(0.01,) * (3 * WAVES), *(2e-3,) * 3, *(0.01,) * WAVES,
-            1e-3)
-"""Prior standard deviations: in m, 1, rad, of the largest field, 1, and m."""
+PRIOR_SD = (*(3e-3,) * 9, *(0.05,) * 3, *(0.02,) * 6, *(0.01,) * (3 * WAVES), *(2e-3,) * 3,
+            *(0.01,) * WAVES, 1e-3)
+"""Prior standard deviations: in m, rad, rad, 1, rad, of the largest field, 1, and m."""
+
+PAIRS = tuple(((axis + 1) % 3, (axis + 2) % 3) for axis in range(3))
+"""The other two axes of every axis."""
+
+
+def _matrices() -> Floats:
+    """Return the matrices (9, 3, 3) of turns about the axes, of angles between them, and gains.
+
+    An angle is by how much less than 90 degrees two sensors are apart.
+    """
+    found = np.zeros((9, 3, 3))
+    for axis, (first, second) in enumerate(PAIRS):
+        found[axis, first, second], found[axis, second, first] = 1.0, -1.0
+        found[3 + axis, first, second] = found[3 + axis, second, first] = 0.5
+        found[6 + axis, axis, axis] = 1.0
+    found[6:] -= np.eye(3) / 3  # a common gain is no error that a map can show
+    return found
+
+
+MATRICES = _matrices()
 
 
 @dataclass(frozen=True)
@@ -96,50 +117,62 @@ class ProbeFit:
         Its trace is 0, because a common gain is no error that a map can show. (Where one component
         is most of the field, that changes the field's size: `ProbeModel.ideal` takes it back.)
         """
-        matrix = (self.instrument * self.prior_sd)[MIXING].reshape(3, 3)
-        return np.asarray(matrix - np.eye(3) * np.trace(matrix) / 3)
+        return np.einsum("m,mij->ij", (self.instrument * self.prior_sd)[MIXING], MATRICES)
 
 
-LEAST_ERROR = 0.03
-"""Smallest standard deviation by which a reading is weighted, relative to the rms residual: the
+LEAST_ERROR = 0.3
+"""Smallest standard deviation by which a reading is weighted, relative to the median one: the
 flattest readings of a small map may be fitted by chance."""
+
+LEAST_OWN = 0.05
+"""Smallest share of a reading that the fit counts to leave: beyond, its residual is rounding."""
+
+
+def weights_of(scatter: Floats) -> Floats:
+    """Return weights (n, 3), whose median is 1, of readings that scatter by as much (n,) in T."""
+    median = float(np.median(scatter))
+    if not median:
+        return np.ones((len(scatter), 3))
+    return np.repeat(median / np.maximum(scatter, LEAST_ERROR * median)[:, None], 3, axis=1)
 
 
 class ProbeModel:
     """Readings of a three-axis probe in a harmonic field.
 
-    ``weights`` (n, 3) multiply the residuals; they are 1 until `weighted`.
+    ``weights`` (n, 3) multiply the residuals. They follow from ``scatter`` (n,) in T, by which
+    readings are expected to be off a field without sources.
     """
 
     def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
-                 directions: Floats) -> None:
+                 directions: Floats, scatter: Floats) -> None:
         self.charges, self.points, self.field = charges, points, field
         self.time, self.directions = time, directions
         self.waves = np.polynomial.legendre.legvander(time, WAVES)[:, 1:]
         sd = np.array(PRIOR_SD)
         sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
-        self.prior_sd = sd
-        self.weights = np.ones_like(field)
+        step = np.linalg.norm(np.diff(points, axis=0), axis=1)[directions[1:].any(axis=1)]
+        sd[LAG] = max(sd[LAG], float(np.median(step)) if len(step) else 0.0)  # a row late
+        self.prior_sd = self.any_sd = sd
+        self.scatter, self.weights = scatter, weights_of(scatter)
 
-    def without(self, group: slice) -> ProbeModel:
-        """Return a model whose instrument has none of a group of parameters."""
+    def with_terms(self, kept: NDArray[np.bool_]) -> ProbeModel:
+        """Return a model whose instrument has some of all parameters (p,) only."""
         other = copy(self)
-        other.prior_sd = self.prior_sd.copy()
-        other.prior_sd[group] = 0.0
+        other.prior_sd = np.where(kept, self.any_sd, 0.0)
         return other
 
-    def weighted(self, at: ProbeFit, rows: NDArray[np.bool_]) -> ProbeModel:
-        """Return a model that weights readings by their expected residuals, see `expected`.
+    def weighted(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> ProbeModel:
+        """Return a model that weights readings by how far those around are off the field of others.
 
         Near edges of magnets charges follow the field less well than the probe reads it. There are
         few such readings, but without weights they are what decides on the instrument: it is given
         errors of many standard deviations that it does not have.
         """
-        other, expected = copy(self), self.expected(at, rows)
-        rms = float(np.sqrt(np.mean((self.field - self.readings(at))[rows]**2)))
-        if rms:
-            expected = np.maximum(expected, LEAST_ERROR * rms)
-            other.weights = 1 / (expected * np.sqrt(np.mean(expected[rows]**-2)))
+        left = (self.field - self.readings(at))[rows] / np.maximum(
+            self.noise_left(at, rows, width2)[0], LEAST_OWN)
+        other = copy(self)
+        other.scatter = scatter_around(self.points, self.points[rows], left)
+        other.weights = weights_of(other.scatter)
         return other
 
     def allowed(self, at: ProbeFit) -> ProbeFit:
@@ -201,9 +234,7 @@ class ProbeModel:
             for other in range(3):  # of the mean of the sensors, which stays where it is
                 found[:, sensor, 3 * other:3 * other + 3] = gradient * (
                     (sensor == other) - 1 / 3)
-            found[:, sensor, 9 + 3 * sensor:12 + 3 * sensor] = field
-            for other in range(3):
-                found[:, sensor, 9 + 4 * other] -= field[:, sensor] / 3
+            found[:, sensor, MIXING] = field @ MATRICES[:, sensor].T
             found[:, sensor, TURNS] = np.einsum(
                 "nw,na->nwa", self.waves[rows], np.cross(np.eye(3)[sensor], field)
             ).reshape(len(found), -1)
@@ -224,36 +255,19 @@ class ProbeModel:
             found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
 
-    def noise_left(self, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> Floats:
-        """Return the variance (n, 3) of residuals that noise makes, relative to its own.
+    def noise_left(
+        self, at: ProbeFit, rows: NDArray[np.bool_], width2: float
+    ) -> tuple[Floats, Floats]:
+        """Return how much of each reading (n, 3), and of its variance, the fit of the field leaves.
 
-        The rest the field takes along, the most at the edges of a map. With the matrix H that makes
-        fitted values of readings, for the prior variance ``width2`` of the amplitudes in T^2, it is
-        the diagonal of (1 - H) (1 - H)^T. The few numbers of the instrument are left out.
+        The rest the field takes along, the most at the edges of a map. For the prior variance
+        ``width2`` of the amplitudes in T^2 they are the diagonals of P and P^2 of `FreeField`. A
+        residual divided by the first one is that of a fit without the reading. The few numbers of
+        the instrument are left out.
         """
         by_amplitude = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
-        information = by_amplitude.T @ by_amplitude
-        with_prior = information.copy()
-        with_prior[np.diag_indices(len(with_prior))] += (
-            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
-        factor = linalg.cho_factor(with_prior)
-        left = np.empty(len(by_amplitude))
-        for first in range(0, len(left), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            solved = linalg.cho_solve(factor, by_amplitude[part].T)
-            left[part] = 1 - 2 * np.sum(by_amplitude[part].T * solved, axis=0) + np.sum(
-                solved * (information @ solved), axis=0)
-        return left.reshape(-1, 3)
-
-    def expected(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the standard deviations (n, 3) in T of all residuals, as those of ``rows`` show.
-
-        Residuals are larger where the field is steep. Those of lines that are not fitted are no
-        measure of a single reading: at the edge of the map the field there is extrapolated.
-        """
-        gradient = self.charges.gradient(self.points, at.amplitudes)
-        noise, displaced = noise_of(gradient[rows], (self.field - self.readings(at))[rows])
-        return np.sqrt(noise**2 + displaced**2 * np.sum(gradient**2, axis=2))
+        once, twice = FreeField(by_amplitude, at.sigma**2 / width2).diagonals()
+        return once.reshape(-1, 3), twice.reshape(-1, 3)
 
     def ideal(self, at: ProbeFit) -> Floats:
         """Return what a probe without errors would have read (n, 3) in T.
@@ -289,7 +303,8 @@ def fit_probe(
     width2 = fit.sigma**2 / fit.penalty
     state = _State.of(model, at, rows, width2)
     for _ in range(iterations):
-        step, covariance, used = state.step()
+        design, by_field, covariance = state.normal()
+        step, used = state.step(design, covariance), state.used(design, by_field, covariance)
         for halving in range(HALVINGS):
             after = _State.of(model, replace(
                 state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
@@ -306,6 +321,97 @@ def fit_probe(
     return state.at
 
 
+class FreeField:
+    """What the prior field of the charges leaves of readings: ``P = (1 + A A^T / penalty)^-1``.
+
+    ``A`` (m, k) are the readings by amplitude, and ``penalty`` is the ratio of the variances of
+    noise and amplitudes. ``P`` follows from the smaller one of A A^T and A^T A.
+    """
+
+    def __init__(self, by_amplitude: Floats, penalty: float, gram: Floats | None = None) -> None:
+        self.by_amplitude = by_amplitude
+        self.dual = len(by_amplitude) <= by_amplitude.shape[1]
+        tall = by_amplitude if self.dual else by_amplitude.T
+        self.gram = tall @ tall.T if gram is None else gram
+        self.penalty = penalty + ROUNDING * float(np.trace(self.gram)) / by_amplitude.shape[1]
+        with_prior = self.gram.copy()
+        with_prior[np.diag_indices(len(with_prior))] += self.penalty
+        self.factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
+
+    def of_noise(self, penalty: float) -> FreeField:
+        """Return the same for another penalty."""
+        return FreeField(self.by_amplitude, penalty, self.gram)
+
+    def left(self, readings: Floats) -> Floats:
+        """Return P times readings (m,) or (m, p)."""
+        if self.dual:
+            return np.asarray(self.penalty * linalg.cho_solve(self.factor, readings))
+        return np.asarray(readings - self.by_amplitude @ self.amplitudes(readings))
+
+    def amplitudes(self, readings: Floats) -> Floats:
+        """Return the most probable amplitudes (k,) or (k, p)."""
+        if self.dual:
+            return np.asarray(self.by_amplitude.T @ linalg.cho_solve(self.factor, readings))
+        return np.asarray(linalg.cho_solve(self.factor, self.by_amplitude.T @ readings))
+
+    @property
+    def trace(self) -> float:
+        """Trace of P: the number of readings that the field does not use up."""
+        inverse, info = linalg.lapack.dpotri(self.factor[0], lower=1)
+        assert info == 0  # the factor is that of a Cholesky decomposition
+        rest = 0 if self.dual else len(self.by_amplitude) - self.by_amplitude.shape[1]
+        return rest + self.penalty * float(np.trace(inverse))
+
+    def diagonals(self) -> tuple[Floats, Floats]:
+        """Return the diagonals (m,) of P and of P^2."""
+        once, twice = np.empty((2, len(self.by_amplitude)))
+        for first in range(0, len(once), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            if self.dual:
+                unit = np.zeros((len(once), len(once[part])))
+                unit[part] = np.eye(unit.shape[1])
+                columns = self.left(unit)
+                once[part], twice[part] = np.diag(columns[part]), np.sum(columns**2, axis=0)
+                continue
+            rows = self.by_amplitude[part]
+            solved = linalg.cho_solve(self.factor, rows.T)
+            taken = np.sum(rows.T * solved, axis=0)
+            once[part] = 1 - taken
+            twice[part] = 1 - 2 * taken + np.sum(solved * (self.gram @ solved), axis=0)
+        return once, twice
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What some readings tell of the instrument, linearized: ``information @ instrument = sums``.
+
+    Attributes
+    ----------
+    information : ndarray, shape (p, p)
+    sums : ndarray, shape (p,)
+        The instrument is in units of `PRIOR_SD`. The field is that of these readings, too.
+    """
+
+    information: Floats
+    sums: Floats
+
+    @classmethod
+    def of(
+        cls, model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, width2: float
+    ) -> Evidence:
+        """Return what some rows tell, near a fit, for the prior variance of amplitudes in T^2."""
+        state = _State.of(model, at, rows, width2)
+        design, left, _ = state.normal()
+        information = design.T @ left / at.sigma**2
+        return cls(information, design.T @ state.left / at.sigma**2
+                   + information @ at.instrument)
+
+    def estimate(self, kept: Ints) -> tuple[Floats, Floats]:
+        """Return the values (k,) and covariance (k, k) of an instrument of some parameters only."""
+        covariance = np.linalg.inv(self.information[np.ix_(kept, kept)] + np.eye(len(kept)))
+        return covariance @ self.sums[kept], np.asarray(covariance)
+
+
 @dataclass(frozen=True)
 class _State:
     """The field of largest probability for an instrument and a noise.
@@ -316,13 +422,8 @@ class _State:
     chi2 : float
         With the prior of amplitudes and instrument.
     left : ndarray, shape (m,), in T
-    by_amplitude : ndarray, shape (m, k)
-    information : ndarray, shape (k, k)
-        Of the amplitudes, without their prior and in units of 1 / sigma^2.
-    projected : ndarray, shape (k,)
-        Product of ``by_amplitude`` with the readings.
-    factor : tuple
-        Cholesky factor of the information with the prior.
+    target : ndarray, shape (m,), in T
+    free : FreeField
     """
 
     model: ProbeModel
@@ -331,61 +432,56 @@ class _State:
     at: ProbeFit
     chi2: float
     left: Floats
-    by_amplitude: Floats
-    information: Floats
-    projected: Floats
-    factor: tuple[Floats, bool]
+    target: Floats
+    free: FreeField
 
     @classmethod
     def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> _State:
         """Fit the field for the instrument and the noise of ``at``."""
         by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
-        target = model.target(at, rows)
-        return cls._solved(model, rows, width2, at, target, by_amplitude,
-                           by_amplitude.T @ by_amplitude, by_amplitude.T @ target)
+        return cls._solved(model, rows, width2, at, model.target(at, rows),
+                           FreeField(by_amplitude, at.sigma**2 / width2))
 
     @classmethod
     def _solved(
         cls, model: ProbeModel, rows: NDArray[np.bool_], width2: float, at: ProbeFit,
-        target: Floats, by_amplitude: Floats, information: Floats, projected: Floats,
+        target: Floats, free: FreeField,
     ) -> _State:
         """Solve for the amplitudes."""
-        with_prior = information.copy()
-        with_prior[np.diag_indices(len(with_prior))] += (
-            at.sigma**2 / width2 + ROUNDING * np.trace(information) / len(information))
-        factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
-        amplitudes = linalg.cho_solve(factor, projected)
-        left = target - by_amplitude @ amplitudes
+        amplitudes = free.amplitudes(target)
+        left = target - free.by_amplitude @ amplitudes
         chi2 = (float(left @ left) / at.sigma**2 + float(amplitudes @ amplitudes) / width2
                 + float(at.instrument @ at.instrument))
-        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left,
-                   by_amplitude, information, projected, factor)
+        return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left, target,
+                   free)
 
     def with_noise(self, sigma: float, at: ProbeFit) -> _State:
         """Return the state of the same instrument for another noise in T."""
-        target = self.left + self.by_amplitude @ self.at.amplitudes
-        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma), target,
-                            self.by_amplitude, self.information, self.projected)
+        return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma),
+                            self.target, self.free.of_noise(sigma**2 / self.width2))
 
-    def step(self) -> tuple[Floats, Floats, float]:
-        """Return the step (p,) of the instrument, its covariance / sigma^2, and `ProbeFit.used`.
+    def normal(self) -> tuple[Floats, Floats, Floats]:
+        """Return the design (m, p) of the instrument, what the field leaves of it, its covariance.
 
         The amplitudes, which are the best for the present instrument, are eliminated from the
-        normal equations.
+        normal equations. The covariance (p, p) is relative to sigma^2.
         """
-        noise2, count = self.at.sigma**2, len(PRIOR_SD)
+        count = len(PRIOR_SD)
         design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
-        mixed = self.by_amplitude.T @ design
-        solved = linalg.cho_solve(self.factor, mixed)
-        inverse = np.linalg.inv(design.T @ design - mixed.T @ solved + noise2 * np.eye(count))
-        step = inverse @ (design.T @ self.left - noise2 * self.at.instrument)
-        # traces of the blocks of the inverse of all normal equations
-        amplitudes, info = linalg.lapack.dpotri(self.factor[0], lower=1)
-        assert info == 0  # the factor is that of a Cholesky decomposition
-        by_amplitude = float(np.trace(amplitudes)) + float(np.sum((solved @ inverse) * solved))
-        used = (len(mixed) - noise2 / self.width2 * by_amplitude
-                + count - noise2 * float(np.trace(inverse)))
-        return step, inverse, used
+        left = self.free.left(design)
+        return design, left, np.asarray(np.linalg.inv(
+            design.T @ left + self.at.sigma**2 * np.eye(count)))
+
+    def step(self, design: Floats, inverse: Floats) -> Floats:
+        """Return the step (p,) of the instrument, see `normal`."""
+        return np.asarray(inverse @ (
+            design.T @ self.left - self.at.sigma**2 * self.at.instrument))
+
+    def used(self, design: Floats, left: Floats, inverse: Floats) -> float:
+        """Return `ProbeFit.used`, by the traces of the inverse of all normal equations."""
+        by_field = len(design) - self.free.trace - float(
+            np.sum(inverse * (design.T @ left - left.T @ left)))
+        return by_field + len(inverse) - self.at.sigma**2 * float(np.trace(inverse))
 
 
 def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:

@@ -151,6 +151,15 @@ def spikes(
     return found
 
 
+def scatter_around(points: Floats, known: Floats, residual: Floats) -> Floats:
+    """Return the standard deviation (n,) around points (n, 3) of residuals (k, c) at known ones.
+
+    It is that of the median, which single rows that are far off do not change.
+    """
+    near = KDTree(known).query(points, np.arange(1, min(NEIGHBOURS + 1, len(known)) + 1))[1]
+    return np.asarray(1.4826 * np.median(np.abs(residual[near]), axis=(1, 2)))
+
+
 def neighbours(points: Floats) -> Ints:
     """Return the numbers (n, k) of the nearest neighbours of points (n, 3).
 

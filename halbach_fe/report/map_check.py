@@ -58,18 +58,47 @@ def answer(check: MapCheck) -> Answer:
             "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
+    if _violates(check):
+        return Answer(
+            question, f"{verdict(check)} {_noise(check)}",
+            f"No: nothing that the probe may plausibly be explains this map. {_worst(check)}Do not "
+            "update a magnet with it.", "Look for rows, axes and units "
+            "that are not what the map says, or leave out what is near to magnets and conductors, "
+            "and check it again.", "halbach-fe check MAP -o DIR",
+            sound=False)
+    trust = _trust(check)
+    used = "DIR/oriented_map.csv" if better else "MAP"
+    named = ("oriented_map.csv, which has the right axes and no broken rows" if better
+             else "this map")
+    said = f"{verdict(check)} {_noise(check, keys=True)}"
+    if check.is_displaced:
+        return Answer(question, said, trust, "Look for rows, axes and units of the positions that "
+                      "are not what the map says, and check it again.",
+                      "halbach-fe check MAP -o DIR", sound=False)
+    if check.floor_rms_T > VIOLATED * check.size_T:
+        return Answer(
+            question, f"{verdict(check)} {_noise(check)}", trust,
+            "Cut the map back: inner_map.csv has the readings "
+            f"{_where(check, check.reach)} only. Check it alone."
+            if check.reach is not None else "", "halbach-fe check DIR/inner_map.csv -o DIR2")
+    if _on_a_stage(check):
+        return Answer(
+            question, said, trust, "Find where the map lies in the magnet, as its coordinates seem "
+            f"to be those of a stage: the origin is far from all readings. Use {named}.",
+            f"halbach-fe register STUDY --measurements {used} -o DIR")
+    return Answer(
+        question, said, trust, f"Update the magnet with {named}. If you do not know where the map "
+        "lies in the magnet, let halbach-fe register find it first.",
+        f"halbach-fe infer STUDY --measurements {used} -o DIR")
+
+
+def _trust(check: MapCheck) -> str:
+    """Say how far the answer that a map passes can be trusted."""
     trust = ("Yes: no magnet is assumed, and the lines that were held out were not fitted. More "
              f"than {100 * VIOLATED:g}\u00a0% of the largest field would fail. A model of the "
              "magnet that predicts readings worse than this fit lacks something; close to the "
              "edges of blocks, where the field varies more than the fit can follow, it can do "
              "better.")
-    if _violates(check):
-        return Answer(
-            question, f"{verdict(check)} {_noise(check)}",
-            "No: nothing that the probe may plausibly be explains this map: do not "
-            "update a magnet with it.", "Look for rows, axes and units "
-            "that are not what the map says, and check it again.", "halbach-fe check MAP -o DIR",
-            sound=False)
     if check.structure > REMAINS:
         trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
                  f"correlation of {check.structure:.2f}. Something that this check does not know, "
@@ -85,24 +114,10 @@ def answer(check: MapCheck) -> Answer:
             f"{'Beyond that,' if np.isfinite(reach.limit_m) else 'Everywhere,'} held-out lines are "
             f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
             "either the field is steeper there than the lines show, as near edges of magnets, or "
-            "these readings are wrong. An update of the magnet tells which.")
-    used = "DIR/oriented_map.csv" if better else "MAP"
-    named = ("oriented_map.csv, which has the right axes and no broken rows" if better
-             else "this map")
-    said = f"{verdict(check)} {_noise(check, keys=True)}"
-    if check.is_displaced:
-        return Answer(question, said, trust, "Look for rows, axes and units of the positions that "
-                      "are not what the map says, and check it again.",
-                      "halbach-fe check MAP -o DIR", sound=False)
-    if _on_a_stage(check):
-        return Answer(
-            question, said, trust, "Find where the map lies in the magnet, as its coordinates seem "
-            f"to be those of a stage: the origin is far from all readings. Use {named}.",
-            f"halbach-fe register STUDY --measurements {used} -o DIR")
-    return Answer(
-        question, said, trust, f"Update the magnet with {named}. If you do not know where the map "
-        "lies in the magnet, let halbach-fe register find it first.",
-        f"halbach-fe infer STUDY --measurements {used} -o DIR")
+            "these readings are wrong. An update of the magnet tells which."
+            + (" DIR/inner_map.csv is the map without them."
+               if np.isfinite(reach.limit_m) else ""))
+    return trust
 
 
 def total_answer(check: TotalCheck) -> Answer:
@@ -208,6 +223,7 @@ def sentences(check: MapCheck) -> list[str]:
     if check.is_reoriented:
         found.append(f"The map obeys with other axes than it names: {_axes(check)} (or all of them "
                      "with the opposite sign, which no map can show).")
+        found.append(OPEN_SIGN)
     if check.alike:
         found.append(f"{len(check.alike)} other orientations fit as well: " + "; ".join(
             ", ".join(_component(name) for name in names) for names in check.alike[:5])
@@ -219,7 +235,7 @@ def sentences(check: MapCheck) -> list[str]:
         found.append(
             f"The map's column of |B| contradicts its components in {len(check.contradicted)} "
             f"row{'s' if len(check.contradicted) > 1 else ''}, which one of the two has wrong: "
-            f"{_numbers(check.contradicted)}. Exclude them, unless you know which.")
+            f"{_numbers(check.contradicted)}. They are left out.")
     terms = sorted((term for term in check.terms if term.found),
                    key=lambda term: -abs(term.value) / term.sd)
     if terms:
@@ -231,6 +247,14 @@ def sentences(check: MapCheck) -> list[str]:
                         else "")
                      + ".")
     return found
+
+
+OPEN_SIGN = (
+    "The common sign of all components is open. On it depends how the map lies in the magnet, and "
+    "with that which block is which: register finds poses for either sign, and each gives the same "
+    "reading to other blocks. A pole that is known, by a compass, tells. Nothing else on this page "
+    "depends on it.")
+"""What depends on the common sign of all components."""
 
 
 def _numbers(rows: Sequence[int]) -> str:
@@ -258,8 +282,10 @@ def verdict(check: MapCheck) -> str:
     share = check.floor_rms_T / check.size_T
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
             f"{relative(share)} of the largest field ({flux_density(check.size_T)})")
-    if share > VIOLATED:
-        return f"Failed. The map does not obey div B = 0 and curl B = 0: they leave {size}."
+    if not check.obeys:
+        return ("Failed. The map does not obey div B = 0 and curl B = 0: it is not described by a "
+                f"field without sources within its region, which leaves {size}. No instrument "
+                "explains it.")
     wrong = _impossible(check)
     if wrong:
         return ("Failed. The map does not obey div B = 0 and curl B = 0 with any likely "
@@ -286,14 +312,24 @@ def _where(check: MapCheck, reach: Reach) -> str:
     return f"at {reach.along} of {limit} and {'less' if reach.below else 'more'}"
 
 
+def _worst(check: MapCheck) -> str:
+    """Say where the most is left, if that is not the same everywhere."""
+    if check.uneven is None:
+        return ""
+    _, (low, high, most) = check.uneven
+    return (f"The most is left at {check.windows[0]} from {_range(low, high)}: "
+            f"{flux_density(most, 2)}. ")
+
+
 def _impossible(check: MapCheck) -> list[str]:
     """Return the names of the parameters of a probe that no probe has."""
-    return [term.name for term in check.terms if term.determined and not term.plausible]
+    return [term.name for term in check.terms
+            if term.determined and term.predictive and not term.plausible]
 
 
 def _violates(check: MapCheck) -> bool:
     """Whether the map does not obey Maxwell's equations with any likely probe."""
-    return check.floor_rms_T > VIOLATED * check.size_T or bool(_impossible(check))
+    return not check.obeys or bool(_impossible(check))
 
 
 def _axes(check: MapCheck) -> str:
@@ -313,16 +349,16 @@ def instrument_table(check: MapCheck) -> list[dict[str, str]]:
     return [{"parameter": term.name,
              "value": f"{with_error(term.value, term.sd)}\u00a0{term.unit}",
              "": "found" if term.found else ""}
-            for term in check.terms if term.determined]
+            for term in check.terms if term.determined and term.predictive]
 
 
 def undetermined(check: MapCheck) -> str:
     """Say which parameters of the instrument the map does not tell, in a sentence; or nothing."""
     said = []
-    for words, predictive in (("Left out, because scan lines are predicted as well without them",
-                               False), ("What this map cannot tell", True)):
-        names = [term.name for term in check.terms
-                 if not term.determined and term.predictive == predictive]
+    for words, predictive in (("Not stated, because parts of the map contradict each other about "
+                               "it", False), ("What this map cannot tell", True)):
+        names = [term.name for term in check.terms if term.predictive == predictive
+                 and not (term.determined and predictive)]
         if names:
             said.append(f"{words}: {'; '.join(names)}.")
     return " ".join(said)
@@ -371,6 +407,9 @@ def write_map_check(
     if check.is_reoriented or check.excluded.any():
         write_map(oriented(data, check), folder / "oriented_map.csv")
         files.append("oriented_map.csv")
+    if (within := inner(data, check)) is not None:
+        write_map(within, folder / "inner_map.csv")
+        files.append("inner_map.csv")
     if check.suffices:
         write_map(corrected(data, check), folder / "corrected_map.csv")
         files.append("corrected_map.csv")
@@ -411,6 +450,14 @@ def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
         if "sigma_T" in kept:
             turned["sigma_T"][:, axis] = kept["sigma_T"].values[:, column]
     return turned
+
+
+def inner(data: xr.Dataset, check: MapCheck) -> xr.Dataset | None:
+    """Return the oriented map in the region that a field without sources describes, if not all."""
+    if check.reach is None or not np.isfinite(check.reach.limit_m):
+        return None
+    return oriented(data, check).isel(point=np.flatnonzero(
+        check.reach.holds(points_of(data))[~check.excluded]))
 
 
 def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:

@@ -84,7 +84,7 @@ def test_columns_in_any_order_and_missing_components(tmp_path):
     (HEADER + "0,0,,1,1,1\n", "z_m in line 2"),
     (HEADER + "0,0,0,one,1,1\n", "'one'"),
     (HEADER + "0,0,0,,,\n", "at least one component"),
-    (HEADER + "0,0,0,.1,.1,.1\n0,0,1,.1,.1,.1\n0,0,0,.2,.1,.1\n", "reading 3"),
+    (HEADER + "0,0,0,.1,.1,.1\n0,0,1,.1,.1,.1\n0,0,0,.1,.1,.1\n", "reading 3"),
     ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,0\n", "sigma"),
     ("x_m,y_m,z_m,Bx_T,sigma_T\n0,0,0,1,-1\n", "sigma"),
     (HEADER + "0,0,0,1,1," + "1" * 200_000 + "\n", "line 2"),

@@ -152,7 +152,9 @@ def test_the_check_names_contradictions(generator, tmp_path, capsys):
     total[7] *= 1.2
     write_map(with_total_field(field_map(GRID, field), total), tmp_path / "map.csv")
     assert main(["check", str(tmp_path / "map.csv")]) == 0
-    assert "contradicts its components in 1 row" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "contradicts its components in 1 row" in said
+    assert "8. They are left out." in said
 
 
 def test_a_map_of_the_magnitude_is_checked_for_broken_rows(generator):
