@@ -66,6 +66,7 @@ from halbach_fe.diagnosis.search import (
     Signatures,
     apply_effects,
     identify_effects,
+    possible,
     score_hypotheses,
     with_short_steps,
 )
@@ -307,7 +308,10 @@ def _diagnose(
             break
         if converged := only_equals_took_turns(identified, found):
             break
-        identified, closing = with_short_steps(found, identified), pace.is_over
+        short = with_short_steps(found, identified)
+        # a step that ends inside material is made as a whole, which was found to be possible
+        identified = short if possible(corrected, short, campaign) else found
+        closing = pace.is_over
         if closing:
             say("the time is up: the effects so far are put into the model")
     assert first is not None
