@@ -50,6 +50,7 @@ DEMAGNETIZATION = {"remanence_coefficient_per_K": -1.2e-3, "coercivity_coefficie
     ({"array__inner_radius_m": 104}, "Was it meant in millimetres? Then write 0.104."),
     ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),
     ({"array__remanence_T": 13000}, "Was it meant in gauss? Then write 1.3."),
+    ({"array__remanence_T": 13}, "Was it meant in kilogauss? Then write 1.3."),
     ({"array__remanence_T": 1e6}, "Correct the value."),
     ({"demagnetization": DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955}},
      "Was it meant in kiloamperes per metre? Then write 955000."),
