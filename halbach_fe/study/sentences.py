@@ -75,7 +75,9 @@ WRONG_UNITS = (
     *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
     ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
     ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
-    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "the other sign", -1.0),
+    ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("coefficient_per_K", "per cent per kelvin and the other sign", -1e-2),
     *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
@@ -97,7 +99,7 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
                 limits.get("ge", -math.inf) <= given <= limits.get("le", math.inf)) and (
                 limits.get("gt", -math.inf) < given < limits.get("lt", math.inf)):
-            return f"Was it meant in {unit}? Then write {given:.6g}."
+            return f"Was it meant {'with' if factor == -1 else 'in'} {unit}? Then write {given:.6g}."
     return ""
 
 
