@@ -99,7 +99,8 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
                 limits.get("ge", -math.inf) <= given <= limits.get("le", math.inf)) and (
                 limits.get("gt", -math.inf) < given < limits.get("lt", math.inf)):
-            return f"Was it meant {'with' if factor == -1 else 'in'} {unit}? Then write {given:.6g}."
+            word = "with" if factor == -1 else "in"
+            return f"Was it meant {word} {unit}? Then write {given:.6g}."
     return ""
 
 

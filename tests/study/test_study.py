@@ -40,6 +40,7 @@ def test_studies_are_frozen(dipole):
 
 
 DEMAGNETIZATION = {"remanence_coefficient_per_K": -1.2e-3, "coercivity_coefficient_per_K": -6e-3}
+HOT = DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955e3, "temperature_C": 80}
 
 
 @pytest.mark.parametrize(("changes", "said"), [
@@ -56,9 +57,9 @@ DEMAGNETIZATION = {"remanence_coefficient_per_K": -1.2e-3, "coercivity_coefficie
      "Was it meant in kiloamperes per metre? Then write 955000."),
     ({"demagnetization": DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 2e9}},
      "Correct the value."),
-    ({"demagnetization": DEMAGNETIZATION | {"remanence_coefficient_per_K": 1.2e-3}},
+    ({"demagnetization": HOT | {"remanence_coefficient_per_K": 1.2e-3}},
      "Was it meant with the other sign? Then write -0.0012."),
-    ({"demagnetization": DEMAGNETIZATION | {"remanence_coefficient_per_K": 0.12}},
+    ({"demagnetization": HOT | {"remanence_coefficient_per_K": 0.12}},
      "Was it meant in per cent per kelvin and the other sign? Then write -0.0012."),
     ({"array__inner_radius_m": 0.2}, "must be larger than inner_radius_m"),
     ({"array__inner_radius_m": math.nan}, "`array.inner_radius_m`"),
