@@ -77,7 +77,6 @@ WRONG_UNITS = (
     ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
     ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "the other sign", -1.0),
     ("coefficient_per_K", "per cent per kelvin", 1e-2),
-    ("coefficient_per_K", "per cent per kelvin and the other sign", -1e-2),
     *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.

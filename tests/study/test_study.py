@@ -59,8 +59,6 @@ HOT = DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955e3, "temperature_C":
      "Correct the value."),
     ({"demagnetization": HOT | {"remanence_coefficient_per_K": 1.2e-3}},
      "Was it meant with the other sign? Then write -0.0012."),
-    ({"demagnetization": HOT | {"remanence_coefficient_per_K": 0.12}},
-     "Was it meant in per cent per kelvin and the other sign? Then write -0.0012."),
     ({"array__inner_radius_m": 0.2}, "must be larger than inner_radius_m"),
     ({"array__inner_radius_m": math.nan}, "`array.inner_radius_m`"),
     ({"array__block": {"shape": "hexagon"}}, "`array.block.shape`"),
