@@ -124,10 +124,17 @@ class DemagnetizationMap(ShownInNotebook):
         return np.array([weight[self.along * g < -h].sum()
                          for g, h in zip(grown, limit, strict=True)])
 
+    @property
+    def worst_when_cold(self) -> bool:
+        """Whether the coercivity rises with the temperature, as that of ferrite."""
+        return self.material.coercivity_coefficient_per_K > 0
+
     def limit_temperature(self, share: float) -> float:
         """Return the highest temperature in °C with at most a share of the volume past the knee.
 
-        It is infinite if more of the volume is past the knee at no temperature.
+        It is infinite if more of the volume is past the knee at no temperature, and -infinity if at
+        every one. Where `worst_when_cold`, it is the lowest such temperature, and the signs of the
+        infinities are the others.
         """
         material = self.material
         at_reference = -self.along / remanence_factor(material, material.temperature_C)
@@ -137,9 +144,11 @@ class DemagnetizationMap(ShownInNotebook):
                 - knee(material, material.reference_temperature_C)
                 * material.coercivity_coefficient_per_K)
         spare = knee(material, material.reference_temperature_C) - at_reference
-        with np.errstate(divide="ignore"):
-            limit = np.where(rate > 0, spare / rate, np.where(spare > 0, np.inf, -np.inf))
-        order = np.argsort(limit)
+        sign = -1 if self.worst_when_cold else 1
+        with np.errstate(divide="ignore", invalid="ignore"):
+            limit = np.where(sign * rate > 0, spare / rate,
+                             np.where(spare > 0, sign * np.inf, -sign * np.inf))
+        order = np.argsort(sign * limit)
         passed = np.cumsum(self.cells.volumes[order]) / self.cells.volumes.sum()
         first = int(np.searchsorted(passed, share + 1e-12))
         return float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)

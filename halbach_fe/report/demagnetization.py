@@ -78,19 +78,16 @@ def answer(found: DemagnetizationMap) -> Answer:
     losing = "" if not lost else (
         f" The block that loses most is {place_of(by_number[most['block']])}, of which "
         f"{100 * most['share_beyond_knee']:.3g} % is past the knee.")
-    start = (f"{100 * lost:.2g} % of the magnet's volume is past the knee of its demagnetization "
+    start = (f"{100 * lost:.3g} % of the magnet's volume is past the knee of its demagnetization "
              "curve and loses magnetization for good" if lost > 0 else
              "no cell is past the knee of the demagnetization curve")
-    limits = "; ".join(
-        f"{'the first cell' if not share else f'{100 * share:g} % of the volume'} passes the knee "
-        f"at {round(limit)} °C" if math.isfinite(limit) else
-        f"{'no cell' if not share else f'{100 * share:g} % of the volume'} "
-        f"{'ever' if not share else 'never'} passes the knee"
-        for share, limit in ((share, found.limit_temperature(share)) for share in SHARES))
+    limits = "; ".join(_limit_in_words(found, share) for share in SHARES)
     nonlinear = (" At other temperatures the field of the iron is scaled with the remanence."
                  if is_nonlinear(found.study) else "")
-    cold = " It loses magnetization at room temperature already." if (
-        found.limit_temperature(SHARES[-1]) < min(ROOM_C, temperature)) else ""
+    limit = found.limit_temperature(SHARES[-1])
+    at_room = " It loses magnetization at room temperature already." if (
+        limit > max(ROOM_C, temperature) if found.worst_when_cold
+        else limit < min(ROOM_C, temperature)) else ""
     at = f"at {temperature:g}\u00a0°C"
     reference = found.material.reference_temperature_C
     cooler = "" if temperature == reference else (
@@ -98,20 +95,31 @@ def answer(found: DemagnetizationMap) -> Answer:
     return Answer(
         "Do the blocks keep their magnetization?",
         f"{'No' if lost > 0 else 'Yes'}: {at}, {start}.{losing} The smallest margin "
-        f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{cold}",
+        f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{at_room}",
         "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
         "within some per cent. The very edges of blocks are worse than any cell (the option "
         f"--across makes them smaller); shares of the volume hardly depend on that.{nonlinear}"
         f"{cooler}",
         *(("Choose a grade of a higher coercivity for these blocks (the table on the page says "
-           "which), or keep the magnet cooler. If it is built already, a measurement shows what "
-           "it has lost.",
+           f"which), or keep the magnet {'warmer' if found.worst_when_cold else 'cooler'}. If it "
+           "is built already, a measurement shows what it has lost.",
            "halbach-fe diagnose STUDY --measurements MAP -o DIR") if lost > 0 else
           ("Nothing has to be done at this temperature. Next, see which forces the blocks feel.",
            "halbach-fe forces STUDY -o DIR") if found.study.dimension == 3 else
           ("Nothing has to be done at this temperature. Next, see what the tolerances of the "
            "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")),
         concern=f"A{at[1:]}, {start}." if lost > 0 else "")
+
+
+def _limit_in_words(found: DemagnetizationMap, share: float) -> str:
+    """Say at which temperature in °C a share of the volume passes the knee."""
+    part = f"{100 * share:g} % of the volume" if share else "the first cell"
+    limit, cold = found.limit_temperature(share), found.worst_when_cold
+    if math.isfinite(limit):
+        return f"{part} passes the knee {'below' if cold else 'at'} {round(limit)} °C"
+    if (limit > 0) == cold:
+        return f"{part} is past the knee at every temperature"
+    return f"{part} never passes the knee" if share else "no cell ever passes the knee"
 
 
 @own_style
@@ -196,9 +204,11 @@ def _temperature_figure(found: DemagnetizationMap) -> Figure:
     figure = figure_of(3.4)
     axis = figure.subplots()
     limit = found.limit_temperature(SHARES[-1])
-    hottest = max(material.temperature_C, limit if math.isfinite(limit) else -np.inf)
-    temperature = np.linspace(min(material.temperature_C, material.reference_temperature_C),
-                              hottest + SWEEP_K, 241)
+    last = [material.temperature_C, limit if math.isfinite(limit) else material.temperature_C]
+    ends = ((min(last) - SWEEP_K, max(*last, material.reference_temperature_C))
+            if found.worst_when_cold else
+            (min(material.temperature_C, material.reference_temperature_C), max(last) + SWEEP_K))
+    temperature = np.linspace(*ends, 241)
     axis.plot(temperature, 100 * found.share_beyond(temperature), color=POSTERIOR)
     axis.axvline(material.temperature_C, color=PRIOR, ls="--",
                  label=f"temperature of the magnet, {material.temperature_C:g} °C")

@@ -222,8 +222,18 @@ def multipole_rows(magnets: Mapping[str, Multipoles]) -> list[dict[str, str]]:
 
 
 def _size_sd(known: Multipoles) -> Floats:
-    """Return standard deviations (k,) of |c_n| in units: rms over normal and skew part."""
-    return np.asarray(np.hypot(*known.sd.reshape(2, -1)) / np.sqrt(2))
+    """Return standard deviations (k,) of |c_n| in units.
+
+    That of the part along the mean c_n where this is large, because the part across it only turns
+    c_n; the rms of both parts where the mean is 0. The weights are the squares of mean and parts.
+    """
+    normal, skew = known.mean.reshape(2, -1)
+    covariance = known.covariance + np.diag(known.error**2)
+    (bb, ba), (_, aa) = covariance.reshape(2, len(normal), 2, -1).diagonal(axis1=1, axis2=3)
+    along = normal**2 * bb + 2 * normal * skew * ba + skew**2 * aa  # times the mean's square
+    total, square = bb + aa, known.sizes**2
+    return np.asarray(np.sqrt((along + total**2 / 2)
+                              / np.maximum(square + total, np.finfo(float).tiny)))
 
 
 def of_no_main(question: str, said: str, trust: str, command: str) -> Answer:

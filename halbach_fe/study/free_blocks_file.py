@@ -334,5 +334,7 @@ def _sentence(error: ValidationError, rows: Callable[[int], str], where: str) ->
         return f"Input {what} of {where} must be consistent: {ours}."
     if given is None:
         return must_be(what, where, "given", "nothing")
-    received = f"{given:g}" if isinstance(given, int | float) else "something else"
-    return must_be(what, where, sentences.expected(first), received)
+    if not isinstance(given, int | float):
+        return must_be(what, where, sentences.expected(first), "something else")
+    return must_be(what, where, sentences.expected(first), f"{given:g}",
+                   sentences.wrong_unit(str(column), given, first.get("ctx", {})))

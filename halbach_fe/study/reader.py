@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.arguments import typed
@@ -24,19 +23,6 @@ from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.iron import TableCurve
 from halbach_fe.study.model import Study, iron_of
-
-MAX_WRONG_UNIT = 1e12
-"""Values from this size on are not explained by a wrong unit."""
-
-WRONG_UNITS = (
-    ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
-    ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
-    ("_rad", "degrees", np.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
-    *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
-    ("_C", "kelvin", 1.0))
-"""End of a key, a unit in which its value may have been given, and what that is in the right one.
-"""
-ZERO_C_IN_K = 273.15
 
 
 @typed
@@ -179,7 +165,7 @@ def _sentence(error: ValidationError, where: str) -> str:
     elif kind == "tuple_type" and isinstance(value, dict) and _holds_tables(model, first["loc"]):
         hint = f"Write [[{key}]] for [{key}], and once more for each further one."
     elif isinstance(value, int | float) and not isinstance(value, bool):
-        hint = _unit_hint(key, value, first.get("ctx", {}))
+        hint = sentences.wrong_unit(key, value, first.get("ctx", {})) or "Correct the value."
     return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
 
 
@@ -193,28 +179,6 @@ def _holds_tables(model: type[BaseModel] | None, location: tuple[int | str, ...]
 
 def _more(errors: list[Any]) -> str:
     return f" ({len(errors) - 1} more in this file.)" if len(errors) > 1 else ""
-
-
-def _unit_hint(key: str, value: float, limits: Mapping[str, Any]) -> str:
-    """Return a hint to a unit that is wrong, if the value is within the limits in the right one.
-
-    ``limits`` are those of pydantic that the value violates, by their names: ge, gt, le or lt.
-    """
-    return wrong_unit(key, value, limits) or "Correct the value."
-
-
-def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
-    """Return the hint of `_unit_hint`, empty if no unit fits."""
-    key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
-    if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
-        return ""
-    for suffix, unit, factor in WRONG_UNITS:
-        given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
-        if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
-                limits.get("ge", -np.inf) <= given <= limits.get("le", np.inf)) and (
-                limits.get("gt", -np.inf) < given < limits.get("lt", np.inf)):
-            return f"Was it meant in {unit}? Then write {given:.6g}."
-    return ""
 
 
 def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:

@@ -5,6 +5,8 @@ pydantic's errors have a kind, and what belongs to it by name: limits, patterns,
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -64,6 +66,41 @@ def did_you_mean(near: str, given: str) -> str:
     stem, _, unit = near.rpartition("_")
     other = unit in UNITS and stem == given.rpartition("_")[0]
     return f"Did you mean `{near}`?" + (f" Then convert its values to {unit}." if other else "")
+
+
+MAX_WRONG_UNIT = 1e12
+"""Values from this size on are not explained by a wrong unit."""
+
+WRONG_UNITS = (
+    *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
+    ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
+    ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
+    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "the other sign", -1.0),
+    ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
+    ("_C", "kelvin", 1.0))
+"""End of a key, a unit in which its value may have been given, and what that is in the right one.
+"""
+ZERO_C_IN_K = 273.15
+
+
+def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
+    """Return a hint to a unit that is wrong, if the value is within the limits in the right one.
+
+    ``limits`` are those of pydantic that the value violates, by their names: ge, gt, le or lt. The
+    hint is empty if no unit fits.
+    """
+    key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
+    if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
+        return ""
+    for suffix, unit, factor in WRONG_UNITS:
+        given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
+        if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
+                limits.get("ge", -math.inf) <= given <= limits.get("le", math.inf)) and (
+                limits.get("gt", -math.inf) < given < limits.get("lt", math.inf)):
+            word = "with" if factor == -1 else "in"
+            return f"Was it meant {word} {unit}? Then write {given:.6g}."
+    return ""
 
 
 def expected(error: ErrorDetails) -> str:

@@ -15,7 +15,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.demagnetization import demagnetization_summary, write_demagnetization
+from halbach_fe.report.demagnetization import answer, demagnetization_summary, write_demagnetization
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
@@ -151,6 +151,25 @@ def test_no_limit_where_nothing_falls(dipole, session):
     assert found.share_beyond_now == 0.0
     assert found.limit_temperature(0.0) == np.inf
     assert demagnetization_summary(found)["limit_temperature_C"]["0.0"] is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01])
+def test_ferrite_passes_the_knee_in_the_cold(dipole, session, share):
+    """Its coercivity rises with the temperature: below the limit more of it is past the knee."""
+    found = demagnetization_map(build_magnet(dipole(array__remanence_T=0.4, demagnetization={
+        "intrinsic_coercivity_A_per_m": 260e3, "remanence_coefficient_per_K": -2e-3,
+        "coercivity_coefficient_per_K": 3.5e-3})), session)
+    limit = found.limit_temperature(share)
+    below, above = found.share_beyond(np.array([limit - 0.01, limit + 0.01]))
+    assert above <= share < below
+    assert f"passes the knee below {round(limit)} °C" in answer(found).said
+
+
+def test_what_is_past_the_knee_anyway_is_not_said_to_pass_it_never(dipole, session):
+    found = demagnetization_map(build_magnet(dipole(demagnetization=COLD | {
+        "intrinsic_coercivity_A_per_m": 12e3})), session)
+    assert found.limit_temperature(0.0) == -np.inf
+    assert "the first cell is past the knee at every temperature" in answer(found).said
 
 
 def test_needed_coercivity_is_just_enough(warm):

@@ -54,6 +54,7 @@ from halbach_fe.report.words import (
     with_error,
 )
 from halbach_fe.response.homogeneity import Region
+from halbach_fe.response.multipoles import Multipoles
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -184,6 +185,20 @@ def test_a_field_that_cancels_has_no_direction(given):
         assert said.trust.startswith("Only" if cancels else "Yes")
         assert ("multipoles" in said.command) == cancels
         assert bool(homogeneity.harmonic_rows(found)) != cancels
+
+
+@pytest.mark.parametrize(("mean", "root"), [  # b_n and a_n in units; columns are independent
+    ((0, 0), ((50, 0), (0, 50))), ((-7000, 0), ((0.01, 0), (0, 90))),
+    ((300, 400), ((30, 0), (-10, 20))), ((0, 90), ((90, 0), (0, 0.01))),
+    ((40, 0), ((10, 0), (0, 80)))])
+def test_error_of_a_multipoles_size(mean, root):
+    """It is that of drawn magnets; parts across a large multipole only turn it."""
+    known = Multipoles((3,), 1.0, 0.0, 0.0, 0.0, np.array(mean, float), np.array(root, float),
+                          np.zeros(2))
+    drawn = known.sizes_of(np.random.default_rng(1).standard_normal((20_000, 2)))
+    spread, = multipoles._size_sd(known)
+    # where the mean is 0 the rms of a part is stated, 1.5 times the sd of a Rayleigh distribution
+    assert 0.85 < spread / np.std(drawn) < 1.6
 
 
 def of_multipoles(given):

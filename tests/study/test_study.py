@@ -40,6 +40,7 @@ def test_studies_are_frozen(dipole):
 
 
 DEMAGNETIZATION = {"remanence_coefficient_per_K": -1.2e-3, "coercivity_coefficient_per_K": -6e-3}
+HOT = DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955e3, "temperature_C": 80}
 
 
 @pytest.mark.parametrize(("changes", "said"), [
@@ -50,11 +51,14 @@ DEMAGNETIZATION = {"remanence_coefficient_per_K": -1.2e-3, "coercivity_coefficie
     ({"array__inner_radius_m": 104}, "Was it meant in millimetres? Then write 0.104."),
     ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),
     ({"array__remanence_T": 13000}, "Was it meant in gauss? Then write 1.3."),
+    ({"array__remanence_T": 13}, "Was it meant in kilogauss? Then write 1.3."),
     ({"array__remanence_T": 1e6}, "Correct the value."),
     ({"demagnetization": DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955}},
      "Was it meant in kiloamperes per metre? Then write 955000."),
     ({"demagnetization": DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 2e9}},
      "Correct the value."),
+    ({"demagnetization": HOT | {"remanence_coefficient_per_K": 1.2e-3}},
+     "Was it meant with the other sign? Then write -0.0012."),
     ({"array__inner_radius_m": 0.2}, "must be larger than inner_radius_m"),
     ({"array__inner_radius_m": math.nan}, "`array.inner_radius_m`"),
     ({"array__block": {"shape": "hexagon"}}, "`array.block.shape`"),
