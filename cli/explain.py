@@ -95,7 +95,11 @@ class _Explanation:
         """Find where the map lies, and tell whether its pose there may be used."""
         from halbach_fe.report.registration import STUDY_FILE
 
-        found = self.run("register", "registered", self.study)
+        try:
+            found = self.run("register", "registered", self.study)
+        except MeasurementError as error:  # diagnose may know why no pose explains the map
+            common.say(f"The map cannot be registered: {error}")
+            return False
         if STUDY_FILE in found.command:
             self.study = InputFile(self.arguments.output / "registered" / STUDY_FILE)
         else:  # nothing follows from it

@@ -26,6 +26,7 @@ from halbach_fe.inference.pose_space import (
     share_of,
 )
 from halbach_fe.measurement.campaign import middle_of
+from halbach_fe.measurement.field_map import UNDIRECTED_COLUMN
 from halbach_fe.solver.separate_blocks import field_in_vacuum
 
 COARSE_POINTS, MIDDLE_POINTS = 60, 150
@@ -117,9 +118,21 @@ def coarse_poses(
         raise MeasurementError(must_be(
             "map", "registration", "one that some pose of the magnet explains",
             f"{best / size:.0%} of its field unexplained in the best one",
-            "Check the axes and signs of its columns with halbach-fe check."))
+            _after_no_pose(int(training.any(axis=0).sum()), total)))
     most = MOST_POSES if line is None and not total else MOST_OF_A_LINE
     return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:most]
+
+
+def _after_no_pose(components: int, total: bool) -> str:
+    """Say what to do with a map of so many components, or of |B|, that no pose explains."""
+    if total:
+        return ("Look at the places in the file and their unit; if they are right, it is the map "
+                "of another magnet.")
+    if components > 1:
+        return ("Check the axes and signs of its columns with halbach-fe check; if they pass, it "
+                "is the map of another magnet.")
+    return (f"Name its column {UNDIRECTED_COLUMN}, and register finds which component it is; if "
+            "that does not help, it is the map of another magnet.")
 
 
 def _searched(

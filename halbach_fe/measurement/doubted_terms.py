@@ -94,7 +94,7 @@ class Term:
         """The term with its prior, for people."""
         if self.name == ALL_BLOCKS:
             return (f"the blocks would have to be {decimals(100 * abs(self.value))}\u00a0% "
-                    f"{'weaker' if self.value < 0 else 'stronger'} than they were ordered "
+                    f"{'weaker' if self.value < 0 else 'stronger'} than was known before "
                     f"({decimals(self.distance, 2)} standard deviations of a block, "
                     f"{self.known})")
         return (f"{self.name} by {self.size}, where {self.known} was known before "
@@ -195,15 +195,15 @@ def factor_in_words(factor: float, likeness: float = 1.0) -> str:
     ``likeness`` is that of `likeness_of`. Nothing is said of a factor near 1.
     """
     if abs(likeness) < UNLIKE:
-        return ("The readings are not like the field of the magnet as it was ordered, by whatever "
+        return ("The readings are not like the field expected of the magnet, by whatever "
                 "factor: look at the names of their components, at their axes, and at the places "
                 "and their unit (mm for m?) in the file first.")
     if abs(factor - 1) < FACTOR_OFF:
         return ""
     known = f" ({words})" if (words := known_factor(factor)) else ""
-    return (f"The readings are {decimals(factor)} times the field of the magnet as it was ordered"
+    return (f"The readings are {decimals(factor)} times the field expected of the magnet"
             f"{known}: look at their unit, sign and factor in the file first, and at the remanence "
-            "in the study.")
+            "in the study (with --blocks, at the moments in that table).")
 
 
 def known_factor(factor: float) -> str:

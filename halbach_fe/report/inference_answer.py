@@ -35,7 +35,9 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     question = "What is the measured magnet like?"
     solver = _of_the_solver(result)
     if result.disagreement:
-        return Answer(question, "Model and measurement disagree, so that these numbers and their "
+        wrong = ("Model and measurement agree better than the stated noise allows"
+                 if result.disagreement == result.too_near else "Model and measurement disagree")
+        return Answer(question, f"{wrong}, so that these numbers and their "
                       f"error bars are not to be used as they stand. {said}",
                       f"No. {result.disagreement}{solver}",
                       *_after_a_conflict(result), sound=False)
@@ -97,6 +99,9 @@ def _of_the_solver(result: InferenceResult) -> str:
 
 def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
     """Return the next step, and its command, if model and measurement disagree."""
+    if result.disagreement == result.too_near:
+        return ("State the noise that the map has (sigma_T, position_sd_m) and update again. This "
+                "command finds it.", "halbach-fe check MAP -o DIR")
     if result.solver_over_noise >= 1:
         return ("First lower the solver's error, as is said above, and update again: as it is, it "
                 "hides what the study may lack. This command shows how it falls.",

@@ -150,7 +150,9 @@ def answer(
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *(
-            ("Update the blocks with the map in this pose.",
+            ("Update the blocks with the map in this pose. The update takes pose and probe as "
+             "exact, so that error bars of the blocks are too narrow, unless [instrument_sd] says "
+             "how far they were open.",
              f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR") if sound else
             _after_doubts(best, maps) if _is_of_the_file(best) else
             ("Do not update the blocks in this pose. Measure lines beside this one, or the "

@@ -81,6 +81,9 @@ WRONG_UNITS = (
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
 """
+DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius_scale")
+"""Ends of the keys of factors of which the study states the deviation from 1."""
+
 ZERO_C_IN_K = 273.15
 
 
@@ -93,6 +96,9 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
     if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
         return ""
+    if key.endswith(DEVIATIONS_FROM_1) and abs(value - 1) <= limits.get("le", 0.0):
+        return (f"It is the deviation from 1: if {value:.6g} is the whole factor, write "
+                f"{value - 1:.6g}; if per cent, {value / 100:.6g}.")
     for suffix, unit, factor in WRONG_UNITS:
         given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (

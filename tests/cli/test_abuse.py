@@ -138,6 +138,9 @@ def test_values_that_no_magnet_has(campaign, tmp_path, capsys, arguments, code, 
     ({"prior__magnitude_sd": 2.0}, "in per cent? Then write 0.02."),
     ({"prior__magnitude_std": 0.02}, "Did you mean `magnitude_sd`?"),
     ({"array__ring_gap_mm": 1.0}, "Did you mean `ring_gap_m`? Then convert its values to m."),
+    ({"instrument__gain": [1.02, 0, 0]}, "whole factor, write 0.02; if per cent, 0.0102."),
+    ({"instrument__z_scale": 1.001}, "whole factor, write 0.001;"),
+    ({"instrument__gain": [2.0, 0, 0]}, "in per cent? Then write 0.02."),
     ({"instrument__gain": [60, 0, 0]}, "Correct the value.")])
 def test_units_that_a_value_may_have_had(changes, said):
     """What the sentence advises is within the limits; nothing is advised that is not."""

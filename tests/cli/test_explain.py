@@ -11,6 +11,7 @@ import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.cli.verbs import module_of
+from halbach_fe.core.errors import MeasurementError
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, write_record
 from tests.diagnosis.campaign import CIRCLES, NOISE_T, STUDY, drawn, field
@@ -63,6 +64,8 @@ UNKNOWN = replace(BAD, changes_study=False)
       "explained": BAD}, "check inferred registered updated diagnosed explained",
      "check inferred registered updated diagnosed explained"),
     ({"inferred": BAD, "registered": NEAR, "diagnosed": UNKNOWN},
+     "check inferred registered diagnosed", "check inferred diagnosed"),
+    ({"inferred": BAD, "registered": MeasurementError("No pose."), "diagnosed": UNKNOWN},
      "check inferred registered diagnosed", "check inferred diagnosed")])
 def test_each_command_runs_as_far_as_it_is_needed(
         study, tmp_path, monkeypatch, answers, steps, joined):
@@ -73,6 +76,8 @@ def test_each_command_runs_as_far_as_it_is_needed(
         ran.append((arguments.output.name, str(getattr(arguments, "study", ""))))
         arguments.output.mkdir(parents=True)
         answer = {"check": CHECK, **answers}[arguments.output.name]
+        if isinstance(answer, MeasurementError):
+            raise answer
         write_record(arguments.output / "page.html", "", answer, (), (), {}, None)
         return 0
 

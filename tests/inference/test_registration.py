@@ -15,7 +15,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.pose_result import OpenKey
-from halbach_fe.inference.pose_search import coarse_poses, right_angles
+from halbach_fe.inference.pose_search import _after_no_pose, coarse_poses, right_angles
 from halbach_fe.inference.registration import (
     UNDECIDED_LOG_EVIDENCE,
     axes_of_map,
@@ -54,7 +54,7 @@ def test_a_pose_is_found_from_nothing(magnet, generator, tmp_path, number):
     shift = middle - turn.apply(GRID.mean(axis=0))
     if np.abs(GRID @ turn.as_matrix().T + shift)[:, :2].max() > 0.018:
         # the long side lies across the bore: the map would be inside blocks
-        with pytest.raises(MeasurementError, match="unexplained"):
+        with pytest.raises(MeasurementError, match=r"unexplained.*halbach-fe check"):
             register(magnet, field_map(GRID, np.ones_like(GRID)), Session.open(tmp_path))
         return
     # the origin of the stage is half a metre away
@@ -314,3 +314,12 @@ def test_of_equal_poses_the_least_turned_one_is_first():
     # two poses in the same axes the likelier one is first
     assert least_turned_first([half, worse]) == [half, worse]
     assert least_turned_first([near, half, straight]) == [straight, half, near]
+
+
+@pytest.mark.parametrize(("components", "total", "said"), [
+    (3, False, "halbach-fe check"), (1, False, "Name its column B_T"), (1, True, "places in the")])
+def test_what_to_do_with_a_map_that_no_pose_explains(components, total, said):
+    """`check` needs several components, and only one alone can have a wrong name; |B| has none."""
+    advice = _after_no_pose(components, total)
+    assert said in advice
+    assert "another magnet" in advice

@@ -66,6 +66,16 @@ def test_another_magnet_is_to_be_diagnosed(campaign, session):
     assert "agree:" not in said.trust
 
 
+def test_noise_that_is_stated_too_large_is_no_disagreement(campaign, session):
+    """The step finds the noise; a model that lacks something is no reason for it."""
+    result, said = answered(campaign, session, noise={"regions": [
+        {"name": "all", "sigma_T": 1e3 * cuboids.NOISE_T}]})
+    assert result.disagreement == result.too_near
+    assert said.said.startswith("Model and measurement agree better than the stated noise allows")
+    assert "halbach-fe check" in said.command
+    assert not said.sound
+
+
 def test_the_table_has_the_chi2_of_the_answer(campaign, session):
     """In the row of all training readings, whether there are several noise regions or one."""
     regions = [{"name": name, "sigma_T": cuboids.NOISE_T} | limits for name, limits in (
