@@ -81,6 +81,7 @@ WRONG_UNITS = (
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
 """
+
 DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius_scale")
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
