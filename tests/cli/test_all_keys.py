@@ -213,7 +213,7 @@ PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
          or (command in BRIEF and name not in SLOW
              and not (command == "diagnose" and name.startswith("iron")))]
 
-UNLIKE = "Make them types of their own"
+UNLIKE = "Where rings differ, list the blocks as `array.free_blocks`"
 REFUSED: dict[tuple[str, str], str] = {
     ("layers-missing", "sort"): UNLIKE, ("flat-layers", "sort"): UNLIKE,
     ("varying", "shim"): "0 for shimming",
