@@ -102,6 +102,8 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
                 f"{value - 1:.6g}; if per cent, {value / 100:.6g}.")
     for suffix, unit, factor in WRONG_UNITS:
         given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
+        if factor < 0 and value < 0:  # no sign was lost
+            continue
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
                 limits.get("ge", -math.inf) <= given <= limits.get("le", math.inf)) and (
                 limits.get("gt", -math.inf) < given < limits.get("lt", math.inf)):
