@@ -269,7 +269,8 @@ def test_error_bars_are_those_of_drawn_magnets(generator, tmp_path):
     (["--sphere-m", "0.002", "--centre-m", "0.026", "0", "0.015"], "Move its centre into air"),
     (["--centre-m", "0", "0", "1"], "must be beside a region"),
     (["--sphere-m", "0.005", "--centre-m", "0", "0", "10"], "where there is some field"),
-    (["--cylinder-m", "0.005", "100"], "where there is some field"),
+    (["--cylinder-m", "0.005", "19"], "where there is some field"),
+    (["--cylinder-m", "0.005", "100"], "Was it meant in millimetres?"),
 ])
 def test_bad_regions(tmp_path, capsys, options, sentence):
     path = tmp_path / "study.toml"
