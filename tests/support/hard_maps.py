@@ -14,6 +14,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.field_map import field_map
+from tests.support import cube_dipole
 from tests.support.short_dipole import field_of, truth
 
 ROLL_RAD, LAG_M, APART_M, GAIN, DRIFT = 0.02, 1e-3, 2e-3, 0.02, 0.02
@@ -56,18 +57,10 @@ def dipole(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], 
 
 def cubes(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], Floats]:
     """Two rings of cubes of 12 mm around a bore of 50 mm radius, 22 mm apart."""
-    sources = []
-    for z in (-0.011, 0.011):
-        for slot in range(12):
-            angle = np.radians(30.0 * slot)
-            one = magpylib.magnet.Cuboid(
-                dimension=(0.012,) * 3, position=(0.056 * np.cos(angle), 0.056 * np.sin(angle), z),
-                polarization=(1.27 * (1 + 0.01 * generator.standard_normal()), 0.0, 0.0))
-            one.rotate_from_angax(60.0 * slot + 0.5 * generator.standard_normal(), "z")
-            sources.append(one)
+    sources = cube_dipole.cubes(generator)
     points = serpentine(np.linspace(0.014, generator.uniform(0.0476, 0.0486), 7),
                         0.006 * np.arange(-2, 3), 0.007 * np.arange(-2, 5), _within(0.0488))
-    return magpylib.Collection(sources).getB, points
+    return sources.getB, points
 
 
 def quadrupole(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], Floats]:

@@ -22,7 +22,6 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import COMPONENTS
 
 STEP = 1e-3
 """Step of the differences by an instrument, in prior standard deviations of an effect: small
@@ -313,12 +312,6 @@ class InstrumentEffect(Effect):
 def added(values: Sequence[float], change: Sequence[float]) -> tuple[float, ...]:
     """Return the sum of two vectors as a tuple, for a key of a study."""
     return tuple(float(value) + float(more) for value, more in zip(values, change, strict=True))
-
-
-def along(axis: str, value: float) -> tuple[float, float, float]:
-    """Return a vector along ``axis``, which is x, y or z, with the component ``value``."""
-    x, y, z = (value if name == axis else 0.0 for name in COMPONENTS)
-    return x, y, z
 
 
 def with_exceptions(study: Study, exceptions: Sequence[BlockException]) -> Study:
