@@ -22,7 +22,7 @@ from halbach_fe.study.uncertain import Uncertain, number_changes
 
 STEP = 1e-3
 """Step of the differences by an amplitude, in its prior standard deviations, see
-`halbach_fe.diagnosis.scene.STEP`."""
+`halbach_fe.diagnosis.effects.base.STEP`."""
 
 DIGITS = 9
 """Digits of a derivative that differences have, of which rounding leaves no more."""
