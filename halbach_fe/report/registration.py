@@ -63,7 +63,7 @@ STUDY_FILE = "study.registered.toml"
 MAP_FILE = "registered_map.csv"
 """The map with the component that was found, where the map itself does not say which it is."""
 
-NOTE = "found by halbach-fe register"
+NOTE = "of halbach-fe register"
 
 EQUALLY_GOOD = 0.05
 """Odds from which a second pose is reported as a possible one."""
@@ -150,9 +150,8 @@ def answer(
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *(
-            ("Update the blocks with the map in this pose. The update takes pose and probe as "
-             "exact, so that error bars of the blocks are too narrow, unless [instrument_sd] says "
-             "how far they were open.",
+            ("Update the blocks with the map in this pose. The update finds pose and probe again, "
+             "together with the blocks.",
              f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR") if sound else
             _after_doubts(best, maps) if _is_of_the_file(best) else
             ("Do not update the blocks in this pose. Measure lines beside this one, or the "
