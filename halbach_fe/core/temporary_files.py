@@ -8,11 +8,13 @@ more.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import re
 import shutil
 import socket
+import tempfile
 import uuid
 from pathlib import Path
 
@@ -31,6 +33,13 @@ def temporary_path(path: Path) -> Path:
     does not use the module tempfile, gives it the permissions of the user's umask.
     """
     return path.with_name(f"{temporary_name(path.stem)}{uuid.uuid4().hex[:8]}{path.suffix}")
+
+
+def folder_until_exit() -> Path:
+    """Return a new folder that is removed when Python ends."""
+    folder = Path(tempfile.mkdtemp(prefix="halbach-fe-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def remove_orphans(folder: Path) -> None:

@@ -36,7 +36,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.external_field import external_field
 from halbach_fe.solver.separate_blocks import present_blocks, solve_separate
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0
 
@@ -152,7 +152,7 @@ class Forces(ShownInNotebook):
 
 @alone
 def forces(
-    magnet: Magnet, session: Session, order: Sequence[str] | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, order: Sequence[str] | None = None,
     density_kg_per_m3: float | None = None, price_per_kg: float | None = None,
 ) -> Forces:
     """Compute forces and torques on every block, in place and as it is inserted.
@@ -160,7 +160,7 @@ def forces(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP, if the magnet has iron.
     order : sequence of str, optional
         Names of all blocks in the order in which they are inserted; by default ring by ring, slot

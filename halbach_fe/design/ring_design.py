@@ -41,7 +41,7 @@ from halbach_fe.response.homogeneity import (
     slices_of,
 )
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.model import Study
 
@@ -124,7 +124,7 @@ class Designed(ShownInNotebook):
 
 @alone
 def design_rings(
-    study: Study, session: Session, region: Region | None = None, seed: int = 0
+    study: Study, session: Session = NOT_KEPT, region: Region | None = None, seed: int = 0
 ) -> Designed:
     """Choose the rings of a magnet so that its field in a region is homogeneous.
 
@@ -132,7 +132,7 @@ def design_rings(
     ----------
     study : Study
         Its ``design`` lists the rings to choose from and says what is asked.
-    session : Session
+    session : Session, optional
         Its folder receives what is solved for permeable blocks.
     region : Region, optional
         By default the sphere about the origin of half the radius of the study's bore.

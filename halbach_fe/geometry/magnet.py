@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
@@ -44,6 +45,9 @@ that to the boundary of 3D meshes."""
 BESIDE_RAD = 1e-6
 """Angle in rad beyond half a turn without blocks about the axis, from which blocks are on one side.
 Two opposite poles leave half a turn, but for the rounding of their tables to micrometres."""
+
+SOLVED_BY = "halbach_fe.solver.formulation_choice"
+"""The module that solves for the field of a magnet."""
 
 SQUEEZED = 0.1
 """The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
@@ -306,6 +310,32 @@ class Magnet(ShownInNotebook):
         return np.array([
             1.02 * np.linalg.norm((points - block.middle)[:, :self.dimension], axis=1).max()
             for block, points in zip(self.blocks, self._corners, strict=True)])
+
+    def __repr__(self) -> str:
+        """Return the name and the size."""
+        return f"Magnet({self.name}: {len(self.blocks)} blocks in {self.dimension}D)"
+
+    def field_T(self, points_m: ArrayLike) -> Floats:  # noqa: N802 - T is the unit
+        """Return B in T of the nominal magnet at points in air.
+
+        Finite elements are solved where the magnet needs any. `halbach_fe.solve` keeps their files,
+        and has error bars.
+
+        Parameters
+        ----------
+        points_m : array_like, shape (..., 3), in m
+
+        Returns
+        -------
+        ndarray, shape (..., 3), in T
+
+        Raises
+        ------
+        StudyError
+            If a point is not in air.
+        """
+        # the way to the solver, which is a later room: what a magnet is used for most is a method
+        return np.asarray(import_module(SOLVED_BY).field_at(self, points_m))
 
     def with_(self, **changes: Any) -> Magnet:
         """Return the magnet of the same study with other values of some keys, see `Study.with_`."""

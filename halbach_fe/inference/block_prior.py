@@ -159,6 +159,14 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
         If the prior is the distribution of the samples of a type that do not look normal, if the
         blocks were measured at another temperature than that of the study, or if their mean is many
         of the study's standard deviations from nominal.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> prior = hf.prior_from_blocks(magnet, hf.read_blocks("blocks.csv"))
+    >>> len(prior.gaussian.mean) == len(magnet.parameter_names)
+    True
     """
     size = magnet.dimension
     moves = mountings(magnet)

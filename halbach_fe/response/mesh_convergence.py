@@ -21,7 +21,7 @@ from halbach_fe.response.discretization_error import DUAL, REFINEMENT, dual, far
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import MESHES, choose_route, solve_nominal
 from halbach_fe.solver.mesh import meridian_size
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.measurement import FourierCoefficients
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
@@ -131,7 +131,7 @@ class Verification(ShownInNotebook):
 
 @alone
 def verify(
-    magnet: Magnet, session: Session, say: Callable[[str], None] = lambda _: None
+    magnet: Magnet, session: Session = NOT_KEPT, say: Callable[[str], None] = lambda _: None
 ) -> Verification:
     """Estimate the error of the solved field of the nominal magnet.
 
@@ -141,7 +141,7 @@ def verify(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP.
     say : callable, optional
         Called with a description of each solve before it starts, to report progress.

@@ -24,7 +24,7 @@ from halbach_fe.geometry.blocks import vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 
 LIMIT_T = 5e-4
@@ -136,7 +136,7 @@ class StrayField:
 
 @alone
 def stray_field(
-    magnet: Magnet, session: Session, magnetizations: Gaussian | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, magnetizations: Gaussian | None = None,
     limit_T: float = LIMIT_T,
 ) -> StrayField | None:
     """Tell how far outside of a magnet |B| reaches a limit, by default 0.5 mT.
@@ -144,7 +144,7 @@ def stray_field(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
     magnetizations : Gaussian, optional
         Distribution of the magnetizations in A/m, for example the posterior of
         `halbach_fe.infer`; by default the nominal ones.

@@ -14,9 +14,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
@@ -135,6 +136,16 @@ def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
     points = check_points(magnet, points)
     return vacuum_part(magnet, points) + finite_element_part(
         magnet, points, session, columns=False, estimate=False).nominal
+
+
+def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
+    """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
+    points = np.asarray(points_m, float)
+    if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
+        raise StudyError(must_be("points_m", magnet.name, "numbers x, y, z in m: an array (..., 3)",
+                                 f"one of shape {points.shape}"))
+    field = field_function(magnet, Session.temporary())(points.reshape(-1, 3))
+    return field.reshape(points.shape)
 
 
 def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:

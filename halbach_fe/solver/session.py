@@ -17,7 +17,7 @@ from halbach_fe.core.files import make_folder
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.pace import Progress
 from halbach_fe.core.result_folder import locked_folder
-from halbach_fe.core.temporary_files import remove_orphans, temporary_path
+from halbach_fe.core.temporary_files import folder_until_exit, remove_orphans, temporary_path
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import NO_GETDP, GetDP, Run, getdp_or_none
 from halbach_fe.solver.getdp_cache import Cache, default_cache
@@ -162,6 +162,11 @@ class Session:
                    cache=default_cache(None))
 
     @classmethod
+    def temporary(cls) -> Session:
+        """Return a session with the usual settings, whose folder is removed when Python ends."""
+        return cls.open(folder_until_exit())
+
+    @classmethod
     def counting(cls, jobs: int) -> Session:
         """Return a session that counts runs of GetDP instead of starting them."""
         return cls(NO_GETDP, Path(), jobs=jobs, counter=RunCounter())
@@ -188,21 +193,29 @@ class Session:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+NOT_KEPT = Session(NO_GETDP, Path())
+"""Stands for a session whose files nobody wants to keep, see `Session.temporary`."""
+
+
 def alone(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function with an argument ``session``, in whose folder nobody else may write.
 
-    A second run in the same folder raises OutputError until the function has returned. Functions
-    may call each other. Arguments of other classes than its own are refused, see `typed`.
+    `NOT_KEPT` becomes a session of its own. A second run in the same folder raises OutputError
+    until the function has returned. Functions may call each other. Arguments of other classes than
+    its own are refused, see `typed`.
     """
     signature = inspect.signature(function)
 
     @typed
     @functools.wraps(function)
     def locked(*arguments: P.args, **options: P.kwargs) -> R:
-        session = signature.bind(*arguments, **options).arguments["session"]
+        bound = signature.bind(*arguments, **options)
+        session = bound.arguments.get("session", NOT_KEPT)
+        if session is NOT_KEPT:
+            session = bound.arguments["session"] = Session.temporary()
         if session.counter is not None:  # which writes nothing
-            return function(*arguments, **options)
+            return function(*bound.args, **bound.kwargs)
         with locked_folder(session.folder):
-            return function(*arguments, **options)
+            return function(*bound.args, **bound.kwargs)
 
     return locked

@@ -23,7 +23,7 @@ def files(tmp_path_factory):
     (folder / "study.toml").write_text(STUDY)
     field = np.column_stack([0 * ANGLE + 0.55, 0 * ANGLE, 0 * ANGLE])
     field[:, :2] += 1e-3 * np.random.default_rng(1).standard_normal((12, 2))
-    data = field_map(POINTS, field, sigma=np.full((12, 3), 1e-3))
+    data = field_map(POINTS, field, sigma_T=np.full((12, 3), 1e-3))
     write_map(data.assign(time_s=("point", np.arange(12.0))), folder / "map.csv")
     return folder / "study.toml", folder / "map.csv"
 
