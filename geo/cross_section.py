@@ -13,13 +13,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geo.element_size import set_element_sizes
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.geometry import regions as tags
+from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.domain import boundary_radius
+from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_radius
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.regions import BlockRegion, Regions
 
 LINE, TRIANGLE = 1, 2
 """Gmsh's element types of straight edges and triangles."""

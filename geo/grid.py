@@ -9,7 +9,7 @@ import gmsh
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry import regions as tags
+from halbach_fe.geometry import domain as tags
 
 LINE, QUADRANGLE = 1, 3
 """Gmsh's element types of edges and quadrangles."""

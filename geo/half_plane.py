@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geo.grid import add_grid
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.geometry import regions as tags
-from halbach_fe.geometry.regions import Regions
+from halbach_fe.geometry import domain as tags
+from halbach_fe.geometry.domain import Regions
 
 
 def mesh_half_plane(

@@ -16,10 +16,9 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geo.grid import add_grid
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.geometry import regions as tags
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry import domain as tags
+from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.regions import BlockRegion, Regions
 
 _GROWTH = 1.35
 """Ratio of the sizes of neighbouring elements towards the outer boundary."""

@@ -14,8 +14,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
-from halbach_fe.geometry.block_export import blocks_of_table, blocks_table
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
+from halbach_fe.geometry.free_blocks import blocks_of_table, blocks_table
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.prism import Prism, upright

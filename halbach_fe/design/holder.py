@@ -16,9 +16,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.design.engraving import digits
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.outline import Outline, distance_from_origin, thinnest_wall
 from halbach_fe.geometry.prism import Prism, circle, widened, with_notch
-from halbach_fe.geometry.walls import distance_from_origin, thinnest_wall
 from halbach_fe.study.holder import Holder, Rods
 
 LEVEL_M = 1e-5

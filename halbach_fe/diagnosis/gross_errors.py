@@ -40,9 +40,8 @@ from halbach_fe.diagnosis.map_conventions import (
     compose_axes,
     rank,
 )
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of

@@ -238,6 +238,12 @@ def rotation_matrix(vector: tuple[float, float, float]) -> Floats:
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
+def rotation_about_z(angle: float) -> Floats:
+    """Return the matrix (3, 3) of a rotation about z by ``angle`` rad."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
+
+
 def frames_of(blocks: Sequence[MagnetBlock]) -> tuple[Floats, Floats]:
     """Return `position` (blocks, 3) in m and `axes` (blocks, 3, 3) of many blocks."""
     turns, turned, origins, moves = (

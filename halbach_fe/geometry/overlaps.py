@@ -19,10 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.convex_pieces import Shape, annulus
+from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.separating_axes import PARALLEL, Prisms
 
 TOLERANCE = 1e-6
 """Allowed penetration, as a fraction of the smaller body's size. Positions with nine significant

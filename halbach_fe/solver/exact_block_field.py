@@ -33,9 +33,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
-from halbach_fe.geometry.blocks import MagnetBlock, frames_of
+from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.symmetry import rotation_about_z
 
 _STEP = 1e-4
 """Step of finite differences, relative to the largest radius of the blocks. Their relative error is

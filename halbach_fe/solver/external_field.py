@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0

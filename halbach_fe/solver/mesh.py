@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry.domain import Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.regions import Regions
 from halbach_fe.study.model import Study
 
 MESH_NAME = "mesh.msh"

@@ -30,8 +30,8 @@ from halbach_fe.core.errors import (
     OutputError,
     StudyError,
 )
+from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.regions import Regions
 from halbach_fe.inference import mcmc, storage
 from halbach_fe.inference.mcmc import _Run
 from halbach_fe.inference.storage import _stored_root, read_posterior

@@ -12,8 +12,8 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.cli.common import print_table
 from halbach_fe.core.errors import MeasurementError, MeshError, StudyError
+from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.regions import Regions
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.report.page import write_page
