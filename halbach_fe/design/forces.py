@@ -33,8 +33,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.separate_blocks import present_blocks, solve_separate
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.study.grades import grade

@@ -21,7 +21,6 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import check_number
 from halbach_fe.design.forces import DENSITY_KG_PER_M3
-from halbach_fe.design.radius_programs import moved_radii
 from halbach_fe.design.ring_catalogue import (
     Catalogue,
     Option,
@@ -30,7 +29,7 @@ from halbach_fe.design.ring_catalogue import (
     fields_with_images,
     tables_of,
 )
-from halbach_fe.design.ring_search import MISSES, Found, Task, search
+from halbach_fe.design.ring_search import MISSES, Found, Task, moved_radii, search
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.response.homogeneity import (
     PPM,

@@ -46,8 +46,7 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix, to_magnet_axes
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

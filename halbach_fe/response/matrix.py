@@ -32,15 +32,14 @@ from halbach_fe.core.hdf5 import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.block_variation import Variations
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
-from halbach_fe.response.uncertain_amplitudes import (
+from halbach_fe.response.block_variation import (
+    Variations,
     amplitude_names,
     field_changes,
     shared_deviations,
 )
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import (
     SUPERPOSITION_TOLERANCE,
     ElementFields,

@@ -21,8 +21,7 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.condensed_newton import Condensed, condense
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import (
     check_points,
     choose_route,

@@ -31,9 +31,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.discretization_error import (
+    error_bar_session,
+    reading_errors,
+    variants_to_compare,
+)
 from halbach_fe.response.matrix import LOADED_BYTES
-from halbach_fe.response.mesh_convergence import variants_to_compare
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.formulation_choice import (
     MESHES,

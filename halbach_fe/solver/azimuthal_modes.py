@@ -39,12 +39,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.getdp import DIRECT_SOLVER_OF_PLANE, Job
-from halbach_fe.solver.grid_interpolation import grid_operators
 from halbach_fe.solver.interpolation import (
     Located,
     apply_operator,
     compare_printed,
     coordinates,
+    grid_operators,
     locate,
     nodal_operators,
     probes_of,
@@ -58,8 +58,7 @@ from halbach_fe.solver.mesh import (
     count_mesh,
     verify_mesh,
 )
-from halbach_fe.solver.runs import Task, run_tasks
-from halbach_fe.solver.session import RunSize, Session
+from halbach_fe.solver.session import RunSize, Session, Task, run_tasks
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"

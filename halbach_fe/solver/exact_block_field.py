@@ -21,6 +21,9 @@ B_t remains.
 On straight edges the integrals are elementary; on arcs they are evaluated by Gauss-Legendre
 quadrature on panels that are no longer than their distance from the point, to an error of 1e-15 of
 the field. `halbach_fe.solver.prism_kernel` has them in compiled form.
+
+Fields of external sources (background, neighbouring magnets, magnetized objects) are added in
+vacuum: the magnet's permeability and iron do not react to them.
 """
 
 from __future__ import annotations
@@ -34,7 +37,10 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
+from halbach_fe.study.magnet import Neighbour, check_apart
+from halbach_fe.study.materials import MU_0
 
 _STEP = 1e-4
 """Step of finite differences, relative to the largest radius of the blocks. Their relative error is
@@ -331,3 +337,54 @@ def _inside(block: MagnetBlock, order: int = 6) -> tuple[Floats, Floats]:
     points = np.concatenate([np.dstack([place, np.full_like(area, block.z_min + height * level)])
                              for level in t])
     return points.reshape(-1, 3), np.outer(height * weights, area).ravel()
+
+
+def external_field(magnet: Magnet, points: Floats) -> Floats:
+    """Return B (n, 3) in T of the study's external sources at points (n, 3) in m.
+
+    Raises
+    ------
+    StudyError
+        If a point is at a dipole.
+    """
+    external = magnet.external
+    check_apart(external, points, magnet.name)
+    field = np.tile(external.background_T, (len(points), 1)).astype(float)
+    for neighbour in external.neighbours:
+        field += neighbour_field(magnet, neighbour, points)
+    for dipole in external.dipoles:
+        field += dipole_field(np.array(dipole.position_m), np.array(dipole.moment_A_m2), points)
+    return field
+
+
+def neighbour_field(magnet: Magnet, neighbour: Neighbour, points: Floats) -> Floats:
+    """Return B of a second magnet with the study's blocks, shifted along z and turned about z.
+
+    Its permeability is that of vacuum, and its remanence is scaled by ``neighbour.factor``.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    neighbour : Neighbour
+    points : ndarray, shape (n, 3), in m
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T
+    """
+    turn = rotation_about_z(np.radians(neighbour.turn_deg))
+    local_points = (points - [0.0, 0.0, neighbour.z_m]) @ turn
+    return np.asarray(neighbour.factor * field_of(magnet.blocks, local_points) @ turn.T)
+
+
+def dipole_field(position: Floats, moment: Floats, points: Floats) -> Floats:
+    """Return B (n, 3) in T of a point dipole at points (n, 3) in m.
+
+    ``position`` (3,) is in m and ``moment`` (3,) in A m^2. See J. D. Jackson, Classical
+    Electrodynamics, 3rd ed., eq. 5.56.
+    """
+    offset = points - position
+    distance = np.linalg.norm(offset, axis=1)[:, None]
+    direction = offset / distance
+    along = (direction @ moment)[:, None]
+    return np.asarray(MU_0 / (4 * np.pi) * (3 * along * direction - moment) / distance**3)

@@ -22,15 +22,12 @@ from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.formulations import (
+from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
     Formulation,
     edge_elements,
-)
-from halbach_fe.solver.magnetostatics import (
     nominal_samples,
     solve_samples,
     solve_sources,
@@ -46,6 +43,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -484,3 +482,44 @@ def check_points(
                 f"{z:g}) m. Enlarge `open_boundary` of study {magnet.name}.", HalbachWarning,
                 stacklevel=2)
     return points
+
+
+def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
+    """Return the derivative of B along the nominal direction of magnetization of a block.
+
+    The iron is at its operating point in the nominal array.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    block : int
+        Number of the block, from 0.
+    points : ndarray, shape (n, 3), in m
+        Anywhere inside the outer boundary, also in magnet and iron.
+    session : Session
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T m/A
+
+    Raises
+    ------
+    StudyError
+        If the array has no block of this number.
+    """
+    blocks = magnet.blocks
+    if not 0 <= block < len(blocks):
+        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)} "
+                         f"blocks; instead received number {block + 1}. Correct the number.")
+    # Solve for B itself by a vector potential: in materials the field in vacuum has no exact form
+    # to which a reaction could be added, and the gradient of the scalar potential is H, not B.
+    direct = magnet.with_(solver__method="direct", solver__route="auto")
+    formulation = formulation_of(direct, choose_route(direct, points))
+    if magnet.is_nonlinear:
+        fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
+    else:
+        fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
+    size, changed = magnet.dimension, blocks[block]
+    # the change of remanence in T for a change of magnetization by 1 A/m along the easy axis
+    remanence = MU_0 * changed.recoil_tensor @ np.array(changed.easy_axis)
+    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])

@@ -30,7 +30,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     solve_iron,
 )
 from halbach_fe.solver.exact_block_field import field_on_circles, unit_fields
-from halbach_fe.solver.iron_grid import IronRectangle, Resolution
+from halbach_fe.solver.iron_modes import IronRectangle, Resolution
 from halbach_fe.solver.session import Session
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ def separate_columns(
         Takes the number of a block, from 0, and indices (k,) of points or a slice; returns the
         reaction (k, 3, 3) in T per T of remanence along each axis.
     """
-    from halbach_fe.solver.moments.columns import reaction_columns  # imports numba
+    from halbach_fe.solver.moments.solve import reaction_columns  # imports numba
 
     blocks = magnet.blocks
     of_blocks = reaction_columns(
