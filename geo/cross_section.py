@@ -19,9 +19,6 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 
-LINE, TRIANGLE = 1, 2
-"""Gmsh's element types of straight edges and triangles."""
-
 COUNTED = 4000
 """Number of triangles up to which an estimate of a mesh's size builds the mesh itself; finer meshes
 are extrapolated from one of about this size, which takes half a second."""
@@ -29,12 +26,6 @@ are extrapolated from one of about this size, which takes half a second."""
 DRAWN = 64
 """Number of blocks up to which an estimate of a mesh's size draws all of them; larger rings are
 extrapolated from so many blocks, which takes a second."""
-
-ALONG_CURVES = 0.7
-"""Exponent of the refinement with which the number of excess triangles grows. A mesh has more
-triangles than area and element size imply, because every curve is cut into whole edges. Measured
-are 0.55 to 0.85 on four cross-sections of trapezoids, cubes and sectors, refined by steps of two.
-The excess is about a quarter of all triangles, so that this range means an error of 3 %."""
 
 
 def mesh_2d(magnet: Magnet, mesh_path: Path) -> Regions:
@@ -127,17 +118,24 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     if len(blocks) > DRAWN:  # every further block adds the same number of triangles
         fewer, _ = _counted(drawn, blocks[:DRAWN // 2], radius)
         excess += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
-    return wanted + excess * coarser**ALONG_CURVES, rim
+    # exponent of the refinement with which the number of excess triangles grows. A mesh has more
+    # triangles than area and element size imply, because every curve is cut into whole edges.
+    # Measured are 0.55 to 0.85 on four cross-sections of trapezoids, cubes and sectors, refined by
+    # steps of two. The excess is about a quarter of all triangles, so that this range means an
+    # error of 3 %.
+    excess_exponent = 0.7
+    return wanted + excess * coarser**excess_exponent, rim
 
 
 def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> tuple[int, int]:
     """Return the numbers of triangles and of outer edges of the plane mesh of these blocks."""
+    line, triangle = 1, 2  # Gmsh's element types of straight edges and triangles
     with gmsh_session(magnet.name):
         draw(magnet, blocks, radius)
         gmsh.model.mesh.generate(2)
         mesh = gmsh.model.mesh
-        rim = sum(len(mesh.getElementsByType(LINE, curve)[0]) for curve in outer_curves(radius))
-        return len(mesh.getElementsByType(TRIANGLE)[0]), rim
+        rim = sum(len(mesh.getElementsByType(line, curve)[0]) for curve in outer_curves(radius))
+        return len(mesh.getElementsByType(triangle)[0]), rim
 
 
 def _equilateral(magnet: Magnet, radius: float) -> float:

@@ -22,12 +22,6 @@ from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 
-_GROWTH = 1.35
-"""Ratio of the sizes of neighbouring elements towards the outer boundary."""
-
-_GRADING, _LEVELS = 0.3, 2
-"""Refinement at corners of materials: ratio of successive subdivisions, and their number."""
-
 
 def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
     """Mesh the half-plane with elements of ``size`` (m) in the magnet; return its regions.
@@ -108,11 +102,13 @@ def _graded(positions: list[float], corners: list[float]) -> Floats:
     """
     x = np.array(positions)
     added = []
+    # refinement at corners of materials: ratio of successive subdivisions, and their number
+    grading, levels = 0.3, 2
     for corner in corners:
         i = int(np.argmin(np.abs(x - corner)))
         for neighbour in (i - 1, i + 1):
             step = x[neighbour] - x[i]
-            added += [x[i] + step * _GRADING**level for level in range(1, _LEVELS + 1)]
+            added += [x[i] + step * grading**level for level in range(1, levels + 1)]
     return np.unique(np.concatenate([x, added]))
 
 
@@ -132,8 +128,9 @@ def _uniform(stops: list[float], size: float) -> list[float]:
 def _growing(start: float, size: float, stop: float) -> list[float]:
     """Return positions after ``start`` up to ``stop`` with geometrically growing distances."""
     result, position = [], start
+    growth = 1.35  # ratio of the sizes of neighbouring elements towards the outer boundary
     while position < stop:
-        size *= _GROWTH
+        size *= growth
         position = stop if stop - position < 1.5 * size else position + size
         result.append(position)
     return result
@@ -175,10 +172,6 @@ def mesh_half_plane(
                    outer_boundary=tags.OUTER_BOUNDARY_TAG, axis=tags.AXIS_TAG, blocks=())
 
 
-LINE, QUADRANGLE = 1, 3
-"""Gmsh's element types of edges and quadrangles."""
-
-
 def add_grid(r: Floats, z: Floats, material: Ints) -> None:
     """Add the rectangles of a grid to the Gmsh model, as one discrete entity per material.
 
@@ -207,11 +200,12 @@ def add_grid(r: Floats, z: Floats, material: Ints) -> None:
     for tag in present:
         gmsh.model.addDiscreteEntity(2, tag)
     gmsh.model.mesh.addNodes(2, present[0], np.arange(1, len(points) + 1), points.ravel())
+    line, quadrangle = 1, 3  # Gmsh's element types of edges and quadrangles
     for tag in present:
-        _add(2, QUADRANGLE, tag, cells[material.ravel() == tag])
+        _add(2, quadrangle, tag, cells[material.ravel() == tag])
     for tag, lines in ((tags.AXIS_TAG, axis), (tags.OUTER_BOUNDARY_TAG, rim)):
         gmsh.model.addDiscreteEntity(1, tag)
-        _add(1, LINE, tag, lines)
+        _add(1, line, tag, lines)
 
 
 def _add(dimension: int, kind: int, tag: int, nodes: Ints) -> None:

@@ -78,10 +78,6 @@ LARGEST_STREAM_BYTES = 2**30
 """Most that is read of a pipe or device, some of which never end (/dev/zero). The largest maps that
 were tried, of a million readings, have a tenth of it."""
 
-FULL_BYTES = 10_000_000
-"""A disk with less free space is full: programs that met its end have removed some of their files.
-"""
-
 Writing = Callable[[Path, Path], AbstractContextManager[None]]
 """A context in which a complete temporary file, the second path, is renamed to the first."""
 
@@ -244,7 +240,10 @@ def write_text(path: Path, text: str) -> None:
 
 def is_full(folder: Path) -> bool:
     """Tell whether the disk of a folder has no room left, as far as that can be known."""
+    # A disk with less free space is full: programs that met its end have removed some of their
+    # files
+    full_bytes = 10_000_000
     try:
-        return shutil.disk_usage(folder).free < FULL_BYTES
+        return shutil.disk_usage(folder).free < full_bytes
     except OSError:
         return False

@@ -62,12 +62,6 @@ def digits(
 LEVEL_M = 1e-5
 """Blocks that overlap by less than this in z are above one another."""
 
-USUAL_FLOOR_M, LEAST_FLOOR_M = 2e-3, 5e-4
-"""Thickness of the floor where there is room for it, and the thinnest one that is made unasked."""
-
-DIGIT_M = 4e-3
-"""Largest height of the engraved number of a plate."""
-
 FLAT = 0.1
 """Part of the magnetization in the plane of a plate below which it is not marked there."""
 
@@ -265,9 +259,11 @@ def _frame(
               for group in groups]
     gap = min((above[0] - below[1] for below, above in pairwise(limits)), default=np.inf)
     floor = holder.floor_m
+    # thickness of the floor where there is room for it, and the thinnest one that is made unasked
+    usual_floor_m, least_floor_m = 2e-3, 5e-4
     if floor is None:
-        floor = min(USUAL_FLOOR_M, max(gap, 0.0))
-        floor = floor if floor >= LEAST_FLOOR_M else 0.0
+        floor = min(usual_floor_m, max(gap, 0.0))
+        floor = floor if floor >= least_floor_m else 0.0
     for below, above in pairwise(limits):
         top = below[1] if holder.thickness_m is None else below[0] - floor + holder.thickness_m
         if above[0] - floor < top - LEVEL_M:
@@ -420,8 +416,9 @@ def _shape(plate: Plate) -> object:
 def _numbered(plate: Plate, number: int, holder: Holder, frame: _Frame) -> Plate:
     """Return a plate with its number, engraved outside of the pockets where there is room."""
     room = frame.outer - 2 * holder.mark_m - frame.pockets - 2 * holder.least_wall_m
-    height, depth = min(DIGIT_M, room), min(holder.engraving_m, plate.thickness_m / 2)
-    if depth and height >= DIGIT_M / 2:
+    digit_m = 4e-3  # largest height of the engraved number of a plate
+    height, depth = min(digit_m, room), min(holder.engraving_m, plate.thickness_m / 2)
+    if depth and height >= digit_m / 2:
         rods = [rod.polygon for rod in frame.rods]
         for angle in np.radians(np.arange(0.0, 360.0, 3.0)):
             bars = digits(str(number), height, frame.pockets + holder.least_wall_m + room / 2,

@@ -62,10 +62,6 @@ class UnknownDeviation:
     baseline: Floats
 
 
-CURVE_POINTS = 100
-"""Number of subsets, of increasing size, of the study's positions whose information is computed."""
-
-
 @dataclass(frozen=True)
 class MeasurementPlan(ShownInNotebook):
     """Positions of a measurement plan, and its information compared with the study's positions.
@@ -196,7 +192,9 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     choice = greedy(whitened[len(baseline):], wanted, None if values is None else values.root)
     chosen = choice.chosen
     same = min(wanted, len(baseline))
-    counts = np.unique(np.append(np.linspace(1, len(baseline), CURVE_POINTS).astype(int), same))
+    # number of subsets, of increasing size, of the study's positions whose information is computed
+    curve_points = 100
+    counts = np.unique(np.append(np.linspace(1, len(baseline), curve_points).astype(int), same))
     subsets = [whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2])
                for number in counts]
     rows = np.arange(len(observation)).reshape(len(points), size)

@@ -43,23 +43,11 @@ from halbach_fe.design.ring_catalogue import (
 )
 from halbach_fe.response.homogeneity import PPM
 
-PAIRED = 10
-"""Number of rings of each place, the best by themselves, that are tried in pairs."""
-
-CHANGED = (2, 3, 4)
-"""Numbers of places that are changed at random."""
-
-PROMISING = 4.0
-"""Factor to the best value below which pairs are tried."""
-
 MISSES = 1e9
 """Value in ppm of designs that miss what is asked, above that of every other one."""
 
 TINY_T = 1e-12
 """Mean field below which there is none."""
-
-LEAST_GAIN = 1e-9
-"""Smallest relative gain of a change: of smaller ones, rounding decides."""
 
 
 @dataclass(frozen=True)
@@ -130,11 +118,12 @@ def search(
     """
     best = _descend(task, start, np.inf)
     places, options = task.table.shape[:2]
+    counts = (2, 3, 4)  # numbers of places that are changed at random
     for _ in range(restarts if options > 1 else 0):
         if best.ppm <= enough:
             break
         changed = best.chosen.copy()
-        some = generator.choice(places, min(int(generator.choice(CHANGED)), places), replace=False)
+        some = generator.choice(places, min(int(generator.choice(counts)), places), replace=False)
         changed[some] = generator.integers(options, size=len(some))
         found = _descend(task, changed, best.ppm)
         if found.ppm < best.ppm:
@@ -149,15 +138,17 @@ def _descend(task: Task, start: Ints, best: float) -> Found:
     """
     chosen, total = start.copy(), task.total(start)
     value = float(task.value(total))
+    promising = 4.0  # factor to the best value below which pairs are tried
+    least_gain = 1e-9  # smallest relative gain of a change: of smaller ones, rounding decides
     while True:
         rest = total - task.table[np.arange(len(chosen)), chosen]
         single = task.value(rest[:, None] + task.table)
         place, option = np.unravel_index(int(np.argmin(single)), single.shape)
         new = {int(place): int(option)}
         least = float(single[place, option])
-        if least >= value * (1 - LEAST_GAIN) and value < PROMISING * best:
+        if least >= value * (1 - least_gain) and value < promising * best:
             least, new = _best_pair(task, rest, total, single)
-        if least >= value * (1 - LEAST_GAIN):
+        if least >= value * (1 - least_gain):
             return Found(chosen, value)
         chosen[list(new)] = list(new.values())
         total, value = task.total(chosen), least
@@ -173,24 +164,12 @@ def _best_pair(
     """
     from halbach_fe.design.ring_pairs import best_pair  # imports numba
 
-    options = np.argsort(single, axis=1)[:, :PAIRED]
+    paired = 10  # number of rings of each place, the best by themselves, that are tried in pairs
+    options = np.argsort(single, axis=1)[:, :paired]
     value, first, one, second, other = best_pair(
         rest, total, task.table, options, task.weights, task.objective == "rms",
         task.least_field_T, task.most_mass_kg, MISSES, TINY_T, PPM)
     return value, {first: one, second: other} if first >= 0 else {}
-
-
-STEP_M = 1e-5
-"""Step of the derivatives by a radius: that of a field which falls as 1/r^3 is exact to 1e-7."""
-
-LARGEST_M, SMALLEST_M = 2e-3, 1e-6
-"""First and last size of the trust region; no workshop places a block better than the last."""
-
-RADIUS_DECIMALS = 7
-"""Decimals of radii in m: finer than any workshop."""
-
-MOST_PROGRAMS = 60
-"""Largest number of programs. Each that helps is followed by a larger step."""
 
 
 def moved_radii(
@@ -214,10 +193,13 @@ def moved_radii(
         strict=True))
     radii = np.array([_ring(rings, place, layer).radius_m for place, layer in places])
     total = _totals(catalogue, rings, places, radii, reaction)
-    value, size = float(task.value(total)), LARGEST_M
+    # first and last size of the trust region; no workshop places a block better than the last
+    largest_m, smallest_m = 2e-3, 1e-6
+    value, size = float(task.value(total)), largest_m
     tie = _groups(catalogue, places)
-    for _ in range(MOST_PROGRAMS):
-        if size < SMALLEST_M:
+    most_programs = 60  # largest number of programs. Each that helps is followed by a larger step.
+    for _ in range(most_programs):
+        if size < smallest_m:
             break
         slopes = _slopes(catalogue, rings, places, radii) @ tie
         moves = tie @ _program(task, total, slopes, tie, np.maximum(low - radii, -size),
@@ -226,7 +208,7 @@ def moved_radii(
         tried = _totals(catalogue, rings, places, radii + moves, reaction)
         now = float(task.value(tried))
         if now < value:
-            radii, total, value, size = radii + moves, tried, now, min(2 * size, LARGEST_M)
+            radii, total, value, size = radii + moves, tried, now, min(2 * size, largest_m)
         else:
             size /= 4
     return _with_radii(rings, places, radii)
@@ -265,7 +247,8 @@ def _with_radii(
     rings: Sequence[Option], places: Sequence[tuple[int, int]], radii: Floats
 ) -> tuple[Option, ...]:
     """Return the rings with other radii in m."""
-    new = dict(zip(places, radii.round(RADIUS_DECIMALS).tolist(), strict=True))
+    decimals = 7  # decimals of radii in m: finer than any workshop
+    new = dict(zip(places, radii.round(decimals).tolist(), strict=True))
     return tuple(tuple(ring and replace(ring, radius_m=new[place, layer])
                        for layer, ring in enumerate(option)) for place, option in enumerate(rings))
 
@@ -297,11 +280,13 @@ def _slopes(
 ) -> Floats:
     """Return the derivatives (n + 1, rings) in T/m of field and mean by each radius."""
     found = []
+    # step of the derivatives by a radius: that of a field which falls as 1/r^3 is exact to 1e-7
+    step_m = 1e-5
     for (place, layer), radius in zip(places, radii.tolist(), strict=True):
         ring = _ring(rings, place, layer)
         above, below = (_one_total(catalogue, replace(ring, radius_m=radius + step), place)
-                        for step in (STEP_M, -STEP_M))
-        found.append((above - below) / (2 * STEP_M))
+                        for step in (step_m, -step_m))
+        found.append((above - below) / (2 * step_m))
     return np.array(found).T
 
 

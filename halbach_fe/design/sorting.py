@@ -58,20 +58,6 @@ STARTS, STARTED_SLOTS = 20, 2000
 """Largest number of random assignments from which the search starts, and the slots of all of them
 together: local optima of large magnets differ less, and take longer to find."""
 
-RANDOM_ORDERS = 2000
-"""Number of random assignments with which the result is compared."""
-
-SHOWN_SLOTS = 6
-"""Largest number of slots of a type that are listed one by one."""
-
-WORTHWHILE = 1e-3
-"""Smallest decrease of the sum of squares for which blocks are exchanged, relative to what the
-measurement's uncertainty contributes to that sum, which no assignment changes."""
-
-
-SAME = 1e-4
-"""Part of their mean by which random orders differ at most where the order does not matter."""
-
 
 @dataclass(frozen=True)
 class SortedBlocks(ShownInNotebook):
@@ -131,7 +117,9 @@ class SortedBlocks(ShownInNotebook):
 
         Blocks that only change rings do not: the multipoles are those of the field along all of z.
         """
-        return bool(np.ptp(self.random) > SAME * np.mean(self.random))
+        # part of their mean by which random orders differ at most where the order does not matter
+        rounding = 1e-4
+        return bool(np.ptp(self.random) > rounding * np.mean(self.random))
 
     @property
     def turned(self) -> int:
@@ -202,15 +190,19 @@ def sort_blocks(
     fitting = [np.flatnonzero(blocks.types == number) for number in blocks.slot_types]
     best = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset)
     starts = min(STARTS, max(1, STARTED_SLOTS // len(blocks.slot_types)))
+    # smallest decrease of the sum of squares for which blocks are exchanged, relative to what the
+    # measurement's uncertainty contributes to that sum, which no assignment changes
+    worthwhile = 1e-3
     for start in range(starts):
         found = Assignment.of(blocks.slots, _random_order(blocks, generator), blocks.offset)
-        descend(found, peers, fitting, WORTHWHILE * floor, floor)
+        descend(found, peers, fitting, worthwhile * floor, floor)
         if not start or found.square < best.square:
             best = found
         progress(start + 1, starts)
+    random_orders = 2000  # number of random assignments with which the result is compared
     random = np.array([Assignment.of(
         blocks.slots, _random_order(blocks, generator), blocks.offset).square
-        for _ in range(RANDOM_ORDERS)])
+        for _ in range(random_orders)])
     # assignments count in units of a main multipole that no order changes; results in their own
     in_these_units = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset).square / count
     unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
@@ -233,9 +225,10 @@ def types_in_words(alike: dict[str, tuple[int, ...]]) -> str:
     if all(len(slots) == 1 for slots in alike.values()):
         return ""
     found = []
+    shown_slots = 6  # largest number of slots of a type that are listed one by one
     for name, slots in alike.items():
         text = ", ".join(map(str, slots))
-        if len(slots) > SHOWN_SLOTS and slots == tuple(range(slots[0], slots[-1] + 1)):
+        if len(slots) > shown_slots and slots == tuple(range(slots[0], slots[-1] + 1)):
             text = f"{slots[0]}, {slots[0] + 1}, ..., {slots[-1]}"
         found.append(f"{name} = [{text}]")
     return f" ({'; '.join(found)})"
@@ -383,15 +376,6 @@ def _with_places(
 
 Change = tuple[float, tuple[tuple[int, int, int], ...]]
 """The change of the sum of squares by placements of blocks: slot, block and number of the turn."""
-
-FIRSTS = 8
-"""Number of blocks that are tried in a slot as the first of a cycle of three."""
-
-MOST_CYCLES = 500
-"""Largest number of slots for which cycles of three are tried."""
-
-ENOUGH = 0.01
-"""Gain of a sweep over all slots, relative to the sum of squares, below which the search ends."""
 
 
 @dataclass(frozen=True)
@@ -610,7 +594,7 @@ def descend(assignment: Assignment, peers: Sequence[Ints], block_peers: Sequence
             least: float, floor: float) -> None:
     """Improve an assignment by exchanges and turns, and where these do not help by cycles.
 
-    Sweeps over all slots end when one gains less than `ENOUGH`. Magnets of more than `MOST_CYCLES`
+    Sweeps over all slots end when one gains less than 1 %. Magnets of more than 500
     slots are left without cycles: pairs suffice there, and cycles take long.
 
     Parameters
@@ -624,13 +608,14 @@ def descend(assignment: Assignment, peers: Sequence[Ints], block_peers: Sequence
     floor : float
         Part of the expected sum of squares that no order changes.
     """
+    firsts = 8  # number of blocks that are tried in a slot as the first of a cycle of three
     def improve(slot: int, cycles: bool) -> float:
         """Make the best change at a slot; return what it gains."""
         others = peers[slot][peers[slot] != slot]
         spare = np.setdiff1d(block_peers[slot], assignment.order[peers[slot]])
         found = [assignment.best_placement(slot, np.append(spare, assignment.order[slot]))]
         if cycles and len(others) > 1:
-            found.append(assignment.best_cycle(slot, others, FIRSTS))
+            found.append(assignment.best_cycle(slot, others, firsts))
         elif len(others):
             found.append(assignment.best_exchange(slot, others))
         change, placements = min(found, key=lambda each: each[0])
@@ -640,11 +625,14 @@ def descend(assignment: Assignment, peers: Sequence[Ints], block_peers: Sequence
         return -change
 
     count, cycles = len(assignment.order), False
+    most_cycles = 500  # largest number of slots for which cycles of three are tried
+    # gain of a sweep over all slots, relative to the sum of squares, below which the search ends
+    enough = 0.01
     while True:
         gained = sum(improve(slot, cycles) for slot in range(count))
-        if gained > ENOUGH * (assignment.square + floor):
+        if gained > enough * (assignment.square + floor):
             cycles = False
-        elif cycles or count > MOST_CYCLES:
+        elif cycles or count > most_cycles:
             return
         else:
             cycles = True

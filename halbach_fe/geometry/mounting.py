@@ -49,19 +49,6 @@ def as_meant(magnet: Magnet) -> Magnet:
         exception.with_(**meant) for exception in magnet.array.exceptions))
 
 
-FITS = 0.99
-"""A body whose size is reduced by this factor lies within its slot wherever it fits: slots are
-wider than blocks by about a hundredth, and edges of a block may differ by as much."""
-
-SAME = 1e-3
-"""Difference of directions up to which two turns of a block are one."""
-
-MOST_EDGES = 12
-"""Number of edges of an outline up to which turns from edge to edge are tried."""
-
-MOST_IN_RING, MOST_RINGS = 64, 40
-"""Numbers of blocks in a ring, and of rings, up to which moves of rings are tried."""
-
 Turn = tuple[tuple[float, float, float], ...]
 """A rotation matrix, row by row."""
 
@@ -96,15 +83,18 @@ def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
     axes = block.shape_axes
     tried = list(Rotation.create_group("O"))
     edges = len(block.outline)
-    if edges <= MOST_EDGES:
+    most_edges = 12  # number of edges of an outline up to which turns from edge to edge are tried
+    if edges <= most_edges:
         tried += [Rotation.from_euler("z", 2 * np.pi * k / edges) for k in range(1, edges)]
     found: list[tuple[Turn, Floats]] = []
     corners = _corners(block)
+    same_direction = 1e-3  # difference of directions up to which two turns of a block are one
     for turn in sorted(tried, key=lambda each: float(each.magnitude())):
         matrix = axes @ turn.as_matrix() @ axes.T
         direction = matrix @ np.array(block.easy_axis)
         known = [np.array(block.easy_axis), *(each for _, each in found)]
-        if min(np.linalg.norm(direction - each) for each in known) > SAME and block.contains(
+        nearest = min(np.linalg.norm(direction - each) for each in known)
+        if nearest > same_direction and block.contains(
                 _shrunk(corners) @ matrix.T + corners.mean(axis=0)).all():
             found.append((_as_turn(matrix), direction))
     return tuple(turn for turn, _ in found)
@@ -134,8 +124,10 @@ def _moves(array: Array, dimension: int, kind: str) -> dict[str, Move]:
     for number, block in enumerate(blocks):
         rings.setdefault(block.ring, []).append(number)
     groups = {f"ring {ring}": numbers for ring, numbers in rings.items() if len(numbers) > 2}
-    if dimension == 2 or not 1 <= len(groups) <= MOST_RINGS or max(
-            map(len, groups.values())) > MOST_IN_RING:
+    # numbers of blocks in a ring, and of rings, up to which moves of rings are tried
+    most_in_ring, most_rings = 64, 40
+    if dimension == 2 or not 1 <= len(groups) <= most_rings or max(
+            map(len, groups.values())) > most_in_ring:
         return {}
     several = len(groups) > 1  # a whole magnet that is turned is an error of another kind
     if len(groups) > 3:
@@ -220,7 +212,10 @@ def _corners(block: MagnetBlock) -> Floats:
 
 def _shrunk(corners: Floats) -> Floats:
     """Return corners (n, 3) about their middle, of a body that is slightly smaller."""
-    return np.asarray(FITS * (corners - corners.mean(axis=0)))
+    # A body whose size is reduced by this factor lies within its slot wherever it fits: slots are
+    # wider than blocks by about a hundredth, and edges of a block may differ by as much
+    reduction = 0.99
+    return np.asarray(reduction * (corners - corners.mean(axis=0)))
 
 
 def _middle(blocks: Sequence[MagnetBlock], numbers: Sequence[int]) -> Floats:

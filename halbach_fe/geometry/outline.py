@@ -71,14 +71,11 @@ class Edge:
 Outline = tuple[Edge, ...]
 
 
-PARTS_OF_AN_ARC = 8
-"""Number of equal parts of an arc at whose ends `points_on` has points."""
-
-
 @lru_cache(maxsize=4096)  # the same magnet is built with many instruments and effects
 def points_on(outline: Outline) -> Floats:
     """Return points (n, 2) in m on an outline: its corners, and some on its arcs."""
-    t = np.linspace(0.0, 1.0, PARTS_OF_AN_ARC + 1)[:-1]
+    parts_of_arc = 8  # number of equal parts of an arc at whose ends `points_on` has points
+    t = np.linspace(0.0, 1.0, parts_of_arc + 1)[:-1]
     points = np.vstack([edge.at(t if edge.arc else t[:1])[0] for edge in outline])
     points.flags.writeable = False
     return points

@@ -24,9 +24,6 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 from halbach_fe.study.magnet import External
 
-_ROUNDING = 1e-12
-"""Grid in m that coordinates are rounded to before points are compared."""
-
 _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers with well-mixed bits, which combine three rounded coordinates to a hash."""
 
@@ -72,14 +69,15 @@ class SymmetryImage:
 
 def unique_points(points: Floats) -> tuple[Floats, Ints]:
     """Return the distinct points (u, 3), and the index (n,) among them of each point (n, 3)."""
-    grid = np.round(points / _ROUNDING).astype(np.int64)
+    grid_m = 1e-12  # grid in m that coordinates are rounded to before points are compared
+    grid = np.round(points / grid_m).astype(np.int64)
     with np.errstate(over="ignore"):  # sorting one hash is faster than sorting three coordinates
         key = (grid.astype(np.uint64) * _HASH_FACTORS).sum(axis=1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     found = points[first]
-    if np.abs(found[inverse] - points).max(initial=0) > 2 * _ROUNDING:  # two points share a hash
+    if np.abs(found[inverse] - points).max(initial=0) > 2 * grid_m:  # two points share a hash
         found, inverse = np.unique(grid, axis=0, return_inverse=True)
-        return found * _ROUNDING, inverse.reshape(-1)
+        return found * grid_m, inverse.reshape(-1)
     return found, inverse.reshape(-1)
 
 
@@ -178,15 +176,6 @@ def _same_shape(corners: Floats, others: Floats) -> bool:
     return bool((distance.min(axis=0) < 1e-9).all() and (distance.min(axis=1) < 1e-9).all())
 
 
-SAME_M, SAME_T = 1e-7, 1e-7
-"""Distance of corners in m, and difference of remanences in T, up to which blocks are equal: more
-than the rounding of any study, and less than any deviation that is given."""
-
-
-MOST_IN_RING = 64
-"""Number of blocks of a ring up to which turns from block to block are tried."""
-
-
 def turned_onto(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     """Return the number from 0 of the equal block onto which each block is turned.
 
@@ -202,11 +191,14 @@ def turned_onto(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     moments = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
     middles = np.array([each.mean(axis=0) for each in corners])
     found = []
+    # distance of corners in m, and difference of remanences in T, up to which blocks are equal:
+    # more than the rounding of any study, and less than any deviation that is given
+    same_m, same_T = 1e-7, 1e-7
     for number, block in enumerate(blocks):
         there = int(np.linalg.norm(middles - turn @ middles[number], axis=1).argmin())
         apart = np.linalg.norm((corners[number] @ turn.T)[:, None] - corners[there], axis=2)
-        if (max(apart.min(axis=0).max(), apart.min(axis=1).max()) > SAME_M
-                or np.abs(turn @ moments[number] - moments[there]).max() > SAME_T
+        if (max(apart.min(axis=0).max(), apart.min(axis=1).max()) > same_m
+                or np.abs(turn @ moments[number] - moments[there]).max() > same_T
                 or _permeabilities(block) != _permeabilities(blocks[there])):
             return None
         found.append(there)
@@ -221,7 +213,8 @@ def own_turns(magnet: Magnet) -> list[tuple[int, ...]]:
     """
     turns = [each for each in Rotation.create_group("O").as_matrix() if np.trace(each) < 2.9]
     count = max(Counter(block.ring for block in magnet.blocks).values(), default=0)
-    if count <= MOST_IN_RING:
+    most_in_ring = 64  # number of blocks of a ring up to which turns from block to block are tried
+    if count <= most_in_ring:
         for number in range(count):
             about_z = Rotation.from_euler("z", 2 * np.pi * number / count)
             turns += [about_z.as_matrix(), (about_z * Rotation.from_euler(

@@ -40,31 +40,6 @@ if TYPE_CHECKING:
     from halbach_fe.solver.moments.cells import Cells
     from halbach_fe.solver.moments.interaction import Interaction
 
-PARTS_PER_LENGTH = 1.7
-"""Parts of a block per correlation length along each direction. With 1.1 of them, readings 8 mm off
-the blocks of a dipole of 1.7 T saw the parts: held-out residuals were 1.05 mT, and 0.72 mT with
-1.7."""
-
-MOST_CELLS = 6
-"""Largest number of cells, of two parts each, along the sides of a cube: the correlations between
-12^3 parts of a block take 24 MB."""
-
-NEAR_WALL = 0.8
-"""Radius of the cylinder on which modes are compared, relative to the distance of a block from the
-axis."""
-
-NOTICEABLE_T = 2e-5
-"""Rms field on the cylinder below which a mode is left out, at one prior standard deviation."""
-
-AROUND, ALONG = 9, 13
-"""Numbers of points of the cylinder about a block and along it."""
-
-AT_ONCE = 30_000_000
-"""Number of field components of parts at points that are in memory at a time, 240 MB."""
-
-JITTER = 1e-9
-"""Added to the diagonal of correlations, which are singular to rounding."""
-
 
 @dataclass(frozen=True)
 class Variations:
@@ -93,9 +68,16 @@ class Variations:
         if not prior.variation_sd or prior.variation_length_m is None:
             return None
         side = float(np.cbrt(np.median([block.volume for block in magnet.blocks])))
-        per_side = max(1, int(np.ceil(PARTS_PER_LENGTH * side / prior.variation_length_m / 2)))
-        if per_side > MOST_CELLS:
-            least = PARTS_PER_LENGTH * side / MOST_CELLS / 2
+        # parts of a block per correlation length along each direction. With 1.1 of them, readings 8
+        # mm off the blocks of a dipole of 1.7 T saw the parts: held-out residuals were 1.05 mT, and
+        # 0.72 mT with 1.7.
+        parts_per_length = 1.7
+        per_side = max(1, int(np.ceil(parts_per_length * side / prior.variation_length_m / 2)))
+        # largest number of cells, of two parts each, along the sides of a cube: the correlations
+        # between 12^3 parts of a block take 24 MB
+        most_cells = 6
+        if per_side > most_cells:
+            least = parts_per_length * side / most_cells / 2
             raise StudyError(must_be(
                 "`prior.variation_length_m`", f"study {magnet.name}",
                 f"at least {least:.2g} m for blocks of {side:.2g} m",
@@ -115,6 +97,9 @@ class Variations:
         cells = cells_of(blocks, per_side)
         starts = np.searchsorted(cells.block, np.arange(len(blocks) + 1))
         interaction, found, names = Interaction(cells), [], []
+        # rms field on the cylinder below which a mode is left out, at one prior standard deviation
+        noticeable_T = 2e-5
+        jitter = 1e-9  # added to the diagonal of correlations, which are singular to rounding
         for number, block in enumerate(blocks):
             mine = slice(starts[number], starts[number + 1])
             places = cells.nodes[mine]
@@ -124,10 +109,10 @@ class Variations:
             effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)
             correlation = np.exp(-distance / (2 * length_m**2))
-            correlation[np.diag_indices(len(flat))] += JITTER
+            correlation[np.diag_indices(len(flat))] += jitter
             root = sd * np.linalg.cholesky(correlation)
             _, sizes, modes = np.linalg.svd(effect @ root, full_matrices=False)
-            kept = sizes / np.sqrt(len(effect) / 3) > NOTICEABLE_T
+            kept = sizes / np.sqrt(len(effect) / 3) > noticeable_T
             shapes = (root @ modes[kept].T).reshape(*places.shape[:2], 1, -1)
             found.append(shapes * easy[:, None])
             names += [f"{block.name}.v{1 + mode:02d}" for mode in range(int(kept.sum()))]
@@ -156,7 +141,9 @@ class Variations:
 
     def _shares(self, every: range) -> Iterator[range]:
         """Yield parts of a range for which the fields of all parts of cells fit into memory."""
-        step = max(1, AT_ONCE // (9 * self.interaction.cells.weights.size))
+        # number of field components of parts at points that are in memory at a time, 240 MB
+        numbers_at_once = 30_000_000
+        step = max(1, numbers_at_once // (9 * self.interaction.cells.weights.size))
         return (every[first:first + step] for first in range(0, len(every), step))
 
     def _of_amplitudes(self, by_part: Floats) -> Floats:
@@ -191,9 +178,13 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
     angle = np.arctan2(*(places.mean(axis=0)[[1, 0]]))
     low, high = places[:, 2].min(), places[:, 2].max()
     reach = (high - low) / 2
-    phi, z = np.meshgrid(angle + np.linspace(-0.5, 0.5, AROUND) * np.pi,
-                         np.linspace(low - reach, high + reach, ALONG))
-    near = NEAR_WALL * radius.min()
+    n_around, n_along = 9, 13  # numbers of points of the cylinder about a block and along it
+    phi, z = np.meshgrid(angle + np.linspace(-0.5, 0.5, n_around) * np.pi,
+                         np.linspace(low - reach, high + reach, n_along))
+    # radius of the cylinder on which modes are compared, relative to the distance of a block from
+    # the axis
+    near_wall = 0.8
+    near = near_wall * radius.min()
     return np.column_stack([near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()])
 
 
@@ -227,10 +218,6 @@ STEP = 1e-3
 """Step of the differences of exact fields and magnetizations, in standard deviations: geometry and
 materials are linear to 1e-6 over it, and rounding is 1e-12 of the field."""
 
-SOLVED_STEP = 0.1
-"""Step of the differences of what permeability and iron add, in standard deviations: large enough
-for differences between meshes, which a small step would magnify."""
-
 
 def amplitude_names(magnet: Magnet) -> tuple[str, ...]:
     """Return the names of the uncertain amplitudes of a magnet."""
@@ -256,11 +243,14 @@ def field_changes(magnet: Magnet, points: Floats, session: Session) -> Floats:
                                    estimate=False).nominal
 
     changes = vacuum_changes(magnet, points)
+    # step of the differences of what permeability and iron add, in standard deviations: large
+    # enough for differences between meshes, which a small step would magnify
+    solved_step = 0.1
     if magnet.is_vacuum and magnet.study.solver.method == "reaction" and all(
             build_magnet(each).is_vacuum for one in magnet.study.uncertain_of_magnet
-            for each in _either_side(magnet.study, one, SOLVED_STEP)[0]):
+            for each in _either_side(magnet.study, one, solved_step)[0]):
         return changes
-    return changes + _changes(magnet, SOLVED_STEP, solved).transpose(2, 0, 1)
+    return changes + _changes(magnet, solved_step, solved).transpose(2, 0, 1)
 
 
 def with_amplitudes(prior: Gaussian, magnet: Magnet) -> Gaussian:

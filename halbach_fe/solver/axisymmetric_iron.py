@@ -74,38 +74,9 @@ with modes up to 37 it is 5 % off.
 FEWEST_MODES, MOST_MODES = 12, 128
 """Limits of the highest mode that is chosen by `SOURCE_MODES`."""
 
-NO_MODE = 1e-9
-"""Modes of the source that are smaller than this, relative to the largest one, are rounding
-errors."""
-
 TANGENT_MODES = 24
 """Highest mode of `IronReaction.tangent`. Modes of higher order decay before they reach the bore.
 """
-
-TANGENT_RESIDUAL = 1e-7
-"""Conjugate gradients stop at this relative residual in `IronReaction.tangent`."""
-
-ANGLES_PER_MODE = 3
-"""Angles of the non-linear law per mode: products of two modes do not alias into others."""
-
-ALIASING = 1e-2
-"""Angles of the source are doubled until the amplitudes of the highest quarter of the modes are
-below this value, relative to the largest. Modes fall about geometrically, so that those which would
-be mistaken for low modes are then below the square of this value."""
-
-FEWEST_ANGLES, MOST_ANGLES = 64, 512
-"""Limits of the number of angles at which a source is evaluated. Where blocks touch the iron, the
-modes of their field fall slowly, but these local fields do not reach the bore."""
-
-AXIS_RADIUS = 1e-6
-"""Points nearer to the axis than this fraction of the grid's first line are moved there, since
-psi/r is a limit on the axis."""
-
-NO_AMPLITUDE = 1e-7
-"""Modes are left out at points in a bore where (r / inner radius)^m is smaller."""
-
-COLUMNS_AT_ONCE = 8
-"""Number of sources that `IronReaction.tangent` solves for at a time, which limits the memory."""
 
 
 @dataclass(frozen=True)
@@ -193,12 +164,17 @@ class IronReaction:
         tangent = Tangent.of(problem, differential)
         highest = _modes_at(problem, points)
         result = np.empty((len(sources), len(points), 3))
-        for first in range(0, len(sources), COLUMNS_AT_ONCE):
-            part = sources[first:first + COLUMNS_AT_ONCE]
+        # conjugate gradients stop at this relative residual in `IronReaction.tangent`
+        tolerance = 1e-7
+        # number of sources that `IronReaction.tangent` solves for at a time, which limits the
+        # memory
+        step = 8
+        for first in range(0, len(sources), step):
+            part = sources[first:first + step]
             own = np.concatenate([_source_potential(problem, _sampled(state.modes, source))
                                   for source in part], axis=2)
-            total = tangent.solve(problem.stiffness(own), TANGENT_RESIDUAL)
-            result[first:first + COLUMNS_AT_ONCE] = _evaluate(self.name, state.modes, {
+            total = tangent.solve(problem.stiffness(own), tolerance)
+            result[first:first + step] = _evaluate(self.name, state.modes, {
                 number: _continue(state.modes, spaces[number], (total - own)[number])
                 for number in numbers[numbers <= highest].tolist()}, points)
         return result
@@ -256,11 +232,13 @@ def solve_iron(
 
 def _problem(modes: IronModes, bodies: tuple[IronRectangle, ...], numbers: Ints) -> Problem:
     """Return the discrete problem for some modes."""
+    # angles of the non-linear law per mode: products of two modes do not alias into others
+    angles_per_mode = 3
     return Problem(
         modes, bodies, numbers,
         tuple(modes.exterior(number).stiffness for number in numbers.tolist()),
         tuple(modes.gradient(number) for number in numbers.tolist()),
-        _fast(ANGLES_PER_MODE * int(numbers[-1]) + 8))
+        _fast(angles_per_mode * int(numbers[-1]) + 8))
 
 
 def _fast(count: int) -> int:
@@ -291,11 +269,18 @@ def _sampled(modes: IronModes, source: Source | Floats) -> Floats:
     """Return a source (angles, 3, k) in T at the Gauss points, at enough angles for its modes."""
     if not callable(source):
         return _cylindrical(source, _angles(len(source) // len(modes.gauss.r)))
-    angles = _angles(FEWEST_ANGLES)
+    # limits of the number of angles at which a source is evaluated. Where blocks touch the iron,
+    # the modes of their field fall slowly, but these local fields do not reach the bore.
+    fewest_angles, most_angles = 64, 512
+    angles = _angles(fewest_angles)
     values = _cylindrical(source(_nodes(modes, angles)), angles)
-    while len(values) < MOST_ANGLES:
+    # angles of the source are doubled until the amplitudes of the highest quarter of the modes are
+    # below this value, relative to the largest. Modes fall about geometrically, so that those which
+    # would be mistaken for low modes are then below the square of this value.
+    aliasing = 1e-2
+    while len(values) < most_angles:
         size = np.abs(scipy.fft.rfft(values, axis=0)).max(axis=(1, 2))
-        if size[3 * len(size) // 4:].max() <= ALIASING * size.max():
+        if size[3 * len(size) // 4:].max() <= aliasing * size.max():
             break
         between = _angles(len(values), 0.5)
         more = _cylindrical(source(_nodes(modes, between)), between)
@@ -306,7 +291,10 @@ def _sampled(modes: IronModes, source: Source | Floats) -> Floats:
 def _modes_of(values: Floats) -> tuple[list[int], int]:
     """Return the modes that a source (angles, 3, k) has, and the highest that matters."""
     size = np.abs(to_modes(values, slice(None))[:(len(values) + 1) // 2]).max(axis=(1, 2))
-    present = np.flatnonzero(size > NO_MODE * size.max())
+    # modes of the source that are smaller than this, relative to the largest one, are rounding
+    # errors
+    rounding = 1e-9
+    present = np.flatnonzero(size > rounding * size.max())
     highest = int(np.flatnonzero(size >= SOURCE_MODES * size.max())[-1]) if size.any() else 0
     return present.tolist(), int(np.clip(highest, FEWEST_MODES, MOST_MODES))
 
@@ -353,7 +341,9 @@ def highest_mode_at(bodies: Sequence[IronRectangle], points: Floats) -> int | No
     radius = float(np.hypot(points[:, 0], points[:, 1]).max(initial=0.0))
     if radius >= 0.999 * inner:
         return None
-    return int(np.ceil(np.log(NO_AMPLITUDE) / np.log(max(radius / inner, 1e-3)))) + 1
+    # modes are left out at points in a bore where (r / inner radius)^m is smaller
+    no_amplitude = 1e-7
+    return int(np.ceil(np.log(no_amplitude) / np.log(max(radius / inner, 1e-3)))) + 1
 
 
 def _modes_at(problem: Problem, points: Floats) -> int:
@@ -369,7 +359,10 @@ def _evaluate(
     mesh = modes.mesh
     check_inside(name, mesh.radius, mesh.half_length, points)
     r, phi = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
-    least = AXIS_RADIUS * mesh.points[mesh.points[:, 0] > 0, 0].min()
+    # points nearer to the axis than this fraction of the grid's first line are moved there, since
+    # psi/r is a limit on the axis
+    axis_radius = 1e-6
+    least = axis_radius * mesh.points[mesh.points[:, 0] > 0, 0].min()
     places, where = unique_points(np.column_stack([np.maximum(r, least), points[:, 2], 0 * r]))
     at = points_at(mesh, locate(mesh, places), modes.unknowns)
     columns = max((part.shape[1] for part in potentials.values()), default=1)
@@ -382,16 +375,6 @@ def _evaluate(
     cosine, sine = np.cos(phi), np.sin(phi)
     return np.stack([radial * cosine - tangential * sine, radial * sine + tangential * cosine,
                      axial], axis=-1)
-
-
-NEWTON_RESIDUAL = 1e-8
-"""Newton's method stops at this residual relative to the sources, in the norm of the
-preconditioner. The reaction has then converged to some 1e-8."""
-
-MAX_NEWTON_STEPS = 60
-MAX_CG_STEPS = 400
-SMALLEST_STEP = 2.0**-20
-"""Step length, relative to the full Newton step, at which the line search gives up."""
 
 
 def to_angles(by_mode: Complexes, numbers: Ints, angles: int) -> Floats:
@@ -572,7 +555,8 @@ class Tangent:
         solution, residual = np.zeros_like(right), right.copy()
         direction = better = self.precondition(residual)
         size = first = dot(residual, better)
-        for _ in range(MAX_CG_STEPS):
+        most_steps = 400
+        for _ in range(most_steps):
             if (size <= tolerance**2 * first).all():
                 return solution
             applied = self.apply(direction)
@@ -586,7 +570,7 @@ class Tangent:
                                            where=before > 0) * direction
         worst = float(np.sqrt(np.max(size / np.maximum(first, 1e-300))))
         raise NotConvergedError(
-            f"Conjugate gradients on the iron left a residual of {worst:.1e} after {MAX_CG_STEPS} "
+            f"Conjugate gradients on the iron left a residual of {worst:.1e} after {most_steps} "
             "steps. Smooth the H(B) curve.", (worst,))
 
 
@@ -611,14 +595,20 @@ def newton(
     right = problem.stiffness(source)
     residual = problem.residual(total, source)
     norms: list[float] = []
+    # Newton's method stops at this residual relative to the sources, in the norm of the
+    # preconditioner. The reaction has then converged to some 1e-8.
+    tolerance = 1e-8
+    most_steps = 60
+    # step length, relative to the full Newton step, at which the line search gives up
+    smallest_step = 2.0**-20
     while True:
         tangent = Tangent.of(problem, problem.differential(problem.field(total)[..., 0]))
         scale, size = (float(problem.dot(vector, tangent.precondition(vector))[0])
                        for vector in (right, residual))
         norms.append(float(np.sqrt(max(size, 0.0) / scale)) if scale > 0 else 0.0)
-        if norms[-1] <= NEWTON_RESIDUAL:
+        if norms[-1] <= tolerance:
             return total, tuple(norms)
-        if len(norms) > MAX_NEWTON_STEPS or not np.isfinite(norms[-1]):
+        if len(norms) > most_steps or not np.isfinite(norms[-1]):
             raise NotConvergedError(
                 f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
                 f"{len(norms) - 1} steps. Smooth the H(B) curve.", tuple(norms))
@@ -627,7 +617,7 @@ def newton(
         length = 1.0
         while True:
             trial = problem.residual(total + length * step, source)
-            if float(problem.dot(trial, step)[0]) <= 0.5 * slope or length < SMALLEST_STEP:
+            if float(problem.dot(trial, step)[0]) <= 0.5 * slope or length < smallest_step:
                 break
             length /= 2
         total, residual = total + length * step, trial

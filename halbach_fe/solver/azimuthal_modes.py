@@ -89,10 +89,6 @@ NO_WAVES = [0.0, 0.0]
 """Nominal remanence of a ring in runs for single blocks, which do not use it: as few values as
 GetDP's lists can have."""
 
-NO_REMANENCE = 1e-12
-"""Tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
-remanence is smaller, which are rounding errors and are not solved for."""
-
 
 def is_axisymmetric(magnet: Magnet) -> bool:
     """Tell whether the materials are rotationally symmetric.
@@ -309,7 +305,10 @@ def runs_of(
         nominal array has few.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
-    own = np.flatnonzero(size > NO_REMANENCE * size.max()).tolist()
+    # tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
+    # remanence is smaller, which are rounding errors and are not solved for
+    no_remanence = 1e-12
+    own = np.flatnonzero(size > no_remanence * size.max()).tolist()
     runs = []
     if single is not None:
         count = single[1] - single[0] + 1

@@ -42,24 +42,9 @@ from halbach_fe.geometry.outline import Outline
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 
-_STEP = 1e-4
-"""Step of finite differences, relative to the largest radius of the blocks. Their relative error is
-the square of the step over the distance to a block."""
-
 _SHARE, _SHARE_OF_CUBOID = 10_000, 30_000
 """Number of points that a thread evaluates at a time: several milliseconds of work, beside which
 0.3 ms of starting a thread do not count. A point takes 0.1 us by the closed form of cuboids."""
-
-_AT_ONCE = 100_000
-"""Number of points at which blocks of the same shape are evaluated at once: some 10 MB."""
-
-_SAME = 1e-13
-"""Distance, relative to the largest coordinate, below which points are the same: some rounding
-errors."""
-
-_SAME_FIELD = 1e-11
-"""Relative difference of the fields of two blocks that is rounding. A block that is displaced by a
-nanometre differs by more."""
 
 _RECTANGULAR = 1e-13
 """Largest deviation of a rectangle's corners, relative to its sides: some rounding errors."""
@@ -167,7 +152,9 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     for block in blocks:
         alike[block.outline, block.z_min, block.z_max, block.gradient, block.corner_loss].append(
             block)
-    total, most = np.zeros((len(points), 3)), 1 + _AT_ONCE // max(1, len(points))
+    # number of points at which blocks of the same shape are evaluated at once: some 10 MB
+    points_at_once = 100_000
+    total, most = np.zeros((len(points), 3)), 1 + points_at_once // max(1, len(points))
     for same in alike.values():
         for first in range(0, len(same), most):
             total += _field_of_alike(same[first:first + most], points)
@@ -224,7 +211,10 @@ def _equidistant_angles(points: Floats) -> int:
     if len(points) < 2:
         return 1
     radius = np.hypot(points[:, 0], points[:, 1])
-    small = _SAME * max(float(radius.max()), float(np.abs(points[:, 2]).max()))
+    # distance, relative to the largest coordinate, below which points are the same: some rounding
+    # errors
+    rounding = 1e-13
+    small = rounding * max(float(radius.max()), float(np.abs(points[:, 2]).max()))
     again = np.flatnonzero(np.hypot(radius - radius[0], points[:, 2] - points[0, 2]) <= small)
     count = int(again[1]) if len(again) > 1 else 0
     if not count or len(points) % count:
@@ -245,6 +235,9 @@ def _turned_blocks(
     block of its group. Blocks of the same field at three probes (3, 3) in m have the same shape.
     """
     groups: list[list[tuple[int, MagnetBlock]]] = []
+    # relative difference of the fields of two blocks that is rounding. A block that is displaced by
+    # a nanometre differs by more.
+    rounding = 1e-11
     for block in blocks:
         own = unit_field(block, probes)
         for group in groups:
@@ -254,7 +247,7 @@ def _turned_blocks(
             steps = (block.angle_deg - first.angle_deg) / 360 * angles
             turn = rotation_about_z(2 * np.pi * round(steps) / angles)
             turned = turn @ unit_field(first, probes @ turn) @ turn.T
-            if np.abs(turned - own).max() <= _SAME_FIELD * np.abs(own).max():
+            if np.abs(turned - own).max() <= rounding * np.abs(own).max():
                 group.append((round(steps) % angles, block))
                 break
         else:
@@ -285,7 +278,10 @@ def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
     zero = np.zeros(len(points))
     radial = np.column_stack([np.cos(angle), np.sin(angle), zero])
     azimuthal = np.column_stack([-np.sin(angle), np.cos(angle), zero])
-    step = _STEP * max(edge.radius for block in blocks for edge in block.outline)
+    # step of finite differences, relative to the largest radius of the blocks. Their relative error
+    # is the square of the step over the distance to a block.
+    relative_step = 1e-4
+    step = relative_step * max(edge.radius for block in blocks for edge in block.outline)
     places = np.vstack([points + sign * step * along for along in (radial, azimuthal)
                         for sign in (1, -1)])
     for block in blocks:

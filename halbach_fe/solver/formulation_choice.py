@@ -51,36 +51,9 @@ SUPERPOSITION_TOLERANCE = 1e-8
 solver is used. The problem is linear, so that only rounding errors of about 1e-12 remain; a wrong
 or missing column makes a difference of 1e-3."""
 
-ITERATED_TOLERANCE = 1e-7
-"""The same tolerance for conjugate gradients, which stop at a relative residual of 1e-10. The
-difference was measured to be 1e-9 to 6e-9 on coarse meshes."""
-
-PLACED_TOLERANCE = 0.1
-"""The same tolerance if the fields of some blocks are obtained from others by symmetry in 3D.
-
-The mesh is not symmetric, so that its discretization error remains. On meshes of 30 to 50 mm this
-error was measured to be 1 % to 8.5 % of the finite-element part for the scalar potential, and 1 %
-to 4 % for edge elements of order 2. When the mirror image was left out on purpose, the difference
-was 30 % and more for the scalar potential (8 % for edge elements on a coarse mesh with thin iron);
-for blocks rotated the wrong way or of the wrong sign it was mostly 100 % and more. A single wrong
-block among hundreds is not detected."""
-
-PLACED_TOLERANCE_LOWEST_ORDER = 0.5
-"""The same as `PLACED_TOLERANCE` for edge elements of order 1, whose error was measured to be 5 %
-(20 mm) to 35 % (50 mm). Only blocks of the wrong sign or rotated the wrong way, which make a
-difference of 100 % and more, are detected with certainty."""
-
-MOMENTS_TOLERANCE = 0.1
-"""The same tolerance for the route ``moments``. The columns have a single cell per block, and leave
-out what blocks and iron answer to each other."""
-
 MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
 """Kind of mesh by route, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`."""
-
-BOUNDARY_NEAR = 0.5
-"""Fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
-because the condition on the boundary affects their field."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +235,10 @@ def _by_moments(
     if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
-    return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error,
+    # the same tolerance for the route ``moments``. The columns have a single cell per block, and
+    # leave out what blocks and iron answer to each other.
+    moments_tolerance = 0.1
+    return ElementFields(moments_tolerance, nominal, along, magnet.blocks, block, error,
                          for_deviations=True)
 
 
@@ -316,11 +292,20 @@ def uses_symmetry(magnet: Magnet) -> bool:
 
 def _superposition_tolerance(magnet: Magnet, route: str, placed: bool) -> float:
     """Return the tolerance that applies; ``placed`` tells whether symmetry places the blocks."""
-    if placed and route == "edge_elements" and magnet.study.solver.edge_order == 1:
-        return PLACED_TOLERANCE_LOWEST_ORDER
     if placed and route != "azimuthal_modes":  # the half-plane's mesh has the symmetry
-        return PLACED_TOLERANCE
-    return ITERATED_TOLERANCE if route == "scalar_potential" else SUPERPOSITION_TOLERANCE
+        # A 3D mesh is not symmetric, so that its discretization error remains. On meshes of 30 to
+        # 50 mm it was measured to be 1 % to 8.5 % of the finite-element part for the scalar
+        # potential, and 1 % to 4 % for edge elements of order 2. When the mirror image was left out
+        # on purpose, the difference was 30 % and more for the scalar potential (8 % for edge
+        # elements on a coarse mesh with thin iron); for blocks rotated the wrong way or of the
+        # wrong sign it was mostly 100 % and more. A single wrong block among hundreds is not
+        # detected. The error of edge elements of order 1 was 5 % (20 mm) to 35 % (50 mm): only
+        # blocks of the wrong sign or rotated the wrong way are detected with certainty.
+        lowest_order = route == "edge_elements" and magnet.study.solver.edge_order == 1
+        return 0.5 if lowest_order else 0.1
+    # conjugate gradients stop at a relative residual of 1e-10; the difference was measured to be
+    # 1e-9 to 6e-9 on coarse meshes
+    return 1e-7 if route == "scalar_potential" else SUPERPOSITION_TOLERANCE
 
 
 def _not_solved(number: int, some: Ints | slice) -> Floats:
@@ -472,8 +457,11 @@ def check_points(
     if magnet.dimension == 3:
         directions.append((np.abs(points[:, 2]), magnet.half_length,
                      boundary_half_length(magnet, mesh)))
+    # fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
+    # because the condition on the boundary affects their field.
+    boundary_near = 0.5
     for position, end, boundary in directions:
-        near = position > end + BOUNDARY_NEAR * (boundary - end)
+        near = position > end + boundary_near * (boundary - end)
         if near.any() and position.max() <= boundary:  # the solve refuses points beyond it
             x, y, z = points[np.argmax(near)]
             warnings.warn(

@@ -191,15 +191,6 @@ Complexes = NDArray[np.complex128]
 PROBLEM = "iron_modes.pro"
 MESH = "iron.msh"
 
-KEPT_BYTES = 2e9
-"""Factorized modes are kept up to this memory. Blocks and iron that answer to each other ask for
-the same modes again and again."""
-
-MATRIX_TOLERANCE = 1e-9
-"""Largest difference between GetDP's matrix and the one from our Gauss points, relative to its
-largest value. GetDP's Gauss points have 12 digits; another numbering of the unknowns makes a
-difference of order 1."""
-
 
 @dataclass(frozen=True)
 class GaussPoints:
@@ -294,11 +285,14 @@ class IronModes:
         return np.asarray(rest[np.argsort(factorize(self.matrix(0)[rest][:, rest]).perm_c)])
 
     def exterior(self, mode: int) -> Exterior:
-        """Return the space outside the iron in one mode, of which `KEPT_BYTES` are kept."""
+        """Return the space outside the iron in one mode, of which 2 GB are kept."""
         found = self._exteriors.get(mode)
+        # factorized modes are kept up to this memory. Blocks and iron that answer to each other ask
+        # for the same modes again and again.
+        kept_bytes = 2e9
         if found is None:
             found = _condensed(self, mode)
-            if sum(space.bytes for space in self._exteriors.values()) <= KEPT_BYTES:
+            if sum(space.bytes for space in self._exteriors.values()) <= kept_bytes:
                 self._exteriors[mode] = found
         return found
 
@@ -484,7 +478,11 @@ def check_matrix(
         If the two matrices differ.
     """
     difference = abs(points.stiffness(mode, permeability) - theirs).max() / abs(theirs).max()
-    if not difference <= MATRIX_TOLERANCE:
+    # largest difference between GetDP's matrix and the one from our Gauss points, relative to its
+    # largest value. GetDP's Gauss points have 12 digits; another numbering of the unknowns makes a
+    # difference of order 1.
+    matrix_tolerance = 1e-9
+    if not difference <= matrix_tolerance:
         raise GetDPError(
             f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
             "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")

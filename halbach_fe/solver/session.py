@@ -33,13 +33,6 @@ from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import NO_GETDP, GetDP, Job, Run, getdp_or_none
 from halbach_fe.solver.getdp_cache import Cache, default_cache
 
-DEFAULT_JOBS = 2
-"""Number of parallel runs of GetDP, if the machine has as many cores. Most problems consist of two
-runs, with the real materials and with vacuum in their place."""
-
-TEMPORARY_CACHE_BYTES = 4 * 2**30
-"""Size limit of a cache that lasts as long as one search, see `Session.with_cache`."""
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -168,8 +161,11 @@ class Session:
         """
         if jobs is not None:
             check_number("jobs", "Session.open", jobs, 1, whole=True)
+        # number of parallel runs of GetDP, if the machine has as many cores. Most problems consist
+        # of two runs, with the real materials and with vacuum in their place.
+        default_jobs = 2
         return cls(getdp_or_none(getdp), Path(folder),
-                   jobs=jobs or min(DEFAULT_JOBS, os.cpu_count() or 1), progress=progress,
+                   jobs=jobs or min(default_jobs, os.cpu_count() or 1), progress=progress,
                    cache=default_cache(None))
 
     @classmethod
@@ -193,8 +189,10 @@ class Session:
             return
         remove_orphans(make_folder(self.folder))  # of processes that were killed
         folder = temporary_path(self.folder / "cache")
+        # size limit of a cache that lasts as long as one search, see `Session.with_cache`
+        temporary_cache_bytes = 4 * 2**30
         try:
-            yield replace(self, cache=Cache(folder, TEMPORARY_CACHE_BYTES))
+            yield replace(self, cache=Cache(folder, temporary_cache_bytes))
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -100,11 +100,6 @@ def uniformity(found: Ints, draws: int) -> tuple[Floats, float]:
     return values, float(min(1.0, values.min() * len(values)))
 
 
-REPEATS = 1000
-"""Number of simulated outcomes for `error_if_calibrated`. The 95 % limit then scatters by some
-3 %."""
-
-
 @dataclass(frozen=True)
 class Bin:
     """Statements whose probabilities are similar.
@@ -167,6 +162,7 @@ def error_if_calibrated(
         return float("nan")
     stated, place = stated[counted], place[counted]
     member = place[:, None] == np.arange(1, len(edges))  # (statements, bins)
-    outcomes = generator.random((REPEATS, len(stated))) < stated
+    repeats = 1000  # number of simulated outcomes. The 95 % limit then scatters by some 3 %.
+    outcomes = generator.random((repeats, len(stated))) < stated
     errors = np.abs((stated - outcomes) @ member).sum(axis=1) / len(stated)
     return float(np.quantile(errors, quantile))

@@ -36,13 +36,6 @@ from halbach_fe.stats.noise import NoiseCovariance
 Model = Callable[[Floats], Floats]
 """Maps parameters (m,) to readings (n,)."""
 
-MAX_GAUSS_NEWTON = 30
-"""Largest number of Gauss-Newton steps to the mode."""
-
-MODE_TOLERANCE = 1e-3
-"""Length of a Gauss-Newton step, in posterior standard deviations, below which the mode counts as
-found."""
-
 
 @dataclass
 class Posterior:
@@ -129,7 +122,7 @@ def laplace(
     Raises
     ------
     SamplingError
-        If the mode is not found in `MAX_GAUSS_NEWTON` steps.
+        If the mode is not found in 30 steps.
     """
     prior = posterior.prior
     z = np.zeros(prior.root.shape[1])
@@ -138,13 +131,17 @@ def laplace(
         return float(at @ at) / 2 - posterior.log_likelihood(prior.mean + prior.root @ at)
 
     value = objective(z)
-    for _ in range(MAX_GAUSS_NEWTON):
+    max_steps = 30  # largest number of Gauss-Newton steps to the mode
+    # length of a Gauss-Newton step, in posterior standard deviations, below which the mode counts
+    # as found
+    mode_tolerance = 1e-3
+    for _ in range(max_steps):
         parameters = prior.mean + prior.root @ z
         whitened = posterior.noise.whiten(jacobian(parameters) @ prior.root)
         residual = posterior.noise.whiten(posterior.readings - posterior.model(parameters))
         factor = linalg.cholesky(np.eye(len(z)) + whitened.T @ whitened)  # upper
         step = linalg.cho_solve((factor, False), whitened.T @ residual - z)
-        if np.linalg.norm(factor @ step) < MODE_TOLERANCE:
+        if np.linalg.norm(factor @ step) < mode_tolerance:
             root = linalg.solve_triangular(factor, np.eye(len(z)))
             return ReferenceMeasure(z, root, factor), parameters
         length = 1.0
@@ -152,7 +149,7 @@ def laplace(
             length /= 2
         z, value = z + length * step, min(trial, value)
     raise SamplingError(
-        f"The posterior's mode was not found in {MAX_GAUSS_NEWTON} Gauss-Newton steps: the readings"
+        f"The posterior's mode was not found in {max_steps} Gauss-Newton steps: the readings"
         " and the prior disagree, or the noise is understated. Check the study's noise and prior.")
 
 

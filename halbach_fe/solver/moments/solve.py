@@ -44,10 +44,6 @@ from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction, Neighbours
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
-POLARIZATION_CHANGE = 1e-8
-"""Largest change of a polarization, relative to the largest remanence, that ends the iteration.
-The reaction is some 1e-2 of the remanence, so that the error is 1e-6 of it."""
-
 MAX_STEPS = 100
 """Largest number of steps. Each reduces the error by chi/(2 + chi) or more, a third for chi = 1."""
 
@@ -60,12 +56,6 @@ Over random magnets of cuboids, trapezoids, hexagons, cylinders and L-shaped pri
 nearer than 0.9 radii and 1.0 in 95 %; 0.18 and 0.63 up to 1.2 radii, 0.11 and 0.31 up to 1.6, and
 0.05 and 0.24 beyond.
 """
-
-NEAREST_CELLS = 8
-"""Number of nearest centres among which the nearest cell is looked for."""
-
-FLOOR = 5e-4
-"""Smallest error bar relative to the reaction, for the expansions of far clusters."""
 
 Applied = Callable[[Floats], Floats]
 """Takes points (n, 3) in m and returns mu_0 H (n, 3) in T of other sources there."""
@@ -191,12 +181,15 @@ class System:
         """
         damping, polarization = 2 / (2 + self.largest_susceptibility), sources
         field, step = np.zeros_like(sources), sources
+        # largest change of a polarization, relative to the largest remanence, that ends the
+        # iteration. The reaction is some 1e-2 of the remanence, so that the error is 1e-6 of it.
+        tolerance = 1e-8
         for count in range(1, MAX_STEPS + 1):
             size = float(np.abs(step).max(initial=0.0)) / scale
             field = field + self.interaction.mean_field(step, self.interaction.degree_for(size))
             step = damping * (sources + self._respond(field) - polarization)
             polarization = polarization + step
-            if np.abs(step).max(initial=0.0) <= POLARIZATION_CHANGE * scale:
+            if np.abs(step).max(initial=0.0) <= tolerance * scale:
                 return polarization, count
         raise HalbachError(
             f"The polarization of the blocks does not settle in {MAX_STEPS} steps: the last "
@@ -259,12 +252,14 @@ def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[F
     change, size = (np.linalg.norm(value, axis=1) for value in (field - other, field))
     larger = min((fine.cells, coarse.cells), key=len)
     share = np.interp(_distances(larger, points), list(ERROR_SHARE), list(ERROR_SHARE.values()))
-    return field, np.repeat((share * change + FLOOR * size)[:, None], 3, axis=1)
+    floor = 5e-4  # smallest error bar relative to the reaction, for the expansions of far clusters
+    return field, np.repeat((share * change + floor * size)[:, None], 3, axis=1)
 
 
 def _distances(cells: Cells, points: Floats) -> Floats:
     """Return the distances (n,) of points (n, 3) in m from the nearest cell, see `ERROR_SHARE`."""
-    count = min(NEAREST_CELLS, len(cells))
+    nearest_cells = 8  # number of nearest centres among which the nearest cell is looked for
+    count = min(nearest_cells, len(cells))
     distance, number = KDTree(cells.centre).query(points, np.arange(1, count + 1))
     return np.asarray((distance / cells.radius[number]).min(axis=1))
 
@@ -282,26 +277,8 @@ def reaction_with_errors(
     return field_with_errors(fine, coarse, points)
 
 
-PANEL = 256
-"""Number of source cells whose interactions are in memory at a time."""
-
-COLUMN_CHANGE = 1e-6
-"""Largest change of a reading per polarization, relative to the largest one, that ends the
-iteration. Columns describe deviations of a few per cent."""
-
 AT_ONCE = 40_000_000
 """Largest number of readings times unknowns at a time, 320 MB."""
-
-KEPT = 2**30
-"""Largest size in bytes of the interactions that are kept for all steps; larger ones are computed
-again in each. They are in single precision, whose error is 1e-7 of the reaction's second order."""
-
-REACH = 1.2
-"""Distance of cells, in units of the sum of their radii, up to which the field of one makes the
-polarization of the other vary."""
-
-NODES = 3
-"""Nodes per direction in every cell."""
 
 Columns = Callable[[int, Ints | slice], Floats]
 """Takes the number of a block and indices (k,) of points or a slice, and returns the reaction
@@ -322,7 +299,8 @@ def reaction_columns(
 
     ``progress`` is called with the numbers of points that are done and of all points.
     """
-    system = System.of(blocks, cells_per_side, NODES)
+    divisions = 3  # nodes per direction in every cell
+    system = System.of(blocks, cells_per_side, divisions)
     found = np.zeros((len(blocks), len(points), 3, 3))
     if np.any(system.susceptibility):
         deviations, extra = _deviations(system)
@@ -377,7 +355,10 @@ def _deviations(system: System) -> tuple[_Deviations, Any]:
     """
     cells = system.interaction.cells
     count, nodes = cells.weights.shape
-    close, field = system.interaction.near_node_matrices(REACH)
+    # distance of cells, in units of the sum of their radii, up to which the field of one makes the
+    # polarization of the other vary
+    reach = 1.2
+    close, field = system.interaction.near_node_matrices(reach)
     targets, shape = close.targets, (3 * nodes * count, 3 * count)
 
     def sparse(blocks: Floats) -> Any:
@@ -405,13 +386,18 @@ class _Panels:
     def add(self, rows: Floats, to: Floats) -> None:
         """Add the product of rows (r, 3 n) and the matrix to rows of the same shape."""
         count, short = len(self.system.remanence), rows.astype(np.float32)
-        for first in range(0, count, PANEL):
-            last = min(first + PANEL, count)
+        width = 256  # number of source cells whose interactions are in memory at a time
+        # largest size in bytes of the interactions that are kept for all steps; larger ones are
+        # computed again in each. They are in single precision, whose error is 1e-7 of the
+        # reaction's second order.
+        kept_bytes = 2**30
+        for first in range(0, count, width):
+            last = min(first + width, count)
             panel = self.kept.get(first)
             if panel is None:
                 panel = (self.system.interaction.panel(first, last)
                          + self.extra[:, 3 * first:3 * last].toarray()).astype(np.float32)
-                if 36 * count**2 <= KEPT:
+                if 36 * count**2 <= kept_bytes:
                     self.kept[first] = panel
             to[:, 3 * first:3 * last] += short @ panel
 
@@ -436,12 +422,15 @@ def _some(
         deviations.add(by_node.reshape(-1, *by_node.shape[2:]), start[part].reshape(-1, count, 3))
         done(first + len(by_node))
     damping, total = 2 / (2 + system.largest_susceptibility), start
+    # largest change of a reading per polarization, relative to the largest one, that ends the
+    # iteration. Columns describe deviations of a few per cent.
+    tolerance = 1e-6
     for _ in range(MAX_STEPS):
         back = np.einsum("rni,nij->rnj", total.reshape(rows, count, 3), chi).reshape(rows, size)
         change = start - total
         panels.add(back, change)
         total = total + damping * change
-        if np.abs(change).max() <= COLUMN_CHANGE * np.abs(start).max():
+        if np.abs(change).max() <= tolerance * np.abs(start).max():
             break
     found = np.zeros((system.blocks, rows, 3))
     np.add.at(found, interaction.cells.block, np.moveaxis(
