@@ -24,17 +24,11 @@ from halbach_fe.core.files import is_full
 from halbach_fe.geo.session import gmsh_session
 from halbach_fe.geometry.prism import Prism
 
-PER_M = 1e3
-"""Units of STEP and STL files per metre: they are in mm."""
-
-SAGITTA_MM = 0.005
-"""Largest distance in mm of a triangle from the arc that it replaces."""
-
 STEP_END = "END-ISO-10303-21;"
 """Last line of a STEP file."""
 
-TRIANGLE = 2
-"""Gmsh's element type of triangles."""
+PER_M = 1e3
+"""Units of STEP and STL files per metre: they are in mm."""
 
 
 def solid(name: str, body: Prism, openings: Sequence[Prism] = ()) -> tuple[str, Floats]:
@@ -133,12 +127,13 @@ def _silent_stdout() -> Iterator[None]:
 def _triangles() -> Floats:
     """Return the triangles of the surface of the model's only solid, in mm."""
     mesh = gmsh.model.mesh
+    sagitta_mm = 0.005  # largest distance in mm of a triangle from the arc that it replaces
     for _, curve in gmsh.model.getEntities(1):
         count = 1
         if gmsh.model.getType(1, curve) == "Circle":
             (low,), (high,) = gmsh.model.getParametrizationBounds(1, curve)
             radius = gmsh.model.occ.getMass(1, curve) / (high - low)
-            step = 2 * np.arccos(1 - min(SAGITTA_MM / radius, 0.5))
+            step = 2 * np.arccos(1 - min(sagitta_mm / radius, 0.5))
             count = max(2, int(np.ceil((high - low) / step)))
         mesh.setTransfiniteCurve(curve, count + 1)
     for _, surface in gmsh.model.getEntities(2):
@@ -152,5 +147,6 @@ def _triangles() -> Floats:
     tags, points, _ = mesh.getNodes()
     row = np.zeros(int(tags.max()) + 1, int)
     row[tags.astype(int)] = np.arange(len(tags))
-    _, nodes = mesh.getElementsByType(TRIANGLE)
+    triangle = 2  # Gmsh's element type of triangles
+    _, nodes = mesh.getElementsByType(triangle)
     return np.asarray(points.reshape(-1, 3)[row[nodes.astype(int)]].reshape(-1, 3, 3))

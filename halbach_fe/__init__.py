@@ -72,11 +72,11 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.map_check import check_map as check_map
     from halbach_fe.report.campaign_report import campaign_report as campaign_report
     from halbach_fe.report.result_files import write_report as write_report
+    from halbach_fe.response.discretization_error import Verification as Verification
+    from halbach_fe.response.discretization_error import verify as verify
     from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
     from halbach_fe.response.magnetic_axis import magnetic_axis as magnetic_axis
-    from halbach_fe.response.mesh_convergence import Verification as Verification
-    from halbach_fe.response.mesh_convergence import verify as verify
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
     from halbach_fe.response.solution import Solution as Solution
     from halbach_fe.response.solution import solve as solve
@@ -99,7 +99,7 @@ _HOME = {
     "read_blocks": "measurement.block_table",
     "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
-    "verify": "response.mesh_convergence", "multipoles": "api", "homogeneity": "api",
+    "verify": "response.discretization_error", "multipoles": "api", "homogeneity": "api",
     "stray_field": "response.stray_field", "StrayField": "response.stray_field",
     "magnetic_axis": "response.magnetic_axis", "MagneticAxis": "response.magnetic_axis",
     "forces": "design.forces",
@@ -112,7 +112,7 @@ _HOME = {
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
     "MapCheck": "measurement.map_check", "Solution": "response.solution",
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
-    "Verification": "response.mesh_convergence",
+    "Verification": "response.discretization_error",
     "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
     "Region": "response.homogeneity", "HomogeneityResult": "api",
     "Forces": "design.forces",

@@ -160,7 +160,7 @@ def test_imports_point_one_way(me):
 
 
 @pytest.mark.parametrize(("me", "name"), [
-    ("solver.runs", "subprocess"), ("inference.infer", "gmsh"),
+    ("solver.session", "subprocess"), ("inference.infer", "gmsh"),
     ("solver.mesh", "halbach_fe.report"), ("study.model", "halbach_fe.geometry.blocks"),
     ("solver.ring_harmonics_2d", "halbach_fe.study.model"),
     ("stats.linear_gaussian", "halbach_fe.solver.getdp"),

@@ -77,9 +77,6 @@ unless it is its own. A name that is missing here is refused only as it is writt
 RUNS = "getdp-"
 """Beginning of the names of run folders of GetDP."""
 
-MOST_NAMED = 5
-"""Largest number of files that a refusal names."""
-
 _HELD: ContextVar[tuple[Path, ...]] = ContextVar("held", default=())
 """The folders that this run, or this thread, has locked."""
 
@@ -240,9 +237,10 @@ class _Writer:
             return
         names = [str(path.relative_to(self.base)) for path in foreign]
         changed = set(names) <= self.record.files.keys()
-        others = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        named = 5  # largest number of files that a refusal names
+        others = f" and {len(names) - named} more" if len(names) > named else ""
         raise OutputError(
-            f"File {', '.join(names[:MOST_NAMED])}{others} in folder {self.base} "
+            f"File {', '.join(names[:named])}{others} in folder {self.base} "
             + (f"changed after `{self.record.command}` had written it" if changed else
                f"was not written by `{self.record.command}`")
             + f", which would replace it. Name another {self.other}, or move this elsewhere.")

@@ -21,7 +21,6 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import check_number
 from halbach_fe.design.forces import DENSITY_KG_PER_M3
-from halbach_fe.design.radius_programs import moved_radii
 from halbach_fe.design.ring_catalogue import (
     Catalogue,
     Option,
@@ -30,7 +29,7 @@ from halbach_fe.design.ring_catalogue import (
     fields_with_images,
     tables_of,
 )
-from halbach_fe.design.ring_search import MISSES, Found, Task, search
+from halbach_fe.design.ring_search import MISSES, Found, Task, moved_radii, search
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.response.homogeneity import (
     PPM,
@@ -47,19 +46,6 @@ from halbach_fe.study.model import Study
 
 RESTARTS, STARTS = 300, 4
 """Number of random changes from each of several first designs."""
-
-LEVELS = 6
-"""Number of steps from the most homogeneous to the strongest design, which grow with the field:
-near the strongest one there is nothing left to choose."""
-
-RESTARTS_OF_FRONT = 60
-"""Number of random changes for each design of larger field: it begins near a good one."""
-
-ROUNDING = 1e-9
-"""Part of a least field by which rounding may miss it."""
-
-ROUNDS = 3
-"""Largest number of searches with the reaction of permeable blocks."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +162,8 @@ def design_rings(
             "`design`", f"study {study.name}", "with limits that some rings can keep",
             "least_field_T and most_mass_kg that no ring comes nearer to than an empty bore",
             "Are they in tesla and kilograms? Raise most_mass_kg."))
-    for _ in range(ROUNDS):
+    rounds = 3  # largest number of searches with the reaction of permeable blocks
+    for _ in range(rounds):
         chosen = found.chosen
         reaction = _reaction(catalogue, chosen, session)
         if not reaction.any():
@@ -239,10 +226,16 @@ def _front(task: Task, best: Found, generator: np.random.Generator) -> list[Foun
     strongest = task.table[..., -2].argmax(axis=1)
     end = float(task.total(strongest)[-2])
     found, last = [], best
-    for step in range(1, LEVELS):
-        level = max(start + (end - start) * (step / LEVELS)**2, task.least_field_T)
-        harder = replace(task, least_field_T=level * (1 - ROUNDING))
-        last = min((search(harder, one, RESTARTS_OF_FRONT, generator)
+    # number of steps from the most homogeneous to the strongest design, which grow with the field:
+    # near the strongest one there is nothing left to choose
+    levels = 6
+    # number of random changes for each design of larger field: it begins near a good one
+    restarts = 60
+    rounding = 1e-9  # part of a least field by which rounding may miss it
+    for step in range(1, levels):
+        level = max(start + (end - start) * (step / levels)**2, task.least_field_T)
+        harder = replace(task, least_field_T=level * (1 - rounding))
+        last = min((search(harder, one, restarts, generator)
                     for one in (last.chosen, strongest)), key=lambda one: one.ppm)
         if last.ppm < MISSES:
             found.append(last)

@@ -52,17 +52,8 @@ GAIN_SDS = 1.0
 """Smallest ratio of the expected gain of a move to the standard deviation of that gain, for which
 the move is made."""
 
-SURE = 0.95
-"""Probability that the limit is met, at which the search ends."""
-
-DRAWS = 4000
-"""Number of samples from which that probability is estimated, with a standard error of 0.3 %."""
-
 SHORTLIST = 24
 """Number of moves of each kind, the best by an approximate gain, whose exact gain is computed."""
-
-FIRST_OF_CYCLES = 200
-"""Number of placements, the best by themselves, from which exchanges of three blocks are formed."""
 
 AT_ONCE = 100_000
 """Number of moves that are evaluated at a time, which limits the memory."""
@@ -242,7 +233,8 @@ class _Goal:
 
     def met(self, known: Known) -> bool:
         """Return whether the values are within the limit with sufficient probability."""
-        return self.within(known) >= SURE
+        sure = 0.95  # probability that the limit is met, at which the search ends
+        return self.within(known) >= sure
 
 
 @dataclass(frozen=True)
@@ -434,7 +426,9 @@ def shim(
     candidates = [moves for moves in _candidate_moves(placements, len(mounts.places))
                   if budget.get(moves.kind)]
     before = model.of(result.posterior)
-    goal = _Goal(limit, generator.standard_normal((DRAWS, len(before.mean))))
+    # number of samples from which that probability is estimated, with a standard error of 0.3 %
+    draws = 4000
+    goal = _Goal(limit, generator.standard_normal((draws, len(before.mean))))
     chosen, stop = _search(move_model, placements, candidates, budget, goal)
     steps = _steps_by_gain(move_model, chosen, goal)
     within = None
@@ -772,7 +766,7 @@ def _cycles(
 ) -> Iterator[Ints]:
     """Yield cyclic exchanges of three blocks (n, 3) as numbers of placements.
 
-    All possible ones are too many. They begin with the `FIRST_OF_CYCLES` best placements by
+    All possible ones are too many. They begin with the 200 best placements by
     themselves, i into j; each goes on with every j into m, and every m into i. Those of one
     beginning come at a time, which limits the memory: of a magnet of 500 blocks with 24 turns they
     are 300 000, and all together 60 million.
@@ -781,7 +775,9 @@ def _cycles(
                            & (placements.block != placements.to))
     after = now + placements.change[moved]
     score = np.einsum("ij,ij->i", after, after) + placements.noise[moved]
-    for first in moved[np.argsort(score, kind="stable")[:FIRST_OF_CYCLES]]:
+    # number of placements, the best by themselves, from which exchanges of three blocks are formed
+    first_of_cycles = 200
+    for first in moved[np.argsort(score, kind="stable")[:first_of_cycles]]:
         i, j = placements.block[first], placements.to[first]
         second = moved[(placements.block[moved] == j) & (placements.to[moved] != i)]
         third = moved[(placements.to[moved] == i) & (placements.block[moved] != j)]

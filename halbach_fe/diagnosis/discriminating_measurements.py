@@ -36,15 +36,13 @@ from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, keys_of
-from halbach_fe.geometry.blocks import rotation_matrix
+from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.domain import boundary_half_length
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
 from halbach_fe.measurement.campaign import Data
 from halbach_fe.measurement.scan_lines import motion
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise

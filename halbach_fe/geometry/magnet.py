@@ -35,17 +35,6 @@ CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
 """Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
 blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm."""
 
-BEYOND_ENDS = 4.5
-"""Distance by which the field is summed beyond the ends, relative to the magnet's outer radius. The
-field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1 of a block lies
-beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles. Higher orders fall
-faster: for two rings of 80 mm with errors of 2 %, 0.01 units are missing. The distance is half of
-that to the boundary of 3D meshes."""
-
-BESIDE_RAD = 1e-6
-"""Angle in rad beyond half a turn without blocks about the axis, from which blocks are on one side.
-Two opposite poles leave half a turn, but for the rounding of their tables to micrometres."""
-
 SOLVED_BY = "halbach_fe.solver.formulation_choice"
 """The module that solves for the field of a magnet."""
 
@@ -237,7 +226,13 @@ class Magnet(ShownInNotebook):
     @property
     def field_reach(self) -> float:
         """Distance in m from the middle up to which there is some field; of a 3D magnet."""
-        return self.half_length + BEYOND_ENDS * self.radius
+        # distance by which the field is summed beyond the ends, relative to the magnet's outer
+        # radius. The field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1
+        # of a block lies beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles.
+        # Higher orders fall faster: for two rings of 80 mm with errors of 2 %, 0.01 units are
+        # missing. The distance is half of that to the boundary of 3D meshes.
+        reach_per_radius = 4.5
+        return self.half_length + reach_per_radius * self.radius
 
     @cached_property
     def bore_radius(self) -> float:
@@ -261,7 +256,11 @@ class Magnet(ShownInNotebook):
         reach = 0.0 if self.dimension == 2 else self.half_length
         z = np.linspace(-reach, reach, 33)
         axis = np.column_stack([0 * z, 0 * z, z])
-        return bool(widest < np.pi + BESIDE_RAD and not self.contains(axis).any())
+        # angle in rad beyond half a turn without blocks about the axis, from which blocks are on
+        # one side. Two opposite poles leave half a turn, but for the rounding of their tables to
+        # micrometres.
+        rounding_rad = 1e-6
+        return bool(widest < np.pi + rounding_rad and not self.contains(axis).any())
 
     @property
     def iron_half_length(self) -> float:
@@ -347,10 +346,6 @@ class Magnet(ShownInNotebook):
         return Magnet(study, self.blocks) if same else build_magnet(study)
 
 
-WEAKEST_T = 1e-6
-"""Smallest remanence in T of a magnet's strongest block; results are relative to it."""
-
-
 @typed
 def build_magnet(study: Study) -> Magnet:
     """Build the magnet that a study describes.
@@ -377,7 +372,9 @@ def build_magnet(study: Study) -> Magnet:
     """
     magnet = Magnet(study, blocks_of_array(study.array, study.dimension))
     strongest = max(abs(block.remanence) for block in magnet.blocks)
-    if strongest < WEAKEST_T:
+    # smallest remanence in T of a magnet's strongest block; results are relative to it
+    weakest_T = 1e-6
+    if strongest < weakest_T:
         raise StudyError(must_be(
             "`array`", f"study {study.name}", "a magnet with at least one magnetized block",
             f"{len(magnet.blocks)} blocks that are missing" if not strongest

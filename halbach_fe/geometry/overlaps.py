@@ -19,25 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.convex_pieces import Shape, annulus
+from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.separating_axes import PARALLEL, Prisms
 
 TOLERANCE = 1e-6
 """Allowed penetration, as a fraction of the smaller body's size. Positions with nine significant
 digits, and the rounding of rotations (1e-15), stay below it."""
-
-CHORD_ERROR = 4e-5
-"""Largest distance between an arc and its chords or tangents, as a fraction of the shape's width.
-Two such arcs hide an overlap of 8e-5 of the width; larger ones are found."""
-
-COARSE = (1e-3, 3e-2)
-"""Larger values of it, for the depth of an overlap that is already found: fewer and larger pieces
-measure deep overlaps better, since a penetration cannot exceed the width of a piece."""
-
-_PAIRS = 20_000
-"""Number of pairs of pieces that are compared at once."""
 
 
 def overlapping_blocks(
@@ -240,9 +228,16 @@ def _first_overlap(
         return (_Pieces(first, np.unique(first.shape[i[pairs]]), chords, smallest),
                 _Pieces(second, np.unique(second.shape[j[pairs]]), chords, smallest))
 
-    mine, others = pieces(CHORD_ERROR, np.flatnonzero(~exact))
+    # largest distance between an arc and its chords or tangents, as a fraction of the shape's
+    # width. Two such arcs hide an overlap of 8e-5 of the width; larger ones are found.
+    chord_error = 4e-5
+    mine, others = pieces(chord_error, np.flatnonzero(~exact))
     cost = np.where(exact, 1, mine.effort[first.shape[i]] * others.effort[other.shape[j]])
-    lump = np.cumsum(cost) // _PAIRS
+    pairs_at_once = 20_000  # number of pairs of pieces that are compared at once
+    lump = np.cumsum(cost) // pairs_at_once
+    # larger values of it, for the depth of an overlap that is already found: fewer and larger
+    # pieces measure deep overlaps better, since a penetration cannot exceed the width of a piece
+    coarse_errors = (1e-3, 3e-2)
     for pairs in np.split(np.arange(len(i)), np.flatnonzero(np.diff(lump)) + 1):
         depth = np.zeros(len(pairs))
         flat = exact[pairs]
@@ -254,7 +249,7 @@ def _first_overlap(
             continue
         pair, deepest = pairs[found[:1]], float(depth[found[0]])
         if not exact[pair[0]]:
-            for chords in COARSE:
+            for chords in coarse_errors:
                 a, b = pieces(chords, pair)
                 deepest = max(deepest, float(_depth(a, i[pair], b, j[pair], allowed[pair])[0]))
         return int(i[pair[0]]), int(j[pair[0]]), deepest

@@ -11,14 +11,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import Edge, Outline, closed_outline, outline_area
 
-UPRIGHT_RAD = 1e-4
-"""Tilt up to which a block counts as upright: it moves the top of a block of 20 mm by 2 µm."""
-
 ARC_STEP_RAD = np.radians(1.0)
 """Longest part of an arc that a chord replaces. At 150 mm from the centre it is 6 µm off."""
-
-SHORTEST_M = 1e-8
-"""Edges up to this length are rounding, and left out."""
 
 Curve = tuple[tuple[float, float], tuple[float, float], tuple[float, float] | None]
 """Start, end and, of an arc of less than half a turn, centre in m."""
@@ -92,7 +86,9 @@ def upright(block: MagnetBlock) -> Prism | None:
     """
     axes, half = block.axes, (block.z_max - block.z_min) / 2
     centre = block.position + (block.z_max + block.z_min) / 2 * axes[:, 2]
-    standing = np.abs(axes[2]) > np.cos(UPRIGHT_RAD)
+    # tilt up to which a block counts as upright: it moves the top of a block of 20 mm by 2 µm
+    tilt_rad = 1e-4
+    standing = np.abs(axes[2]) > np.cos(tilt_rad)
     if standing[2]:
         return Prism(block.outline, centre[2] - half, centre[2] + half, axes[:2, :2], centre[:2])
     corners = np.array([edge.start for edge in block.outline])
@@ -198,7 +194,8 @@ def with_notch(
     kept = (Edge(after, outline[last[0]].end, outline[last[0]].arc), *between,
             Edge(outline[first[0]].start, before, outline[first[0]].arc),
             Edge(before, tip), Edge(tip, after))
-    return tuple(edge for edge in kept if edge.length > SHORTEST_M)
+    shortest_m = 1e-8  # edges up to this length are rounding, and left out
+    return tuple(edge for edge in kept if edge.length > shortest_m)
 
 
 def _crossings(edge: Edge, centre: Floats, ray: Floats) -> list[float]:

@@ -25,10 +25,9 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.stats.gaussian import Gaussian, remounted_root

@@ -21,8 +21,8 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
-from halbach_fe.geometry.equal_blocks import own_turns
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.symmetry import own_turns
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.unknown_cause import (

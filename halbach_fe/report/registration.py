@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.numbers import EMPTY_CELL
-from halbach_fe.geometry.equal_blocks import turned_onto
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.symmetry import turned_onto
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,

@@ -21,8 +21,7 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.condensed_newton import Condensed, condense
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import (
     check_points,
     choose_route,
@@ -42,15 +41,6 @@ AGREEMENT_T = 1e-8
 
 GetDP's relative residual of 1e-10 is about 1e-10 T, and the condensed solve converges to 1e-9 T. A
 wrong sign or Gauss point makes a difference of 1e-4 T."""
-
-VERIFIED_SAMPLES = 3
-"""Number of magnetizations for which the model is compared with GetDP's Newton method."""
-
-DEVIATIONS = 0.02
-"""Size of deviations from the nominal magnetization, for which the error of the mesh remains."""
-
-IRON_MATRIX_TOLERANCE = 1e-9
-"""Relative tolerance of the matrix in the iron. GetDP's Gauss points have 12 digits."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +123,9 @@ def nonlinear_model(
     settings = magnet.study.prior
     prior = prior or nominal_prior(linear.nominal, magnet.dimension, settings.magnitude_sd,
                                    settings.direction_sd_deg, settings.common_mode_sd)
-    samples = prior.sample(VERIFIED_SAMPLES, generator)
+    # number of magnetizations for which the model is compared with GetDP's Newton method
+    verified_samples = 3
+    samples = prior.sample(verified_samples, generator)
     agreement = compare_with_newton(model, magnet, observation, session, samples)
     model = replace(model, agreement_T=agreement)
     if choose_route(magnet, observation.points) == "moments":
@@ -155,8 +147,10 @@ def _corrected(
     readings = observation.apply(vacuum_part(magnet, observation.points) + parts.nominal)
     correction = readings - model(model.nominal)
     error = reading_errors(magnet, observation, parts, error_bar_session(session))
+    # size of deviations from the nominal magnetization, for which the error of the mesh remains
+    deviation = 0.02
     return replace(model, offset=model.offset + correction,
-                   error=error + DEVIATIONS * np.abs(correction))
+                   error=error + deviation * np.abs(correction))
 
 
 def condense_to_iron(
@@ -294,7 +288,9 @@ def _check_iron(
     if not len(inside):
         return  # a single layer of elements has no inner unknowns; `compare_with_newton` must do
     difference = abs(ours - theirs).tocsr()[inside].max() / abs(theirs).max()
-    if not difference <= IRON_MATRIX_TOLERANCE:
+    # relative tolerance of the matrix in the iron. GetDP's Gauss points have 12 digits.
+    tolerance = 1e-9
+    if not difference <= tolerance:
         raise GetDPError(
             f"GetDP's matrix in the iron differs by {difference:.1e} from that of halbach-fe: this "
             "GetDP numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")

@@ -39,12 +39,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.getdp import DIRECT_SOLVER_OF_PLANE, Job
-from halbach_fe.solver.grid_interpolation import grid_operators
 from halbach_fe.solver.interpolation import (
     Located,
     apply_operator,
     compare_printed,
     coordinates,
+    grid_operators,
     locate,
     nodal_operators,
     probes_of,
@@ -58,8 +58,7 @@ from halbach_fe.solver.mesh import (
     count_mesh,
     verify_mesh,
 )
-from halbach_fe.solver.runs import Task, run_tasks
-from halbach_fe.solver.session import RunSize, Session
+from halbach_fe.solver.session import RunSize, Session, Task, run_tasks
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
@@ -89,10 +88,6 @@ where psi/r is a limit."""
 NO_WAVES = [0.0, 0.0]
 """Nominal remanence of a ring in runs for single blocks, which do not use it: as few values as
 GetDP's lists can have."""
-
-NO_REMANENCE = 1e-12
-"""Tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
-remanence is smaller, which are rounding errors and are not solved for."""
 
 
 def is_axisymmetric(magnet: Magnet) -> bool:
@@ -310,7 +305,10 @@ def runs_of(
         nominal array has few.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
-    own = np.flatnonzero(size > NO_REMANENCE * size.max()).tolist()
+    # tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
+    # remanence is smaller, which are rounding errors and are not solved for
+    no_remanence = 1e-12
+    own = np.flatnonzero(size > no_remanence * size.max()).tolist()
     runs = []
     if single is not None:
         count = single[1] - single[0] + 1

@@ -23,15 +23,12 @@ from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.formulations import (
+from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
     Formulation,
     edge_elements,
-)
-from halbach_fe.solver.magnetostatics import (
     nominal_samples,
     solve_samples,
     solve_sources,
@@ -47,6 +44,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -54,36 +52,9 @@ SUPERPOSITION_TOLERANCE = 1e-8
 solver is used. The problem is linear, so that only rounding errors of about 1e-12 remain; a wrong
 or missing column makes a difference of 1e-3."""
 
-ITERATED_TOLERANCE = 1e-7
-"""The same tolerance for conjugate gradients, which stop at a relative residual of 1e-10. The
-difference was measured to be 1e-9 to 6e-9 on coarse meshes."""
-
-PLACED_TOLERANCE = 0.1
-"""The same tolerance if the fields of some blocks are obtained from others by symmetry in 3D.
-
-The mesh is not symmetric, so that its discretization error remains. On meshes of 30 to 50 mm this
-error was measured to be 1 % to 8.5 % of the finite-element part for the scalar potential, and 1 %
-to 4 % for edge elements of order 2. When the mirror image was left out on purpose, the difference
-was 30 % and more for the scalar potential (8 % for edge elements on a coarse mesh with thin iron);
-for blocks rotated the wrong way or of the wrong sign it was mostly 100 % and more. A single wrong
-block among hundreds is not detected."""
-
-PLACED_TOLERANCE_LOWEST_ORDER = 0.5
-"""The same as `PLACED_TOLERANCE` for edge elements of order 1, whose error was measured to be 5 %
-(20 mm) to 35 % (50 mm). Only blocks of the wrong sign or rotated the wrong way, which make a
-difference of 100 % and more, are detected with certainty."""
-
-MOMENTS_TOLERANCE = 0.1
-"""The same tolerance for the route ``moments``. The columns have a single cell per block, and leave
-out what blocks and iron answer to each other."""
-
 MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
           "edge_elements": "extruded", "scalar_potential": "extruded"}
 """Kind of mesh by route, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`."""
-
-BOUNDARY_NEAR = 0.5
-"""Fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
-because the condition on the boundary affects their field."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +246,10 @@ def _by_moments(
     if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
-    return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error,
+    # the same tolerance for the route ``moments``. The columns have a single cell per block, and
+    # leave out what blocks and iron answer to each other.
+    moments_tolerance = 0.1
+    return ElementFields(moments_tolerance, nominal, along, magnet.blocks, block, error,
                          for_deviations=True)
 
 
@@ -329,11 +303,20 @@ def uses_symmetry(magnet: Magnet) -> bool:
 
 def _superposition_tolerance(magnet: Magnet, route: str, placed: bool) -> float:
     """Return the tolerance that applies; ``placed`` tells whether symmetry places the blocks."""
-    if placed and route == "edge_elements" and magnet.study.solver.edge_order == 1:
-        return PLACED_TOLERANCE_LOWEST_ORDER
     if placed and route != "azimuthal_modes":  # the half-plane's mesh has the symmetry
-        return PLACED_TOLERANCE
-    return ITERATED_TOLERANCE if route == "scalar_potential" else SUPERPOSITION_TOLERANCE
+        # A 3D mesh is not symmetric, so that its discretization error remains. On meshes of 30 to
+        # 50 mm it was measured to be 1 % to 8.5 % of the finite-element part for the scalar
+        # potential, and 1 % to 4 % for edge elements of order 2. When the mirror image was left out
+        # on purpose, the difference was 30 % and more for the scalar potential (8 % for edge
+        # elements on a coarse mesh with thin iron); for blocks rotated the wrong way or of the
+        # wrong sign it was mostly 100 % and more. A single wrong block among hundreds is not
+        # detected. The error of edge elements of order 1 was 5 % (20 mm) to 35 % (50 mm): only
+        # blocks of the wrong sign or rotated the wrong way are detected with certainty.
+        lowest_order = route == "edge_elements" and magnet.study.solver.edge_order == 1
+        return 0.5 if lowest_order else 0.1
+    # conjugate gradients stop at a relative residual of 1e-10; the difference was measured to be
+    # 1e-9 to 6e-9 on coarse meshes
+    return 1e-7 if route == "scalar_potential" else SUPERPOSITION_TOLERANCE
 
 
 def _not_solved(number: int, some: Ints | slice) -> Floats:
@@ -485,8 +468,11 @@ def check_points(
     if magnet.dimension == 3:
         directions.append((np.abs(points[:, 2]), magnet.half_length,
                      boundary_half_length(magnet, mesh)))
+    # fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
+    # because the condition on the boundary affects their field.
+    boundary_near = 0.5
     for position, end, boundary in directions:
-        near = position > end + BOUNDARY_NEAR * (boundary - end)
+        near = position > end + boundary_near * (boundary - end)
         if near.any() and position.max() <= boundary:  # the solve refuses points beyond it
             x, y, z = points[np.argmax(near)]
             warnings.warn(
@@ -495,3 +481,44 @@ def check_points(
                 f"{z:g}) m. Enlarge `open_boundary` of study {magnet.name}.", HalbachWarning,
                 stacklevel=2)
     return points
+
+
+def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
+    """Return the derivative of B along the nominal direction of magnetization of a block.
+
+    The iron is at its operating point in the nominal array.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    block : int
+        Number of the block, from 0.
+    points : ndarray, shape (n, 3), in m
+        Anywhere inside the outer boundary, also in magnet and iron.
+    session : Session
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T m/A
+
+    Raises
+    ------
+    StudyError
+        If the array has no block of this number.
+    """
+    blocks = magnet.blocks
+    if not 0 <= block < len(blocks):
+        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)} "
+                         f"blocks; instead received number {block + 1}. Correct the number.")
+    # Solve for B itself by a vector potential: in materials the field in vacuum has no exact form
+    # to which a reaction could be added, and the gradient of the scalar potential is H, not B.
+    direct = magnet.with_(solver__method="direct", solver__route="auto")
+    formulation = formulation_of(direct, choose_route(direct, points))
+    if magnet.is_nonlinear:
+        fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
+    else:
+        fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
+    size, changed = magnet.dimension, blocks[block]
+    # the change of remanence in T for a change of magnetization by 1 A/m along the easy axis
+    remanence = MU_0 * changed.recoil_tensor @ np.array(changed.easy_axis)
+    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])

@@ -46,7 +46,7 @@ from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.stated_probabilities import (
+from halbach_fe.stats.calibration import (
     error_if_calibrated,
     expected_calibration_error,
     frequencies,

@@ -26,8 +26,8 @@ from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InstrumentTerms
 from halbach_fe.measurement.field_map import field_map

@@ -6,9 +6,9 @@ import tomllib
 
 import pytest
 
-from halbach_fe.geometry.equal_blocks import own_turns, turned_onto
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
+from halbach_fe.geometry.symmetry import own_turns, turned_onto
 from tests.conftest import parse_study
 from tests.support.short_dipole import TEXT
 

@@ -23,10 +23,6 @@ CHORD = np.pi / 6
 """Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
 1.7 % of its radius on either side, if its area is right."""
 
-ROUND = 6
-"""Largest number of corners of a convex polygon that is cut at the middles of its sides. A rounder
-one is cut from its centroid to every other corner, which makes half as many cells."""
-
 
 @dataclass(frozen=True)
 class Cells:
@@ -320,7 +316,10 @@ def _from_centroid(polygon: Floats) -> list[Floats]:
     """Cut a convex polygon (m, 2) into quadrilaterals about its centroid."""
     centre = area_and_centroid(polygon[None])[1][0]
     count = len(polygon)
-    if count <= ROUND:
+    # largest number of corners of a convex polygon that is cut at the middles of its sides. A
+    # rounder one is cut from its centroid to every other corner, which makes half as many cells.
+    most_corners = 6
+    if count <= most_corners:
         middles = (polygon + np.roll(polygon, -1, axis=0)) / 2
         return [np.array([polygon[i], middles[i], centre, middles[i - 1]]) for i in range(count)]
     pieces = [np.array([centre, polygon[i], polygon[i + 1], polygon[(i + 2) % count]])
