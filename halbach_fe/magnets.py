@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import write_text
-from halbach_fe.geometry.block_export import blocks_table
-from halbach_fe.geometry.free_blocks import free_outline
+from halbach_fe.geometry.free_blocks import blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
