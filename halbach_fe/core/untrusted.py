@@ -118,7 +118,8 @@ def _binary_mesh(raw: bytes) -> meshio.Mesh | None:
     if not start or not middle:
         return None
     nodes = np.frombuffer(raw, node, int(start[1]), start.end())
-    cells, tags, left, place = [], [], int(middle[1]), middle.end()
+    cells: list[tuple[str, NDArray[np.int32]]] = []
+    tags, left, place = [], int(middle[1]), middle.end()
     while left > 0:
         rows = _rows_alike(np.frombuffer(raw, "<i4", (len(raw) - place) // 4, place), left)
         if rows is None or len(cells) == len(GMSH_TYPES):
