@@ -1,5 +1,6 @@
 # make demo     the main job on the published profile of the FASER dipole: what is wrong, and what is left
 # make test     all tests
+# make test-quick  those that take two minutes
 # make fuzz     every reader of files, on files that are damaged or made up; half an hour
 # make verify-calibration  are the posteriors as sure as they may be?
 # make verify-diagnosis    are hidden effects found, and only those?
@@ -22,7 +23,7 @@
 # Without compiled files beside the sources every process of the tests would compile all again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-cubes study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-cubes study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test test-quick fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/diagnose.py -o results/demo --quick
@@ -121,8 +122,8 @@ study-sensitivity: setup
 	.venv/bin/python studies/sensitivity/run.py -o results/sensitivity
 
 # Each core has a worker already: more threads of the linear algebra would wait for each other.
-test: setup-test
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+test test-quick: setup-test
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(if $(filter test-quick,$@),-m quick)
 
 # What breaks a promise of tests/fuzz/contract.py is kept in build/fuzz; SEED=2 tries other files.
 SECONDS = 60

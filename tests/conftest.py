@@ -57,23 +57,62 @@ DIPOLE: dict[str, Any] = {
 StudyMaker = Callable[..., Study]
 
 LONGEST = [
-    "cli/test_all_keys.py", "docs/test_docs.py", "response/test_nonlinear.py",
-    "solver/test_oracles.py", "synthetic/test_fields.py", "inference/test_mcmc.py",
-    "solver/test_azimuthal_modes.py", "inference/test_infer.py", "cli/test_cli.py",
-    "cli/test_killed.py", "geometry/test_symmetry.py", "design/test_shimming.py",
-    "design/test_ring_design.py", "diagnosis/test_sealed_cases.py",
-    "diagnosis/test_unlisted_causes.py", "design/test_homogeneity_objective.py",
-    "synthetic/test_hidden_effects.py", "diagnosis/test_assembly.py",
-    "diagnosis/test_uncertain_effects.py", "diagnosis/test_rule_of_evidence.py",
-    "inference/test_total_field.py", "inference/test_registration.py",
+    "cli/test_all_keys.py", "response/test_nonlinear.py", "synthetic/test_fields.py",
+    "solver/test_azimuthal_modes.py", "solver/test_oracles.py", "regression/test_field_maps.py",
+    "cli/test_cli.py", "fuzz/test_readers.py", "geometry/test_symmetry.py", "cli/test_killed.py",
+    "diagnosis/test_unlisted_causes.py", "inference/test_registration.py",
+    "response/test_homogeneity.py", "inference/test_infer.py", "diagnosis/test_diagnose.py",
+    "design/test_homogeneity_objective.py", "inference/test_mcmc.py",
+    "diagnosis/test_gross_errors.py", "measurement/test_map_check.py",
+    "synthetic/test_hidden_effects.py", "diagnosis/test_several_maps.py",
+    "inference/test_line_registration.py", "inference/test_campaign.py", "docs/test_docs.py",
+    "response/test_discretization_error.py", "diagnosis/test_screening.py",
+    "inference/test_doubted_terms.py", "solver/test_axisymmetric_iron.py", "solver/test_dofs.py",
+    "cli/test_files.py", "response/test_resource_estimate.py", "solver/test_getdp_cache.py",
+    "solver/test_dask_cluster.py", "solver/test_magnetostatics.py",
 ]
 """Files that take half a minute or more of processor time, the longest first."""
+
+QUICK = {
+    "cli": "completion dry_run explain export formats new",
+    "core": "code_digest hdf5 pace result_folder",
+    "design": "cad tolerance",
+    "diagnosis": "discriminating_measurements evidence smooth_discrepancy",
+    "docs": "describe_your_magnet figures",
+    "geometry": (
+        "block_export blocks convex_pieces equal_blocks free_blocks iron neighbours "
+        "surface"),
+    "inference": "held_out_map repeated_readings storage",
+    "measurement": (
+        "block_table calibration export_map field_map import_map instrument observation "
+        "one_reader total_field"),
+    "report": "figures geometry inference_answer no_bore point_maps study_pages",
+    "response": "block_variation deviation_field",
+    "solver/moments": "cells irreversible tree",
+    "solver": "exact_block_field getdp prism_kernel runs",
+    "stats": "d_optimal linear_gaussian noise small_samples stated_probabilities",
+    "study": "array free_blocks free_blocks_file grades halbach_order materials sentences study",
+    "synthetic": "placed_blocks stated_instrument",
+    "": "structure",
+}
+"""Files of `make test-quick`, by room: of every room but `fuzz` those that take a few seconds."""
+QUICK_FILES = {ROOT / "tests" / room / f"test_{name}.py"
+               for room, names in QUICK.items() for name in names.split()}
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out the files that are not asked for: to import all takes as long as some of them."""
+    left_out = collection_path.suffix == ".py" and collection_path not in QUICK_FILES
+    return True if config.option.markexpr == "quick" and left_out else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files: one that a worker begins last keeps the others waiting."""
     place = {ROOT / "tests" / name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path, len(LONGEST)))
+    for item in items:
+        if item.path in QUICK_FILES:
+            item.add_marker("quick")
 
 
 def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.conftest import LONGEST, QUICK_FILES, ROOT
 
 FILES = [path for folder in ("halbach_fe", "geo", "cli", "pro")
          for path in (ROOT / folder).rglob("*.py")]
@@ -209,3 +209,10 @@ def test_tests_import_no_benchmarks():
     """Benchmarks import the oracles and the support of the tests, never the other way round."""
     assert not [path for path in (ROOT / "tests").rglob("*.py") if of_benchmarks(path)]
     assert of_benchmarks(ROOT / "benchmarks" / "run.py")  # an import would be seen
+
+
+def test_lists_of_test_files_are_up_to_date():
+    """A file of another name would be left out of `make test-quick`, or begin last."""
+    listed = {*QUICK_FILES, *(ROOT / "tests" / name for name in LONGEST)}
+    assert listed <= set((ROOT / "tests").rglob("test_*.py"))
+    assert not QUICK_FILES & {ROOT / "tests" / name for name in LONGEST}

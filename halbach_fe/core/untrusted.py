@@ -81,8 +81,13 @@ def open_hdf5(file: BinaryIO) -> Iterator[Any]:
         yield opened
 
 
+GMSH_TYPES = {1: ("line", [0, 1]), 3: ("quad", [0, 1, 2, 3]), 8: ("line3", [0, 1, 2]),
+              9: ("triangle6", [0, 1, 2, 3, 4, 5]), 11: ("tetra10", [0, 1, 2, 3, 4, 5, 6, 7, 9, 8])}
+"""meshio's name and order of the nodes, by Gmsh's number of a type of elements."""
+
+
 def read_mesh(path: Path) -> meshio.Mesh:
-    """Read a mesh or table file with meshio.
+    """Read a mesh or table file: Gmsh's binary meshes as arrays, all else with meshio.
 
     Raises
     ------
@@ -90,7 +95,52 @@ def read_mesh(path: Path) -> meshio.Mesh:
         If meshio cannot read the file. (It calls `sys.exit` for some damaged files.)
     """
     with _refusing():
-        return meshio.read(path)
+        mesh = _binary_mesh(path.read_bytes()) if path.suffix == ".msh" else None
+        return mesh or meshio.read(path)
+
+
+def _binary_mesh(raw: bytes) -> meshio.Mesh | None:
+    """Read a mesh in format MSH 2.2; return None if anything is not as Gmsh writes it.
+
+    Gmsh writes a header before every element, and meshio reads as many small arrays.
+    """
+    start = re.match(rb"\$MeshFormat\n2\.2 1 8\n\x01\0{3}\n\$EndMeshFormat\n"
+                     rb"\$Nodes\n(\d{1,9})\n", raw)
+    node = np.dtype([("number", "<i4"), ("x_m", "<f8", (3,))])
+    end = start.end() + int(start[1]) * node.itemsize if start else 0
+    middle = re.compile(rb"\n\$EndNodes\n\$Elements\n(\d{1,9})\n").match(raw, end)
+    if not start or not middle:
+        return None
+    nodes = np.frombuffer(raw, node, int(start[1]), start.end())
+    cells: list[tuple[str, NDArray[np.int32]]] = []
+    tags, left, place = [], int(middle[1]), middle.end()
+    while left > 0:
+        rows = _rows_alike(np.frombuffer(raw, "<i4", (len(raw) - place) // 4, place), left)
+        if rows is None or len(cells) == len(GMSH_TYPES):
+            return None
+        kind, order = GMSH_TYPES[int(rows[0, 0])]
+        cells.append((kind, rows[:, -len(order):][:, order] - 1))
+        tags.append(rows[:, 4])
+        left, place = left - len(rows), place + rows.nbytes
+    if (not cells or not raw.startswith(b"\n$EndElements", place)
+            or not np.array_equal(nodes["number"], np.arange(1, len(nodes) + 1))
+            or any(data.min() < 0 or data.max() >= len(nodes) for _, data in cells)):
+        return None
+    return meshio.Mesh(np.ascontiguousarray(nodes["x_m"]), cells,
+                       cell_data={"gmsh:physical": tags})
+
+
+def _rows_alike(words: NDArray[np.int32], most: int) -> NDArray[np.int32] | None:
+    """Return the first elements of one type, (n, 3 + 1 + tags + nodes); None if there are none.
+
+    Every element is a row of its type, 1, the number of its tags, its number, tags, and nodes.
+    """
+    if len(words) < 3 or int(words[0]) not in GMSH_TYPES or words[1] != 1 or not 1 <= words[2] < 9:
+        return None
+    width = 4 + int(words[2]) + len(GMSH_TYPES[int(words[0])][1])
+    rows = words[:min(most, len(words) // width) * width].reshape(-1, width)
+    other = (rows[:, :3] != words[:3]).any(axis=1)
+    return rows[:int(np.argmax(other))] if other.any() else rows if len(rows) else None
 
 
 def _check_heaps(file: BinaryIO) -> int:

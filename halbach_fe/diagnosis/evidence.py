@@ -85,11 +85,15 @@ class Evidence:
         count = len(score)
         return cls(information, score, chi2, readings, np.ones(count), np.zeros((0, count)))
 
-    def part(self, rows: Ints, columns: Ints | None = None) -> Floats:
-        """Return some rows and columns of A, by default the rows' own columns."""
-        columns = rows if columns is None else columns
-        return (self.information[np.ix_(rows, columns)]
-                - self.absorbed[:, rows].T @ self.absorbed[:, columns]) / self.temperature
+    def part(self, index: Ints) -> Floats:
+        """Return the rows and columns of A of some signatures."""
+        absorbed = self.absorbed[:, index]
+        return (self.information[np.ix_(index, index)] - absorbed.T @ absorbed) / self.temperature
+
+    def rows(self, index: Ints) -> Floats:
+        """Return the rows of A of some signatures, without a copy of all of A."""
+        return (self.information[index]
+                - self.absorbed[:, index].T @ self.absorbed) / self.temperature
 
     def fit(self, chosen: Sequence[int]) -> Fit:
         """Return the posterior of the amplitudes of a set of columns, whose prior mean is 0."""
@@ -109,7 +113,7 @@ class Evidence:
         if not len(index):
             return self
         return self.beside(self.part(index) + np.diag(self.prior[index]),
-                           self.part(index, np.arange(len(self.score))), self.score[index])
+                           self.rows(index), self.score[index])
 
     def beside(self, precision: Floats, cross: Floats, score: Floats) -> Evidence:
         """Return the evidence with the amplitudes of other columns integrated out.
@@ -138,7 +142,7 @@ class Evidence:
 
     def shifted(self, column: int) -> Evidence:
         """Return the evidence of the readings less one signature at amplitude 1."""
-        row = self.part(np.array([column]), np.arange(len(self.score)))[0]
+        row = self.rows(np.array([column]))[0]
         return replace(self, score=self.score - row,
                        chi2=self.chi2 - 2 * self.score[column] + row[column])
 

@@ -16,7 +16,7 @@ CHANGES = (
     {"array__remanence_T": 1.06 * 1.03}, {"array__recoil_permeability": 1.15},
     {"array__first_magnetization_angle_deg": 183.0}, {"array__inner_radius_m": 0.108},
     {"array__multipole_order": 2}, {"array__block": {"shape": "sector", "angular_gap_deg": 1.0}})
-TRIED = {"dipole_3d_direct": 2, "dipole_3d_reaction": 5}
+TRIED = {"dipole_3d_direct": 1, "dipole_3d_reaction": 5}
 """Of the changes; others of this magnet are told by the reaction, gaps, slow in 3D, by sections."""
 
 

@@ -31,7 +31,7 @@ from halbach_fe.solver.getdp_cache import (
     Cache,
     default_cache,
 )
-from tests.conftest import circle
+from tests.conftest import DIPOLE, changed, circle
 
 POINTS = circle(0.07, 5)
 
@@ -275,30 +275,32 @@ def test_a_cache_that_cannot_be_written_costs_nothing_but_a_warning(coarse, shar
 
 
 SHARED = """
-import sys
+import json, sys
 from pathlib import Path
+import numpy as np
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
-from tests.conftest import DIPOLE, changed, circle
 from halbach_fe.study.reader import parse_study
-folder, cache = map(Path, sys.argv[1:])
-for remanence in (1.0, 1.1, 1.2):
-    study = parse_study(changed(DIPOLE, array__remanence_T=remanence, mesh__block_size_m=0.04))
-    field = solve_nominal(build_magnet(study), circle(0.07, 5), Session(
-        find_getdp(), folder, jobs=2, cache=Cache(cache, 150_000)))
+folder, cache, studies, points = sys.argv[1:]
+for study in json.loads(studies):
+    field = solve_nominal(build_magnet(parse_study(study)), np.array(json.loads(points)), Session(
+        find_getdp(), Path(folder), jobs=2, cache=Cache(Path(cache), 150_000)))
     print(field.tobytes().hex())
 """
 
 
 def test_processes_share_it(tmp_path):
     """Four at once, in a cache that holds a part of it: they store, use and remove the same."""
+    studies = [changed(DIPOLE, array__remanence_T=remanence, mesh__block_size_m=0.04)
+               for remanence in (1.0, 1.1, 1.2)]
+
     def one(number):
         return subprocess.run(
             [sys.executable, "-W", "error", "-c", SHARED, tmp_path / f"{number}",
-             tmp_path / "cache"],
+             tmp_path / "cache", json.dumps(studies), json.dumps(POINTS.tolist())],
             capture_output=True, text=True, timeout=300, check=False)
 
     with ThreadPoolExecutor(4) as pool:
