@@ -347,7 +347,9 @@ def _diagnose(
         corrected_study=corrected, before=first[0], after=update,
         study=with_position_noise(with_uncertain_effects(corrected, identified), position_noise),
         identified=identified, unknown=unknown,
-        probabilities=probabilities(first[1].evidence, first[1].candidates),
+        probabilities=probabilities(
+            first[1].evidence, first[1].candidates,
+            judgement.best.log_odds if unknown is not None and unknown.alone else -np.inf),
         evidence=first[1].evidence, candidates=first[1].candidates,
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),

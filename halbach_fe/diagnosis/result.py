@@ -251,7 +251,8 @@ class Diagnosis(ShownInNotebook):
         Posterior probability of each effect by name, and of ``none``, on the assumption that at
         most one effect is missing from the corrected study. Effects that explain too little to be
         solved for have that of their rough signature, see
-        `halbach_fe.diagnosis.effects.base.Effect.rough_signature`.
+        `halbach_fe.diagnosis.effects.base.Effect.rough_signature`. An unlisted cause that was found
+        in place of all effects is among them as ``unknown``.
     evidence : Evidence
         Evidence of all signatures for the corrected study.
     candidates : tuple of Candidate

@@ -31,6 +31,7 @@ from halbach_fe.measurement.doubted_terms import (
     factor_in_words,
     factor_of,
     likeness_of,
+    shared_doubts,
     words_of,
 )
 from halbach_fe.measurement.observation import Observation
@@ -538,6 +539,18 @@ class InferenceResult(ShownInNotebook):
         blocks = block_doubts(magnet, self.posterior.mean, self.prior.mean, self.prior.sd)
         return doubts(terms, magnet.dimension * len(magnet.blocks)) + tuple(
             one for one in blocks if one.name == ALL_BLOCKS)
+
+    @cached_property
+    def shared_doubts(self) -> tuple[Term, ...]:
+        """What all blocks together are farther off than their prior allows, though no block is.
+
+        An error of the instrument does the same, which a good chi-squared does not tell apart.
+        """
+        training = ~self.held_out
+        error, size = (np.linalg.norm(values[training]) for values in (
+            self.response.error, self.prediction_posterior.mean))
+        return () if self.doubts else shared_doubts(
+            self.magnet, self.posterior.mean, self.prior, float(error / size) if size else 0.0)
 
     @property
     def _doubted(self) -> str:

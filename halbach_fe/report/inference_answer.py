@@ -8,6 +8,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
+from halbach_fe.measurement.doubted_terms import ALL_BLOCKS
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
@@ -24,6 +25,10 @@ from halbach_fe.study.types import COMPONENTS
 ALONG_AN_AXIS = 1e-6
 """Angle in rad up to which the direction of a sensor counts as an axis: of 1 T across it shows
 1 µT."""
+
+AGAIN = ("State in the study how far that may be off, and update again.",
+         "halbach-fe infer STUDY --measurements MAP -o DIR")
+"""The next step, and its command, if something of all blocks is in doubt."""
 
 
 def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> Answer:
@@ -46,22 +51,50 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         "[inference.held_out] or --held-out.")
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
+    shared = _of_all_blocks(result)
+    return Answer(
+        question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
+        f"{f'Only with care. {shared} But model' if shared else 'Yes. Model'} and readings agree: "
+        "chi² per reading "
+        f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
+        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
+        f"{_of_the_sign(result)}{solver}",
+        *(AGAIN if shared else _after_agreement(result)))
+
+
+def _after_agreement(result: InferenceResult) -> tuple[str, str]:
+    """Return the next step, and its command, if model and measurement agree."""
     # the field of a quadrupole is not meant to be the same everywhere
     of_order = result.magnet.dimension == 2 or result.magnet.array.multipole_order > 1
     faults = faults_in_words(result.study)
     mend = "" if not faults else (
         f"This is the magnet with blocks that are not as designed ({faults}): put that right and "
         "measure again, or go on with it as it is. ")
-    return Answer(
-        question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
-        "Yes. Model and readings agree: chi² per reading "
-        f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
-        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
-        f"{_of_the_sign(result)}{solver}",
-        f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
-        f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
-        f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
-        "DIR/posterior.h5 -o DIR")
+    return (f"{mend}See {'its multipoles' if of_order else 'how homogeneous it is'}; halbach-fe "
+            f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
+            f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
+            "DIR/posterior.h5 -o DIR")
+
+
+def _of_all_blocks(result: InferenceResult) -> str:
+    """Say what all blocks would share far beyond their prior, and what else does the same."""
+    said = []
+    for each in result.shared_doubts:
+        turn = each.name != ALL_BLOCKS
+        what = (f"turned by {each.size} about {each.name[-1]}" if turn else
+                f"{decimals(100 * abs(each.value))}\u00a0% "
+                f"{'weaker' if each.value < 0 else 'stronger'}")
+        keys = [] if result.study.dimension == 2 else [
+            f"[instrument_sd] {'rotation_rad' if turn else 'gain'}"]
+        keys += [] if turn else ["[prior] common_mode_sd"]
+        said.append(
+            f"All blocks would be {what} together, which is {decimals(each.distance, 2)} standard "
+            f"deviations of what their prior allows ({each.known}). "
+            f"{'A turn of the map' if turn else 'A gain of the instrument'} does the same, and the "
+            "readings cannot tell which it is" + (
+                f": state how far either may be off ({' and '.join(keys)}), and update again."
+                if keys else "."))
+    return " ".join(said)
 
 
 def _of_the_probe(result: InferenceResult) -> str:
