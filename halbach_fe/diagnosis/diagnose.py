@@ -68,6 +68,7 @@ from halbach_fe.diagnosis.search import (
     identify_effects,
     possible,
     score_hypotheses,
+    with_rivals,
     with_short_steps,
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
@@ -340,6 +341,7 @@ def _diagnose(
             suspected = suspicions(judgement, corrected, search)
     if unknown is not None and unknown.alone and not start and not position_noise:
         update, search = first
+    identified = with_rivals(search, identified)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     in_model = [column for number in numbers for column in search.candidates[number].columns]
     limits = detection_limits(update, campaign, search.columns[:, in_model])

@@ -41,12 +41,15 @@ class IdentifiedEffect:
     selection : SelectedEffect
         Log Bayes factor, posterior odds, and the alternatives that the readings cannot distinguish
         from this effect.
+    rivals : tuple of IdentifiedEffect
+        These alternatives, each with the amplitudes that it would have in place of this effect.
     """
 
     hypothesis: Hypothesis
     values: Floats
     sd: Floats
     selection: SelectedEffect
+    rivals: tuple[IdentifiedEffect, ...] = ()
 
     @property
     def place(self) -> Place:

@@ -577,6 +577,26 @@ def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[Iden
     return tuple(identified)
 
 
+def with_rivals(
+    search: Search, identified: Sequence[IdentifiedEffect]
+) -> tuple[IdentifiedEffect, ...]:
+    """Return identified effects with their alternatives, each fitted in place of its effect.
+
+    Alternatives that this search does not compare are left out.
+    """
+    there = {(candidate.effect, candidate.place): candidate for candidate in search.candidates}
+    own = [replace(effect.selection, candidate=search.candidates[search.hypotheses.index(
+        effect.hypothesis)]) for effect in identified]
+    found = []
+    for number, effect in enumerate(identified):
+        others = own[:number] + own[number + 1:]
+        found.append(replace(effect, rivals=tuple(
+            amplitudes(search, [*others, SelectedEffect(candidate, factor, factor, ())])[-1]
+            for one, factor in effect.selection.alternatives
+            if (candidate := there.get((one.effect, one.place))) is not None)))
+    return tuple(found)
+
+
 def with_short_steps(
     found: Sequence[IdentifiedEffect], before: Sequence[IdentifiedEffect]
 ) -> tuple[IdentifiedEffect, ...]:

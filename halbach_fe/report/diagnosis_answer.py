@@ -21,6 +21,7 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
+from halbach_fe.diagnosis.uncertain_effects import exact_rivals
 from halbach_fe.geometry.equal_blocks import own_turns
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import TRAINING
@@ -128,7 +129,8 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
         if any(map(rivals, diagnosis.identified)):
             return ("Measure what tells apart the causes that explain the map equally well: the "
-                    f"page says what. Until then {STUDY_FILE} has the first of them.", infer)
+                    f"page says what. Until then {STUDY_FILE} has the first of them"
+                    f"{_beside(diagnosis)}.", infer)
         if remedies := _remedies(diagnosis):
             changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
                        f"stays as it is, update it with {STUDY_FILE}, the study with what was "
@@ -136,6 +138,18 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         return f"{changed} {suspicions}".strip(), infer
     these = "these maps" if diagnosis.after.is_campaign else "this map"
     return f"Update the magnet with {these}.", f"halbach-fe infer STUDY{maps} -o DIR"
+
+
+def _beside(diagnosis: Diagnosis) -> str:
+    """Say which of the causes that explain the map equally well the diagnosed study has, too."""
+    titles = catalogue_titles(diagnosis)
+    every = {one.hypothesis.effect.name for effect in diagnosis.identified for one in effect.rivals}
+    exact = {one.hypothesis.effect.name for effect in diagnosis.identified
+             for one in exact_rivals(diagnosis.study, effect)}
+    sentence = (", and beside it the others with uncertain amplitudes about 0, so that an update "
+                "is right whichever it is") if every > exact else ""
+    return sentence + (f"; without {in_a_row([title_of(name, titles) for name in sorted(exact)])}, "
+                       "which is there or not" if exact else "")
 
 
 def _remedies(diagnosis: Diagnosis) -> list[str]:

@@ -17,6 +17,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.uncertain_amplitudes import shared_deviations
@@ -108,6 +109,36 @@ def test_the_update_after_a_diagnosis_is_no_surer_than_it_may_be(
     assert sd == pytest.approx(tilt.sd[0], rel=0.05)  # 2 % are the wide prior's, about another mean
     assert result.amplitudes.prior_sd[0] > 3 * sd
     assert abs(tilt.values[0] + result.amplitudes.change[0] - TILT_RAD) < 3.5 * sd
+
+
+def test_what_the_map_does_not_tell_apart_is_estimated_together(session, tmp_path, generator):
+    """A background field is named as the zero of a sensor, which explains the readings as well:
+    blocks of this magnet imitate what the background has across the axis.
+    """
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | SHORT})
+    polarizations = drawn(study, generator)
+    shown = field_map(POINTS, field(study, polarizations, POINTS) + [1e-4, -1e-4, 3e-4]
+                      + NOISE_T * generator.standard_normal(POINTS.shape))
+    effects = [effect for effect in catalogue() if effect.name in ("offset_z", "background")]
+    found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
+    (zero,) = found.identified
+    print(zero.selection.effects, zero.values, zero.sd, [u.name for u in found.study.uncertain])
+    assert zero.selection.effects == ("offset_z", "background")
+    assert [one.name for one in found.study.uncertain] == [
+        "offset_z.offset_T", *(f"background.{axis}_T" for axis in "xyz")]
+    write_study(tomlkit.dumps(study.model_dump(mode="json", exclude_none=True)), study, found,
+                tmp_path)
+    assert read_study(tmp_path / STUDY_FILE) == found.study
+    said = answer(found)
+    assert "the others with uncertain amplitudes about 0" in said.step
+    assert said.trust.startswith("Only in part")
+    chi2, _ = update(found.study, shown, polarizations, session.within("update"))
+    first, _ = update(found.study.with_(uncertain=found.study.uncertain[:1]), shown, polarizations,
+                      session.within("first"))
+    print(chi2, first)
+    least = 4 * np.sqrt(2 / polarizations.size)
+    assert chi2 < 1 + least
+    assert first > 1 + least  # the control: the first name alone
 
 
 def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator):
