@@ -347,7 +347,9 @@ def _diagnose(
     limits = detection_limits(update, campaign, search.columns[:, in_model])
     return Diagnosis(
         corrected_study=corrected, before=first[0], after=update,
-        study=with_position_noise(with_uncertain_effects(corrected, identified), position_noise),
+        study=with_position_noise(with_uncertain_effects(
+            corrected, identified, [each for one in suspected for each in one.fitted]),
+            position_noise),
         identified=identified, unknown=unknown,
         probabilities=probabilities(first[1].evidence, first[1].candidates),
         evidence=first[1].evidence, candidates=first[1].candidates,

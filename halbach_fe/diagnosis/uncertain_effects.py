@@ -19,6 +19,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects.base import Parameter
 from halbach_fe.diagnosis.model_selection import WIDE_PRIOR_FROM, WIDE_PRIOR_SD
 from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.search import apply_effects
 from halbach_fe.study.model import Study
 from halbach_fe.study.uncertain import Uncertain, number_changes
 
@@ -30,22 +31,26 @@ DIGITS = 9
 """Digits of a derivative that differences have, of which rounding leaves no more."""
 
 
-def with_uncertain_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
+def with_uncertain_effects(
+    study: Study, identified: Sequence[IdentifiedEffect],
+    suspected: Sequence[IdentifiedEffect] = ()
+) -> Study:
     """Return a study without some effects, with these at their amplitudes, which stay uncertain.
 
-    What explains the readings as well as one of them is in it with an amplitude of 0, which is
-    uncertain too: readings that do not tell them apart determine a combination of them. Amplitudes
-    that were not fitted (a block is missing or it is not) are exact, but for those of refinements:
-    the place of an object is uncertain too if it was taken from a search.
+    What explains the readings as well as one of them, or is suspected beside them, is in it with
+    an amplitude of 0, which is uncertain too: readings that do not tell them apart determine a
+    combination of them. Amplitudes that were not fitted (a block is missing or it is not) are
+    exact, but for those of refinements: the place of an object is uncertain too if it was taken
+    from a search.
     """
     effects = [_with_refinements(effect) for effect in identified]
     widths = [_prior_sds(effect) for effect in effects]
-    for rival in _rivals(effects):
+    for rival in _rivals(effects, suspected):
         nothing = replace(rival, values=0.0 * rival.values)
-        if _is_neutral(_applied(study, effects), nothing):
+        if _is_neutral(apply_effects(study, effects), nothing):
             effects.append(nothing)
             widths.append(_prior_sds(rival))
-    found, tables = _applied(study, effects), list(study.uncertain)
+    found, tables = apply_effects(study, effects), list(study.uncertain)
     for number, (effect, sds) in enumerate(zip(effects, widths, strict=True)):
         for which, sd in enumerate(sds):
             change = _change(study, effects, (number, which)) if sd else {}
@@ -56,23 +61,25 @@ def with_uncertain_effects(study: Study, identified: Sequence[IdentifiedEffect])
     return found.with_(uncertain=tuple(tables))
 
 
-def exact_rivals(study: Study, identified: IdentifiedEffect) -> list[IdentifiedEffect]:
-    """Return the rivals of an effect whose amplitudes are no uncertain numbers of a study, as that
-    a block is missing: the study calls them absent.
+def is_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
+    """Tell whether a study has amplitudes of an effect as uncertain numbers.
+
+    Of an effect that is there or not, as a missing block, it has none.
     """
-    return [rival for rival in _rivals([identified]) if not any(
-        re.fullmatch(rf"(\d+\. )?{re.escape(rival.name)}\..*", one.name)
-        for one in study.uncertain)]
+    return any(re.fullmatch(rf"(\d+\. )?{re.escape(effect.name)}\..*", one.name)
+               for one in study.uncertain)
 
 
-def _rivals(effects: Sequence[IdentifiedEffect]) -> list[IdentifiedEffect]:
-    """Return all rivals of some effects that are none of these.
+def _rivals(
+    effects: Sequence[IdentifiedEffect], suspected: Sequence[IdentifiedEffect] = ()
+) -> list[IdentifiedEffect]:
+    """Return all rivals of some effects, and what is suspected, that are none of these.
 
     An effect whose place is fitted is one rival, at its likeliest place, and none of itself.
     """
     found = {effect.hypothesis: effect for effect in effects}
-    placed = {effect.hypothesis.effect for effect in effects if effect.hypothesis.effect.refinements}
-    for rival in (each for effect in effects for each in effect.rivals):
+    placed = {one.effect for one in found if one.effect.refinements}
+    for rival in (*(each for effect in effects for each in effect.rivals), *suspected):
         own = rival.hypothesis.effect
         if own not in placed:
             found.setdefault(rival.hypothesis, rival)
@@ -80,21 +87,15 @@ def _rivals(effects: Sequence[IdentifiedEffect]) -> list[IdentifiedEffect]:
     return list(found.values())[len(effects):]
 
 
-def _applied(study: Study, effects: Sequence[IdentifiedEffect]) -> Study:
-    """Return a study with effects at their amplitudes."""
-    for effect in effects:
-        study = effect.hypothesis.apply(study, effect.values.tolist())
-    return study
-
-
 def _is_neutral(study: Study, nothing: IdentifiedEffect) -> bool:
-    """Tell whether an effect with amplitudes of 0 changes nothing but the shape of a study, to which
-    it may add an exception of a block.
+    """Tell whether an effect with amplitudes of 0 changes nothing but the shape of a study.
+
+    It may add an exception of a block.
     """
     if _switches(nothing):
         return False
     try:
-        return not number_changes(study, _applied(study, [nothing]))
+        return not number_changes(study, apply_effects(study, [nothing]))
     except (StudyError, ValidationError):
         return False
     except ValueError:  # the shape
@@ -142,7 +143,7 @@ def _change(
     for sign in (1, 0, -1):
         values = effect.values + sign * step * np.eye(len(effect.values))[which]
         try:
-            sides.append((sign, _applied(study, [
+            sides.append((sign, apply_effects(study, [
                 *effects[:number], replace(effect, values=values), *effects[number + 1:]])))
         except (StudyError, ValidationError):  # beyond the limit of a key
             continue

@@ -21,7 +21,7 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
-from halbach_fe.diagnosis.uncertain_effects import exact_rivals
+from halbach_fe.diagnosis.uncertain_effects import is_uncertain
 from halbach_fe.geometry.equal_blocks import own_turns
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import TRAINING
@@ -110,6 +110,10 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.unknown is not None:
         return unknown_advice(diagnosis.unknown), again
     suspicions = " ".join(map(more_readings, diagnosis.suspected))
+    if any(is_uncertain(diagnosis.study, one)
+           for each in diagnosis.suspected for one in each.fitted):
+        suspicions += (f" Until then {STUDY_FILE} has its amplitude as uncertain about 0: an "
+                       "update with that study is right whether it is there or not.")
     if suspicions and not diagnosis.identified:
         return suspicions, again
     if _fails(diagnosis):
@@ -143,13 +147,13 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
 def _beside(diagnosis: Diagnosis) -> str:
     """Say which of the causes that explain the map equally well the diagnosed study has, too."""
     titles = catalogue_titles(diagnosis)
-    every = {one.hypothesis.effect.name for effect in diagnosis.identified for one in effect.rivals}
-    exact = {one.hypothesis.effect.name for effect in diagnosis.identified
-             for one in exact_rivals(diagnosis.study, effect)}
-    sentence = (", and beside it the others with uncertain amplitudes about 0, so that an update "
-                "is right whichever it is") if every > exact else ""
-    return sentence + (f"; without {in_a_row([title_of(name, titles) for name in sorted(exact)])}, "
-                       "which is there or not" if exact else "")
+    others = [one for effect in diagnosis.identified for one in effect.rivals]
+    exact = dict.fromkeys(title_of(one.hypothesis.effect.name, titles) for one in others
+                          if not is_uncertain(diagnosis.study, one))
+    inside = any(is_uncertain(diagnosis.study, one) for one in others)
+    return (", and beside it the others with uncertain amplitudes about 0, so that an update is "
+            "right whichever it is" if inside else "") + (
+        f"; without {joined_by_or(list(exact))}" if exact else "")
 
 
 def _remedies(diagnosis: Diagnosis) -> list[str]:
