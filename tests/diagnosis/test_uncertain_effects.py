@@ -117,8 +117,9 @@ def test_the_update_after_a_diagnosis_is_no_surer_than_it_may_be(
     assert abs(tilt.values[0] + result.amplitudes.change[0] - TILT_RAD) < 3.5 * sd
 
 
-def test_what_the_map_does_not_tell_apart_is_estimated_together(session, tmp_path, generator):
+def test_what_the_map_does_not_tell_apart_is_estimated_together(session, tmp_path):
     """Blocks with another inner radius, or farther out: whichever is the first name."""
+    generator = np.random.default_rng(1)  # other noise tells them apart
     study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | SHORT})
     polarizations = drawn(study, generator)
     wider = study.with_(array__inner_radius_m=study.array.inner_radius_m + 6e-4)
@@ -167,9 +168,8 @@ def test_only_what_changes_nothing_is_put_beside_a_named_effect():
     assert names == {
         "ring_gap r01.gap_m": 2e-4, "ring_gap r01.shift_m": 1e-4,  # 0 in its likeliest part
         "ring_gap r02.gap_m": 2e-4, "ring_gap r02.shift_m": 1e-4, "gain_z.gain": 0.015}  # wide
-    nominal = build_magnet(study).blocks
-    apart = [block.z_min - own.z_min for block, own in zip(
-        build_magnet(with_uncertain_effects(study, [gap])).blocks, nominal, strict=True)]
+    moved = with_uncertain_effects(study, [gap]).array.exceptions
+    apart = [sum(one.shift_m[2] for one in moved if one.ring == ring) for ring in (1, 2, 3)]
     assert np.ptp(apart) == pytest.approx(2e-4)  # the named gap alone
 
 
@@ -301,3 +301,23 @@ def test_changes_of_numbers():
     assert changes == pytest.approx({"array.remanence_T": 0.05, "instrument.gain[2]": 0.01})
     with pytest.raises(ValueError, match="rings differs"):
         number_changes(study, study.with_(array__rings=2, array__exceptions=()))
+
+
+def test_blocks_of_a_neighbour_deviate_too(session, generator, monkeypatch):
+    """Its field is known as well as its blocks are. Control: blocks without tolerance."""
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | SHORT,
+                                    "external": {"neighbours": [{"z_m": 0.27}]}})
+    polarizations = drawn(study, generator)
+    true = field(study, polarizations, POINTS) + field(
+        study, drawn(study, generator), POINTS - [0.0, 0.0, 0.27])
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    least = 4 * np.sqrt(2 / polarizations.size)
+    chi2, result = update(study, shown, polarizations, session.within("update"))
+    assert abs(chi2 - 1) < least
+    assert result.prior_conflict < result.conflict_limit
+    assert result.posterior.mean.size == polarizations.size  # they are no parameters of the magnet
+    monkeypatch.setattr("halbach_fe.inference.infer.neighbour_columns",
+                        lambda magnet, maps, readings: np.zeros((len(readings.values), 0)))
+    chi2, result = update(study, shown, polarizations, session.within("exact"))
+    assert chi2 > 10
+    assert result.prior_conflict > result.conflict_limit
