@@ -20,7 +20,6 @@ from halbach_fe.inference.instrument_fit import (
     OpenTerms,
     amplitude_columns,
     joined,
-    neighbour_columns,
     of_the_first,
     readings_of_field,
 )
@@ -182,11 +181,6 @@ def infer(
                 readings))
             whole_prior = joined(whole_prior, np.zeros(len(of_instruments)),
                                  np.ones(len(of_instruments)))
-        if magnet.external.neighbours:
-            of_neighbours = neighbour_columns(magnet, maps, readings)
-            matrix = Beside(matrix, of_neighbours)
-            none = np.zeros(of_neighbours.shape[1])
-            whole_prior = joined(whole_prior, none, none + 1)
         if at is not None:
             matrix = Beside(matrix, open_terms.columns(at.field, maps, readings))
             whole_prior = joined(whole_prior, -total, open_terms.sd)
@@ -201,7 +195,7 @@ def infer(
             np.flatnonzero(training))
         whole = update.distribution
         values, _, change = np.split(
-            whole.mean, [len(model.parameters), len(whole.mean) - len(open_terms)])
+            whole.mean, np.cumsum([len(model.parameters), len(of_instruments)]))
         sd = whole.sd_of(np.hstack([np.zeros((len(change), len(whole.mean) - len(change))),
                                     open_terms.counted]))
         if at is not None:
@@ -242,7 +236,7 @@ def infer(
             f"{update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
     posterior = whole
-    if len(whole.mean) > len(model.parameters):
+    if len(open_terms) or of_instruments:
         magnet_prior, posterior = of_the_first([whole_prior, whole], len(model.parameters))
     if magnet.is_nonlinear and not linearized_only:
         _check_linearization(magnet, readings.observation, session, model, posterior.mean,

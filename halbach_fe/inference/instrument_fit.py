@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.readings import Readings
 from halbach_fe.measurement.campaign import ONLY_MAP, Map, with_pivots
 from halbach_fe.measurement.field_map import is_total_field, points_of, refuse_total_field
@@ -43,7 +42,6 @@ from halbach_fe.measurement.instrument_terms import (
     with_terms,
 )
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.deviation_field import neighbour_deviations
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.linear_gaussian import Rows
 from halbach_fe.study.model import Study
@@ -241,32 +239,6 @@ def amplitude_columns(
         found.append(np.array([(off(more) - off(less)) / (2 * AMPLITUDE_STEP)
                                for more, less in sides]).reshape(-1, len(points), 3))
     return readings.observation.read(np.concatenate(found, axis=1)).T
-
-
-def neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
-    """Return what deviations of the blocks of neighbouring magnets change of the readings, as
-    columns (readings, k) in T per standard deviation.
-
-    Combinations that change less than a `SEEN_OF_NEIGHBOURS`th of what the largest one does are
-    left out: of hundreds of blocks far away some dozens remain.
-    """
-    found = []
-    for one in maps:
-        instrument = one.study.instrument
-        sensors = sensor_positions(instrument, points_of(in_si_and_magnet_axes(
-            instrument, one.data)))
-        changes = neighbour_deviations(magnet, sensors.reshape(-1, 3))
-        found.append(np.einsum("ij,nijk->kni", sensor_matrix(instrument),
-                               changes.reshape(*sensors.shape, -1)))
-    left, size, _ = np.linalg.svd(
-        readings.observation.read(np.concatenate(found, axis=1)).T, full_matrices=False)
-    kept = size > SEEN_OF_NEIGHBOURS * size.max(initial=0.0)
-    return np.asarray(left[:, kept] * size[kept])
-
-
-SEEN_OF_NEIGHBOURS = 1e-4
-"""Relative size of what `neighbour_columns` leaves out: deviations are a hundredth of a neighbour's
-field, of which this is a part per million."""
 
 
 def readings_of_field(

@@ -40,6 +40,9 @@ the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the error
 is built with care."""
 
 
+OTHER_SOURCES = ("background", "ferromagnetic_object")
+"""Effects by which a neighbouring magnet's field can be corrected."""
+
 REMEDIES = {
     "block_flipped": "the block of {} is the wrong way round or wrongly magnetized: turn it, or "
                      "replace it by one that is not",
@@ -288,6 +291,12 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "The magnet is the same from several sides, so that the readings may be displaced by "
             f"{joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
             "first is used here.")
+    names = [effect.hypothesis.effect.name for effect in diagnosis.identified]
+    sources = [title_of(name, titles) for name in names if name in OTHER_SOURCES]
+    if "neighbour_magnet" in names and sources:
+        sentences.append(
+            f"{in_a_row(sources).capitalize()} may be what the blocks of the neighbouring magnet "
+            "deviate from nominal, which its model does not have.")
     unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                for effect in diagnosis.identified
                if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]

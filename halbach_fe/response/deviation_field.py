@@ -7,7 +7,7 @@ answer where that is asked for: use the field for error bars and small correctio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,11 +15,10 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock, vector
-from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.block_variation import Variations
 from halbach_fe.response.uncertain_amplitudes import shared_deviations, vacuum_changes
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
-from halbach_fe.stats.gaussian import nominal_prior, root_matrix
 from halbach_fe.study.materials import MU_0
 
 Field = Callable[[Floats], Floats]
@@ -92,7 +91,11 @@ class Deviations:
 
         Its rows are Bx, By and Bz of the first point, then those of the second.
         """
-        matrix = _columns(self.magnet.blocks, self.magnet.dimension, points)
+        size = self.magnet.dimension
+        found = [unit[:, :, :size] @ (MU_0 * block.recoil_tensor[:size, :size])
+                 for block, unit in zip(self.magnet.blocks, unit_fields(
+                     self.magnet.blocks, points), strict=True)]
+        matrix = np.concatenate(found, axis=2).reshape(3 * len(points), -1)
         columns = [matrix]
         if self.variations is not None:
             columns.append(self.variations.fields(points).reshape(3 * len(points), -1))
@@ -100,31 +103,6 @@ class Deviations:
             changes = vacuum_changes(self.magnet, points).reshape(-1, 3 * len(points))
             columns.append(changes.T - matrix @ shared_deviations(self.magnet))
         return np.hstack(columns)
-
-
-def _columns(blocks: Sequence[MagnetBlock], size: int, points: Floats) -> Floats:
-    """Return the matrix (3 n, size * blocks) from magnetizations in A/m to B in T at points (n, 3)
-    in m, in vacuum.
-    """
-    found = [unit[:, :, :size] @ (MU_0 * block.recoil_tensor[:size, :size])
-             for block, unit in zip(blocks, unit_fields(blocks, points), strict=True)]
-    return np.concatenate(found, axis=2).reshape(3 * len(points), -1)
-
-
-def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
-    """Return the changes (3 n, k) of B at points (n, 3) in m by deviations of the blocks of
-    neighbouring magnets, in T per standard deviation.
-
-    The blocks have the tolerances of the study's prior, and nobody has measured them.
-    """
-    prior, found = magnet.study.prior, []
-    for neighbour in magnet.external.neighbours:
-        blocks = neighbour_blocks(magnet.blocks, (neighbour,))
-        found.append(_columns(blocks, magnet.dimension, points) @ root_matrix(nominal_prior(
-            np.concatenate([block.magnetization[:magnet.dimension] for block in blocks]),
-            magnet.dimension, prior.magnitude_sd, prior.direction_sd_deg,
-            prior.common_mode_sd).root))
-    return np.hstack(found)
 
 
 def with_magnetizations(magnet: Magnet, values: Floats) -> tuple[MagnetBlock, ...]:

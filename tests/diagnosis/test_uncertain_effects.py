@@ -301,23 +301,3 @@ def test_changes_of_numbers():
     assert changes == pytest.approx({"array.remanence_T": 0.05, "instrument.gain[2]": 0.01})
     with pytest.raises(ValueError, match="rings differs"):
         number_changes(study, study.with_(array__rings=2, array__exceptions=()))
-
-
-def test_blocks_of_a_neighbour_deviate_too(session, generator, monkeypatch):
-    """Its field is known as well as its blocks are. Control: blocks without tolerance."""
-    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | SHORT,
-                                    "external": {"neighbours": [{"z_m": 0.27}]}})
-    polarizations = drawn(study, generator)
-    true = field(study, polarizations, POINTS) + field(
-        study, drawn(study, generator), POINTS - [0.0, 0.0, 0.27])
-    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
-    least = 4 * np.sqrt(2 / polarizations.size)
-    chi2, result = update(study, shown, polarizations, session.within("update"))
-    assert abs(chi2 - 1) < least
-    assert result.prior_conflict < result.conflict_limit
-    assert result.posterior.mean.size == polarizations.size  # they are no parameters of the magnet
-    monkeypatch.setattr("halbach_fe.inference.infer.neighbour_columns",
-                        lambda magnet, maps, readings: np.zeros((len(readings.values), 0)))
-    chi2, result = update(study, shown, polarizations, session.within("exact"))
-    assert chi2 > 10
-    assert result.prior_conflict > result.conflict_limit
