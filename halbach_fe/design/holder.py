@@ -352,7 +352,7 @@ def _plate(
         raise CannotBeMadeError(
             f"no wall between blocks {group[first].name} and {group[second].name}, which touch or "
             "lie one above the other", "Leave gaps between the blocks.", whatever=True)
-    wall = _checked_walls(openings, holder, frame)
+    wall = _thinnest_wall(openings, holder, frame)
     _check_iron(low, low + thickness, frame, iron)
     if frame.inner:
         openings.append(("bore", through(Prism(circle(frame.inner), 0.0, 0.0))))
@@ -362,7 +362,7 @@ def _plate(
                  frame.inner, frame.outer)
 
 
-def _checked_walls(
+def _thinnest_wall(
     openings: Sequence[tuple[str, Prism]], holder: Holder, frame: _Frame
 ) -> float:
     """Return the thinnest wall in m; raise CannotBeMadeError if it is too thin."""

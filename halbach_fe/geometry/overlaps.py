@@ -53,7 +53,7 @@ def overlapping_blocks(
     ValueError
         If an infinite block is tilted.
     """
-    return _first_overlap(_of_blocks(blocks), None, tolerance) if blocks else None
+    return _first_overlap(_block_bodies(blocks), None, tolerance) if blocks else None
 
 
 def block_in_others(
@@ -62,7 +62,7 @@ def block_in_others(
     """Return the first of some blocks that overlaps one of others, as `block_in_iron` does."""
     if not (blocks and others):
         return None
-    return _first_overlap(_of_blocks(blocks), _of_blocks(others), tolerance)
+    return _first_overlap(_block_bodies(blocks), _block_bodies(others), tolerance)
 
 
 def block_in_iron(
@@ -94,7 +94,7 @@ def block_in_iron(
     bodies = _Bodies(shapes, np.arange(len(iron)),
                      np.array([[body.z_min, body.z_max] for body in iron]),
                      np.broadcast_to(np.eye(3), (len(iron), 3, 3)), np.zeros((len(iron), 3)))
-    return _first_overlap(_of_blocks(blocks), bodies, tolerance)
+    return _first_overlap(_block_bodies(blocks), bodies, tolerance)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class _Bodies:
         return found
 
 
-def _of_blocks(blocks: Sequence[MagnetBlock]) -> _Bodies:
+def _block_bodies(blocks: Sequence[MagnetBlock]) -> _Bodies:
     """Return the bodies of blocks.
 
     Poses are those of `MagnetBlock.axes` and `MagnetBlock.position`. They are computed for all
@@ -360,7 +360,7 @@ def _depth(first: _Pieces, i: Ints, second: _Pieces, j: Ints, allowed: Floats) -
     """
     mine, others = first.bodies, second.bodies
     depth = np.zeros(len(i))
-    start, counts = _within_reach(mine, i, others, j, second.count[others.shape[j]])
+    start, counts = _reachable_pieces(mine, i, others, j, second.count[others.shape[j]])
     total = first.count[mine.shape[i]] * counts
     pair = np.repeat(np.arange(len(i)), total)
     local = np.arange(len(pair)) - np.repeat(np.cumsum(total) - total, total)
@@ -391,7 +391,7 @@ def _depth(first: _Pieces, i: Ints, second: _Pieces, j: Ints, allowed: Floats) -
     return depth
 
 
-def _within_reach(first: _Bodies, i: Ints, second: _Bodies, j: Ints,
+def _reachable_pieces(first: _Bodies, i: Ints, second: _Bodies, j: Ints,
                   count: Ints) -> tuple[Ints, Ints]:
     """Return the first piece, and how many, of second bodies that first bodies can touch, (m,).
 

@@ -114,7 +114,7 @@ def nonlinear_model(
                          "non-linear model; instead it is missing. Use the response matrix.")
     observation = replace(observation, points=check_points(magnet, observation.points))
     route = choose_route(magnet, observation.points).meshed
-    base = _with_vacuum_for_iron(magnet, route)
+    base = _replace_iron_by_vacuum(magnet, route)
     linear = response_matrix(base, observation, replace(session, folder=session.folder / "linear"))
     condensed = condense_to_iron(magnet, observation, session, linear)
     error = _error(magnet, observation, session)
@@ -129,11 +129,11 @@ def nonlinear_model(
     agreement = compare_with_newton(model, magnet, observation, session, samples)
     model = replace(model, agreement_T=agreement)
     if choose_route(magnet, observation.points) is Route.MOMENTS:
-        return _corrected(model, magnet, observation, session)
+        return _correct_nominal(model, magnet, observation, session)
     return model
 
 
-def _corrected(
+def _correct_nominal(
     model: NonlinearModel, magnet: Magnet, observation: Observation, session: Session
 ) -> NonlinearModel:
     """Return the model with the nominal readings of the route ``moments``.
@@ -164,7 +164,7 @@ def condense_to_iron(
     assert curve is not None  # the caller has checked it
     route = choose_route(magnet, observation.points).meshed
     formulation = route.formulation(magnet)
-    assembly = assemble(_with_vacuum_for_iron(magnet, route), session, formulation)
+    assembly = assemble(_replace_iron_by_vacuum(magnet, route), session, formulation)
     mesh, unknowns, size = assembly.mesh, assembly.unknowns, magnet.dimension
     gauss, weights = quadrature(mesh, np.flatnonzero(mesh.in_iron))
     gradient = sparse.csr_array(
@@ -242,7 +242,7 @@ def compare_with_newton(
     return difference
 
 
-def _with_vacuum_for_iron(magnet: Magnet, route: Route) -> Magnet:
+def _replace_iron_by_vacuum(magnet: Magnet, route: Route) -> Magnet:
     """Return the magnet with vacuum in place of the iron, on the same mesh.
 
     Symmetry is switched off, so that every block is solved by itself.

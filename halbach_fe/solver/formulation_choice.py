@@ -249,10 +249,10 @@ def finite_element_part(
                              lambda number, some: np.zeros((len(points[some]), 3, size)))
     route = choose_route(magnet, points)
     if route is Route.MOMENTS:
-        return _by_moments(magnet, points, session, columns, estimate)
+        return _moments_part(magnet, points, session, columns, estimate)
     if not columns:
         nominal = _solve_nominal(magnet, points, session, route)
-        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved)
+        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column)
     placed = uses_symmetry(magnet)
     symmetry = symmetry_of(magnet) if placed else no_symmetry(magnet)
     places, index = symmetry.source_points(points)
@@ -277,7 +277,7 @@ def finite_element_part(
                          magnet.blocks, block)
 
 
-def _by_moments(
+def _moments_part(
     magnet: Magnet, points: Floats, session: Session, columns: bool, estimate: bool
 ) -> ElementFields:
     """Return the reaction of separate blocks and rotationally symmetric iron.
@@ -291,15 +291,15 @@ def _by_moments(
             magnet.with_(solver__route=route), points[chosen], session.within(route), columns,
             estimate))
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
-        return _joined(magnet, points, parts)
+        return _join_parts(magnet, points, parts)
     if session.counter is not None:
         zero = np.zeros((len(points), 3))
-        return ElementFields(np.nan, zero, zero, magnet.blocks, _not_solved, zero)
+        return ElementFields(np.nan, zero, zero, magnet.blocks, _refuse_column, zero)
     solved = solve_separate(magnet, session, estimate)
     nominal, error = solved.field_with_errors(points) if estimate else (
         solved.field(points), None)
     if not columns:
-        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved, error)
+        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column, error)
     block = separate_columns(magnet, points, solved.iron, session.progress)
     along = nominal
     if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
@@ -312,7 +312,7 @@ def _by_moments(
                          for_deviations=True)
 
 
-def _joined(
+def _join_parts(
     magnet: Magnet, points: Floats, parts: Sequence[tuple[Ints, ElementFields]]
 ) -> ElementFields:
     """Return the fields at all points (n, 3) from those that several routes have at some.
@@ -360,7 +360,7 @@ def uses_symmetry(magnet: Magnet) -> bool:
     return magnet.study.solver.symmetry and magnet.dimension == 3 and not magnet.is_nonlinear
 
 
-def _not_solved(number: int, some: Ints | slice) -> Floats:
+def _refuse_column(number: int, some: Ints | slice) -> Floats:
     """Take the place of `ElementFields.block` if only the nominal array was solved for."""
     raise AssertionError(f"block {number} was not solved for")
 

@@ -127,19 +127,19 @@ def grid_lines(bodies: Sequence[IronRectangle], resolution: Resolution) -> tuple
                    for body in bodies)
     size, most = resolution.edge * thinnest, resolution.largest * outer
     far = resolution.boundary * extent
-    r = _distinct(radius for body in bodies
+    r = _distinct_values(radius for body in bodies
                   for radius in (body.inner_radius_m, body.outer_radius_m))
-    z = _distinct(end for body in bodies for end in (body.z_min_m, body.z_max_m))
+    z = _distinct_values(end for body in bodies for end in (body.z_min_m, body.z_max_m))
     growth = resolution.growth
-    radii = [] if r[0] < SAME else [0.0, *(r[0] - _growing(r[0], size, growth, most))[::-1][1:]]
+    radii = [] if r[0] < SAME else [0.0, *(r[0] - _spaced(r[0], size, growth, most))[::-1][1:]]
     middle = [line for low, high in pairwise(r)
-              for line in low + _between(high - low, size, growth, most)]
+              for line in low + _refined_at_ends(high - low, size, growth, most)]
     radii = [*radii, *([0.0] if r[0] < SAME else [r[0]]), *middle,
-             *r[-1] + _outward(far - r[-1], size, growth, most, extent / 2)]
-    heights = [*(z[0] - _outward(far + z[0], size, growth, most, extent / 2))[::-1], z[0],
+             *r[-1] + _spaced_outward(far - r[-1], size, growth, most, extent / 2)]
+    heights = [*(z[0] - _spaced_outward(far + z[0], size, growth, most, extent / 2))[::-1], z[0],
                *(line for low, high in pairwise(z)
-                 for line in low + _between(high - low, size, growth, most)),
-               *z[-1] + _outward(far - z[-1], size, growth, most, extent / 2)]
+                 for line in low + _refined_at_ends(high - low, size, growth, most)),
+               *z[-1] + _spaced_outward(far - z[-1], size, growth, most, extent / 2)]
     return np.array(radii), np.array(heights)
 
 
@@ -152,13 +152,13 @@ def iron_cells(bodies: Sequence[IronRectangle], r: Floats, z: Floats) -> NDArray
     return result
 
 
-def _distinct(values: Iterable[float]) -> list[float]:
+def _distinct_values(values: Iterable[float]) -> list[float]:
     """Return values in ascending order, without those that repeat the one before."""
     ordered = sorted(values)
     return ordered[:1] + [b for a, b in pairwise(ordered) if b - a > SAME]
 
 
-def _growing(length: float, size: float, growth: float, most: float) -> Floats:
+def _spaced(length: float, size: float, growth: float, most: float) -> Floats:
     """Return positions up to ``length`` with distances that grow from ``size`` up to ``most``.
 
     All distances are then scaled to end at ``length``.
@@ -170,13 +170,13 @@ def _growing(length: float, size: float, growth: float, most: float) -> Floats:
     return np.asarray(positions * (length / positions[-1]))
 
 
-def _between(length: float, size: float, growth: float, most: float) -> Floats:
+def _refined_at_ends(length: float, size: float, growth: float, most: float) -> Floats:
     """Return positions up to ``length`` with distances that grow from both ends to the middle."""
-    half = _growing(length / 2, size, growth, most)
+    half = _spaced(length / 2, size, growth, most)
     return np.concatenate([half, length - half[-2::-1], [length]])
 
 
-def _outward(length: float, size: float, growth: float, most: float, near: float) -> Floats:
+def _spaced_outward(length: float, size: float, growth: float, most: float, near: float) -> Floats:
     """Return positions up to ``length``; the distances are limited up to the distance ``near``."""
     steps = [size]
     while (position := sum(steps)) < length:

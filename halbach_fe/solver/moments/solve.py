@@ -308,13 +308,13 @@ def reaction_columns(
         step = max(1, AT_ONCE // (9 * len(system.remanence)))
         for first in range(0, len(points), step):
             part = slice(first, first + step)
-            found[:, part] = _some(
+            found[:, part] = _columns_at(
                 system, np.array(points[part], float), deviations, panels,
-                partial(_advance, progress, first, len(points)))
+                partial(_report_progress, progress, first, len(points)))
     return lambda number, some: found[number, some]
 
 
-def _advance(progress: Progress | None, before: int, total: int, done: int) -> None:
+def _report_progress(progress: Progress | None, before: int, total: int, done: int) -> None:
     """Report that points are done after others."""
     if progress is not None:
         progress(before + done, total)
@@ -402,7 +402,7 @@ class _Panels:
             to[:, 3 * first:3 * last] += short @ panel
 
 
-def _some(
+def _columns_at(
     system: System, points: Floats, deviations: _Deviations, panels: _Panels,
     done: Callable[[int], object],
 ) -> Floats:
