@@ -30,10 +30,6 @@ from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, iron_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
-CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
-"""Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
-blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm."""
-
 SQUEEZED = 0.1
 """The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
 makes neighbours overlap a little; a larger overlap cannot be a tolerance of the assembly."""
@@ -404,7 +400,10 @@ def _check_overlaps(
     ------
     StudyError
     """
-    contact = CONTACT_IN_TABLES if array.free_blocks else CONTACT
+    # overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
+    # blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm.
+    rounding_overlap, table_overlap = 1e-6, 2e-4
+    contact = table_overlap if array.free_blocks else rounding_overlap
     cases = [(nominal_blocks(array, dimension), contact, "")]
     blocks = blocks_of_array(array, dimension)
     if dimension == 2:  # where a small tilt turns magnetizations, and moves nothing in the plane

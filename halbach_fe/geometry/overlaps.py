@@ -23,13 +23,13 @@ from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import Outline
 
-TOLERANCE = 1e-6
+ALLOWED_PENETRATION = 1e-6
 """Allowed penetration, as a fraction of the smaller body's size. Positions with nine significant
 digits, and the rounding of rotations (1e-15), stay below it."""
 
 
 def overlapping_blocks(
-    blocks: Sequence[MagnetBlock], tolerance: float = TOLERANCE
+    blocks: Sequence[MagnetBlock], tolerance: float = ALLOWED_PENETRATION
 ) -> tuple[int, int, float] | None:
     """Return the first two blocks, by number, that overlap.
 
@@ -57,7 +57,8 @@ def overlapping_blocks(
 
 
 def block_in_others(
-    blocks: Sequence[MagnetBlock], others: Sequence[MagnetBlock], tolerance: float = TOLERANCE
+    blocks: Sequence[MagnetBlock], others: Sequence[MagnetBlock],
+    tolerance: float = ALLOWED_PENETRATION,
 ) -> tuple[int, int, float] | None:
     """Return the first of some blocks that overlaps one of others, as `block_in_iron` does."""
     if not (blocks and others):
@@ -66,7 +67,7 @@ def block_in_others(
 
 
 def block_in_iron(
-    blocks: Sequence[MagnetBlock], iron: Sequence[IronSolid], tolerance: float = TOLERANCE
+    blocks: Sequence[MagnetBlock], iron: Sequence[IronSolid], tolerance: float = ALLOWED_PENETRATION
 ) -> tuple[int, int, float] | None:
     """Return the first block, by number, that overlaps a body of iron.
 

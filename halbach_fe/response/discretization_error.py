@@ -165,9 +165,6 @@ def _changes_of_modes(
     return series * (coarser - nominal), BOUNDARY_SERIES * (distant - nominal)
 
 
-HARMONICS = 8
-"""Number of harmonics that are compared if the study does not state a number."""
-
 EXACT = "exact field"
 OWN, COARSEST, COARSER, FINER, FARTHER = (
     "the study's mesh", "a much coarser mesh", "a coarser mesh", "a finer mesh",
@@ -387,8 +384,10 @@ class _Comparison:
         self.scale = float(np.linalg.norm(field, axis=1).max())
         self._circles = None
         positions = magnet.study.observation.positions
+        # number of harmonics that are compared if the study does not state a number
+        default_harmonics = 8
         if positions.kind == "circles" and positions.angles > 2:
-            harmonics = getattr(magnet.study.observation, "harmonics", HARMONICS)
+            harmonics = getattr(magnet.study.observation, "harmonics", default_harmonics)
             self._circles, *_ = fourier_analysis(points, FourierCoefficients(
                 quantity="fourier_coefficients", positions=positions,
                 harmonics=min(harmonics, (positions.angles - 1) // 2)))

@@ -38,7 +38,7 @@ from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
 from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
 from halbach_fe.study.materials import Curve
 
-SAME = 1e-9
+ONE_LINE_M = 1e-9
 """Grid lines that are closer than this, in m, are one."""
 
 
@@ -110,8 +110,9 @@ def check_bodies(bodies: Sequence[IronRectangle]) -> None:
             raise StudyError(must_be("Iron", "the magnet", "a rectangle of the (r, z) half-plane",
                                      f"{body}", "Correct its radii and ends."))
     for a, b in combinations(bodies, 2):
-        if (min(a.outer_radius_m, b.outer_radius_m) - max(a.inner_radius_m, b.inner_radius_m) > SAME
-                and min(a.z_max_m, b.z_max_m) - max(a.z_min_m, b.z_min_m) > SAME):
+        across = min(a.outer_radius_m, b.outer_radius_m) - max(a.inner_radius_m, b.inner_radius_m)
+        along = min(a.z_max_m, b.z_max_m) - max(a.z_min_m, b.z_min_m)
+        if min(across, along) > ONE_LINE_M:
             raise StudyError(must_be("Iron", "the magnet", "bodies that do not overlap",
                                      f"{a} and {b}", "Split them into separate rectangles."))
 
@@ -131,10 +132,11 @@ def grid_lines(bodies: Sequence[IronRectangle], resolution: Resolution) -> tuple
                   for radius in (body.inner_radius_m, body.outer_radius_m))
     z = _distinct_values(end for body in bodies for end in (body.z_min_m, body.z_max_m))
     growth = resolution.growth
-    radii = [] if r[0] < SAME else [0.0, *(r[0] - _spaced(r[0], size, growth, most))[::-1][1:]]
+    is_disc = r[0] < ONE_LINE_M
+    radii = [] if is_disc else [0.0, *(r[0] - _spaced(r[0], size, growth, most))[::-1][1:]]
     middle = [line for low, high in pairwise(r)
               for line in low + _refined_at_ends(high - low, size, growth, most)]
-    radii = [*radii, *([0.0] if r[0] < SAME else [r[0]]), *middle,
+    radii = [*radii, 0.0 if is_disc else r[0], *middle,
              *r[-1] + _spaced_outward(far - r[-1], size, growth, most, extent / 2)]
     heights = [*(z[0] - _spaced_outward(far + z[0], size, growth, most, extent / 2))[::-1], z[0],
                *(line for low, high in pairwise(z)
@@ -155,7 +157,7 @@ def iron_cells(bodies: Sequence[IronRectangle], r: Floats, z: Floats) -> NDArray
 def _distinct_values(values: Iterable[float]) -> list[float]:
     """Return values in ascending order, without those that repeat the one before."""
     ordered = sorted(values)
-    return ordered[:1] + [b for a, b in pairwise(ordered) if b - a > SAME]
+    return ordered[:1] + [b for a, b in pairwise(ordered) if b - a > ONE_LINE_M]
 
 
 def _spaced(length: float, size: float, growth: float, most: float) -> Floats:
