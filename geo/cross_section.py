@@ -113,10 +113,10 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     drawn = magnet.with_study(magnet.study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m * coarser,
         "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})}))
-    triangles, rim = _counted(drawn, blocks[:DRAWN], radius)
+    triangles, rim = _count_triangles(drawn, blocks[:DRAWN], radius)
     excess = triangles - _equilateral(drawn, radius)
     if len(blocks) > DRAWN:  # every further block adds the same number of triangles
-        fewer, _ = _counted(drawn, blocks[:DRAWN // 2], radius)
+        fewer, _ = _count_triangles(drawn, blocks[:DRAWN // 2], radius)
         excess += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
     # exponent of the refinement with which the number of excess triangles grows. A mesh has more
     # triangles than area and element size imply, because every curve is cut into whole edges.
@@ -127,7 +127,9 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     return wanted + excess * coarser**excess_exponent, rim
 
 
-def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> tuple[int, int]:
+def _count_triangles(
+    magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float
+) -> tuple[int, int]:
     """Return the numbers of triangles and of outer edges of the plane mesh of these blocks."""
     line, triangle = 1, 2  # Gmsh's element types of straight edges and triangles
     with gmsh_session(magnet.name):

@@ -49,10 +49,6 @@ NEAR_ORDERS = (6, 9, 14, 21, 32)
 FAR_ORDERS = (1, 2, 3, 4, 5)
 """The same for the field of other blocks."""
 
-NEAR = 2.5
-"""Distance of the middles of two blocks, relative to the sum of the radii of the spheres around
-them, up to which they are near."""
-
 Field = Callable[[Floats], Floats]
 """Takes points (n, 3) in m and returns B (n, 3) in T."""
 
@@ -298,12 +294,15 @@ def _loads(
     reach = np.array([_reach(block) for block in blocks])
     tree = KDTree(middles[targets])
     near_field, far_field = (np.zeros((2, len(each.points), 3)) for each in (near, far))
+    # distance of the middles of two blocks, relative to the sum of the radii of the spheres around
+    # them, up to which they are near
+    near_ratio = 2.5
     for number, block in enumerate(blocks):
         around = np.array(tree.query_ball_point(
-            middles[number], NEAR * (reach[number] + reach[targets].max())), int)
+            middles[number], near_ratio * (reach[number] + reach[targets].max())), int)
         distance = np.linalg.norm(middles[targets[around]] - middles[number], axis=1)
         is_near = np.zeros(len(targets), bool)
-        is_near[around[distance <= NEAR * (reach[number] + reach[targets[around]])]] = True
+        is_near[around[distance <= near_ratio * (reach[number] + reach[targets[around]])]] = True
         later = rank[targets] > rank[number]
         for charges, field, chosen in ((near, near_field, is_near), (far, far_field, ~is_near)):
             here = np.flatnonzero((chosen & (targets != number))[charges.owner])

@@ -28,9 +28,6 @@ BARS = {"a": (0.25, 0.94, False), "b": (0.5, 0.72, True), "c": (0.5, 0.28, True)
         "g": (0.25, 0.5, False)}
 """Middle of each bar, relative to the height of a digit, and whether it is upright."""
 
-LENGTH, WIDTH, PITCH = 0.3, 0.12, 0.8
-"""Size of a bar, and distance of two digits, relative to their height."""
-
 
 def digits(
     text: str, height: float, radius: float, angle: float, bottom: float, top: float
@@ -48,11 +45,13 @@ def digits(
     """
     out = np.array([np.cos(angle), np.sin(angle)])
     axes = np.column_stack([[out[1], -out[0]], out])
-    lying = rectangle(LENGTH * height, WIDTH * height)
-    standing = rectangle(WIDTH * height, LENGTH * height)
+    # size of a bar, and distance of two digits, relative to their height
+    length, width, pitch = 0.3, 0.12, 0.8
+    lying = rectangle(length * height, width * height)
+    standing = rectangle(width * height, length * height)
     found = []
     for place, digit in enumerate(text):
-        left = PITCH * (place - (len(text) - 1) / 2) - 0.25
+        left = pitch * (place - (len(text) - 1) / 2) - 0.25
         for x, y, upright in (BARS[bar] for bar in SEGMENTS[digit]):
             middle = radius * out + height * (axes @ [left + x, y - 0.5])
             found.append(Prism(standing if upright else lying, bottom, top, axes, middle))
@@ -352,7 +351,7 @@ def _plate(
         raise CannotBeMadeError(
             f"no wall between blocks {group[first].name} and {group[second].name}, which touch or "
             "lie one above the other", "Leave gaps between the blocks.", whatever=True)
-    wall = _checked_walls(openings, holder, frame)
+    wall = _thinnest_wall(openings, holder, frame)
     _check_iron(low, low + thickness, frame, iron)
     if frame.inner:
         openings.append(("bore", through(Prism(circle(frame.inner), 0.0, 0.0))))
@@ -362,7 +361,7 @@ def _plate(
                  frame.inner, frame.outer)
 
 
-def _checked_walls(
+def _thinnest_wall(
     openings: Sequence[tuple[str, Prism]], holder: Holder, frame: _Frame
 ) -> float:
     """Return the thinnest wall in m; raise CannotBeMadeError if it is too thin."""

@@ -152,31 +152,8 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
         If there are fewer candidates than positions to choose, a position is outside of the region
         where the field is computed, or the study does not observe flux densities.
     """
-    if magnet.study.observation.quantity != "flux_density":
-        raise StudyError(
-            f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
-            f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
-            "flux densities.")
     baseline = points_from(magnet.study.observation.positions)
-    sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
-    places: list[Floats] = [points_from(positions) for positions in sets]
-    candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
-    wanted = count or magnet.study.plan.points or len(baseline)
-    if wanted > len(candidates):
-        raise StudyError(
-            f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
-            f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
-            "fewer, or add `plan.candidates`.")
-    farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
-    if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
-        raise StudyError(must_be(
-            "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
-            "the magnet, where there is some field", f"one at {farthest:.4g} m",
-            "Are they in metres?"))
-    check_points(magnet, baseline)
-    check_points(magnet, candidates, "plan.candidates")
-    if magnet.study.homogeneity is not None:
-        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
+    candidates, wanted = _candidates(magnet, baseline, count)
     points = np.vstack([baseline, candidates])
     # the order in which they would be measured is not known yet
     steady = magnet.study.instrument.with_(lag_m=0.0)
@@ -215,6 +192,41 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
         magnet, model.parameters, candidates, candidates[chosen], baseline, choice.gain, counts,
         np.array([information(subset) for subset in subsets]), model.nominal, prior.sd,
         sd_after(chosen + len(baseline)), sd_after(spread(len(baseline), same)), deviation)
+
+
+def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:
+    """Return the candidate positions (n, 3) in m and the number of positions to choose.
+
+    Raises
+    ------
+    StudyError
+        See `plan_measurement`.
+    """
+    if magnet.study.observation.quantity != "flux_density":
+        raise StudyError(
+            f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
+            f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
+            "flux densities.")
+    sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
+    places: list[Floats] = [points_from(positions) for positions in sets]
+    candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
+    wanted = count or magnet.study.plan.points or len(baseline)
+    if wanted > len(candidates):
+        raise StudyError(
+            f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
+            f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
+            "fewer, or add `plan.candidates`.")
+    farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
+    if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
+        raise StudyError(must_be(
+            "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
+            "the magnet, where there is some field", f"one at {farthest:.4g} m",
+            "Are they in metres?"))
+    check_points(magnet, baseline)
+    check_points(magnet, candidates, "plan.candidates")
+    if magnet.study.homogeneity is not None:
+        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
+    return candidates, wanted
 
 
 def _values(magnet: Magnet, prior: Gaussian, session: Session) -> Deviations | None:

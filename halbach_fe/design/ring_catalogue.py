@@ -21,9 +21,6 @@ from halbach_fe.study.array import Array, Ring
 from halbach_fe.study.design import Design, DesignLayer
 from halbach_fe.study.model import Study
 
-ALIKE = 1e-7
-"""Difference of fields, relative to the largest, up to which two points are alike."""
-
 DECIMALS = 9
 """Decimals of lengths in m, so that a study shows what was meant."""
 
@@ -93,7 +90,9 @@ class Sample:
         direction = mean / np.linalg.norm(mean)
         along = field @ direction
         size = np.linalg.norm(field, axis=2)  # of each ring two numbers: one may agree by chance
-        alike = np.vstack([along / size.max(), size / size.max(), weights > 0]) / ALIKE
+        # difference of fields, relative to the largest, up to which two points are alike
+        alike_fields = 1e-7
+        alike = np.vstack([along / size.max(), size / size.max(), weights > 0]) / alike_fields
         _, first, group = np.unique(alike.round(), axis=1, return_index=True, return_inverse=True)
         summed: Floats = np.asarray(np.bincount(group.ravel(), weights), float)
         return cls(points[first], summed, weights[first] == 0, direction)

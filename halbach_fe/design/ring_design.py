@@ -44,9 +44,6 @@ from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.model import Study
 
-RESTARTS, STARTS = 300, 4
-"""Number of random changes from each of several first designs."""
-
 
 @dataclass(frozen=True)
 class RingDesign:
@@ -154,8 +151,9 @@ def design_rings(
     reaction = np.zeros_like(catalogue.sample.points)
     task = task_of(catalogue, reaction @ direction)
     places, options = task.table.shape[:2]
-    starts = np.linspace(0, options - 1, STARTS).round().astype(int)
-    found = min((search(task, np.full(places, start), RESTARTS, generator)
+    restarts, start_count = 300, 4  # number of random changes from each of several first designs
+    starts = np.linspace(0, options - 1, start_count).round().astype(int)
+    found = min((search(task, np.full(places, start), restarts, generator)
                  for start in dict.fromkeys(starts.tolist())), key=lambda one: one.ppm)
     if not any(ring for option in catalogue.rings(found.chosen) for ring in option):
         raise StudyError(must_be(
@@ -169,7 +167,7 @@ def design_rings(
         if not reaction.any():
             break
         task = task_of(catalogue, reaction @ direction)
-        found = search(task, chosen, RESTARTS, generator)
+        found = search(task, chosen, restarts, generator)
         if np.array_equal(chosen, found.chosen):
             break
     every = [found, *_front(task, found, generator)]

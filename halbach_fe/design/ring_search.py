@@ -204,7 +204,7 @@ def moved_radii(
         slopes = _slopes(catalogue, rings, places, radii) @ tie
         moves = tie @ _program(task, total, slopes, tie, np.maximum(low - radii, -size),
                                np.minimum(high - radii, size),
-                               _apart(catalogue, _with_radii(rings, places, radii), places))
+                               _gaps(catalogue, _with_radii(rings, places, radii), places))
         tried = _totals(catalogue, rings, places, radii + moves, reaction)
         now = float(task.value(tried))
         if now < value:
@@ -253,7 +253,7 @@ def _with_radii(
                        for layer, ring in enumerate(option)) for place, option in enumerate(rings))
 
 
-def _one_total(catalogue: Catalogue, ring: RingOfBlocks, place: int) -> Floats:
+def _ring_total(catalogue: Catalogue, ring: RingOfBlocks, place: int) -> Floats:
     """Return the field (n,) in T where it decides and its mean, of a ring and its image."""
     sample = catalogue.sample
     field, = fields_with_images(catalogue.study, ring, catalogue.z_m[place:place + 1],
@@ -269,7 +269,7 @@ def _totals(
     weights = catalogue.sample.weights
     moved = _with_radii(rings, places, radii)
     total = np.append(reaction[catalogue.decide], weights @ reaction) + np.sum([
-        _one_total(catalogue, _ring(moved, place, layer), place) for place, layer in places],
+        _ring_total(catalogue, _ring(moved, place, layer), place) for place, layer in places],
         axis=0)
     return np.append(total, catalogue.mass_of(moved))
 
@@ -284,13 +284,13 @@ def _slopes(
     step_m = 1e-5
     for (place, layer), radius in zip(places, radii.tolist(), strict=True):
         ring = _ring(rings, place, layer)
-        above, below = (_one_total(catalogue, replace(ring, radius_m=radius + step), place)
+        above, below = (_ring_total(catalogue, replace(ring, radius_m=radius + step), place)
                         for step in (step_m, -step_m))
         found.append((above - below) / (2 * step_m))
     return np.array(found).T
 
 
-def _apart(
+def _gaps(
     catalogue: Catalogue, rings: Sequence[Option], places: Sequence[tuple[int, int]]
 ) -> list[tuple[int, int, float]]:
     """Return pairs of neighbouring rings at one place, and by how much in m they may approach."""

@@ -47,9 +47,6 @@ from halbach_fe.study.shim_tray import ShimMagnet, ShimTray
 
 EMPTY = -1
 
-LATTICE = 9
-"""Points along each side of a magnet that must be outside of the region."""
-
 
 @dataclass(frozen=True)
 class Filled:
@@ -313,7 +310,9 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
             "the middle along z, where there is some field", f"{along.max():.4g} m",
             "Is it in metres?"))
     points, _ = region.points(12)
-    lattice = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, LATTICE)]), axis=-1).reshape(-1, 3)
+    # points along each side of a magnet that must be outside of the region
+    along_side = np.linspace(-0.5, 0.5, 9)
+    lattice = np.stack(np.meshgrid(*3 * [along_side]), axis=-1).reshape(-1, 3)
     for number, block in enumerate(blocks):
         own = block.from_frame(lattice * sizes)
         if block.contains(points).any() or region.contains(own).any():

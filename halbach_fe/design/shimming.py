@@ -52,17 +52,11 @@ GAIN_SDS = 1.0
 """Smallest ratio of the expected gain of a move to the standard deviation of that gain, for which
 the move is made."""
 
-SHORTLIST = 24
-"""Number of moves of each kind, the best by an approximate gain, whose exact gain is computed."""
-
 AT_ONCE = 100_000
 """Number of moves that are evaluated at a time, which limits the memory."""
 
 MOST_NUMBERS = 3e8
 """Largest number of values of all placements together, and of possible swaps: 2.4 GB."""
-
-BETTER = 1e-6
-"""Smallest relative decrease of the sum for which a move is replaced by another."""
 
 STOPS = {"target": "the limit is met", "uncertainty": "further moves would gain less than the "
          "uncertainty of what they gain", "budget": "the allowed number of moves is reached",
@@ -692,6 +686,8 @@ def _add_moves(
     budget: Mapping[Kind, int], goal: _Goal, chosen: list[Move],
 ) -> tuple[list[Move], str]:
     """Add the moves of largest expected gain one by one; return them and why no more are added."""
+    # number of moves of each kind, the best by an approximate gain, whose exact gain is computed
+    shortlist_size = 24
     while True:
         now = move_model.after(chosen)
         if goal.met(now):
@@ -701,7 +697,7 @@ def _add_moves(
         if (candidates and not left) or not any(budget.values()):
             return chosen, "budget"
         shortlist = [move for moves in left
-                     for move in _best_moves(move_model, placements, moves, chosen, SHORTLIST)]
+                     for move in _best_moves(move_model, placements, moves, chosen, shortlist_size)]
         if not shortlist:
             return chosen, "nothing"
         gains = move_model.gains(chosen, shortlist)
@@ -717,6 +713,8 @@ def _exchange_moves(
 ) -> list[Move]:
     """Replace each move by the best of its kind, given the others, until no move improves."""
     better = True
+    # smallest relative decrease of the sum for which a move is replaced by another
+    least_gain = 1e-6
     while better:
         better = False
         for move in list(chosen):
@@ -725,7 +723,7 @@ def _exchange_moves(
             found = _best_moves(move_model, placements, kind, others, 1)
             now = move_model.after(chosen).expected_square
             if found and move_model.after([*others, found[0]]).expected_square < (
-                    1 - BETTER) * now:
+                    1 - least_gain) * now:
                 chosen, better = [*others, found[0]], True
     return chosen
 

@@ -182,7 +182,7 @@ def sort_blocks(
                       f"the same blocks{types_in_words(alike)}, or measure spare blocks.",
                       HalbachWarning, stacklevel=2)
     count = len(model.orders) if isinstance(model, MultipoleModel) else 1
-    numbered = _with_places(magnet, table, _table_order(blocks))
+    numbered = _name_places(magnet, table, _table_order(blocks))
     known = _assembled(magnet, numbered, model)
     as_numbered = model.of(known)
     floor = float(np.sum(as_numbered.root ** 2))
@@ -207,10 +207,10 @@ def sort_blocks(
     in_these_units = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset).square / count
     unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
     if (placed := _placed_order(table, magnet)) is not None:
-        known = _assembled(magnet, _with_places(magnet, table, placed), model)
+        known = _assembled(magnet, _name_places(magnet, table, placed), model)
     turned = np.zeros((len(table), 3))
     turned[best.order] = np.array([rotation_deg(turn) for turn in mounts.turns])[best.turn]
-    result = _with_places(magnet, table, best.order, mounts.turns[best.turn])
+    result = _name_places(magnet, table, best.order, mounts.turns[best.turn])
     after = _assembled(magnet, result, model)
     return SortedBlocks(
         magnet.study, model, result, turned, model.of(after), model.of(known),
@@ -353,7 +353,7 @@ def _placed_order(table: BlockTable, magnet: Magnet) -> Ints | None:
     return np.array([row_of[place] for place in places])
 
 
-def _with_places(
+def _name_places(
     magnet: Magnet, table: BlockTable, order: Ints, turns: Floats | None = None
 ) -> BlockTable:
     """Return the table with ring and slot of each block, and moments in the axes of these slots.

@@ -312,7 +312,7 @@ class Prisms:
 
         sizes = 1, self.directions.shape[1] + self.other_directions.shape[1]
         depth[level] = _smallest_overlap(depth[level], allowed, mine, others, sizes, (
-            lambda at: _between(mine[at], others[at]), normals))
+            lambda at: _centre_offsets(mine[at], others[at]), normals))
         return depth
 
     def _tilted(self, rows: Ints, allowed: Floats) -> Floats:
@@ -332,10 +332,10 @@ class Prisms:
 
         sizes = 1, faces.shape[1], edges[0].shape[1] * other_edges.shape[1]
         return _smallest_overlap(np.full(len(rows), np.inf), allowed, mine, others, sizes, (
-            lambda at: _between(mine[at], others[at]), lambda at: faces[at], crossed))
+            lambda at: _centre_offsets(mine[at], others[at]), lambda at: faces[at], crossed))
 
 
-def _between(first: Floats, second: Floats) -> Floats:
+def _centre_offsets(first: Floats, second: Floats) -> Floats:
     """Return the vectors (m, 1, d) between the centres of points (m, n, d) and (m, k, d)."""
     return np.asarray(second.mean(axis=1, keepdims=True) - first.mean(axis=1, keepdims=True))
 

@@ -143,7 +143,7 @@ def counter_clockwise(corners: Floats) -> Floats:
     return corners if area > 0 else corners[::-1]
 
 
-ROUNDING = 1e-12
+RELATIVE_ROUNDING = 1e-12
 """Relative differences up to this are rounding."""
 
 PLACE = ("x_m", "y_m", "z_m")
@@ -256,7 +256,7 @@ def _flat_pose(block: MagnetBlock, origin: Floats, axes: Floats) -> dict[str, fl
     A block that is turned over is its own mirror image: about its x axis all shapes but prisms are
     symmetric.
     """
-    if abs(axes[2, 2]) < 1 - ROUNDING:
+    if abs(axes[2, 2]) < 1 - RELATIVE_ROUNDING:
         raise StudyError(
             f"Input `array.exceptions` of study must not tilt a block that is exported from a 2D "
             f"study; instead block {block.name} is tilted. Use dimension = 3.")
@@ -288,6 +288,6 @@ def _shape(outline: Outline) -> tuple[dict[str, Any], Floats, float]:
     size = float(np.hypot(*depth))
     sizes = {"shape": "trapezoid", "size_x_m": size, "inner_width_m": widths[0],
              "outer_width_m": widths[1]}
-    if abs(widths[1] - widths[0]) <= ROUNDING * size:
+    if abs(widths[1] - widths[0]) <= RELATIVE_ROUNDING * size:
         sizes = {"shape": "cuboid", "size_x_m": size, "size_y_m": float(np.mean(widths))}
     return sizes, (inner + outer) / 2, float(np.arctan2(depth[1], depth[0]))

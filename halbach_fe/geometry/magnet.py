@@ -31,10 +31,6 @@ from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, iron_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
-CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
-"""Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
-blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm."""
-
 SOLVED_BY = "halbach_fe.solver.formulation_choice"
 """The module that solves for the field of a magnet."""
 
@@ -434,7 +430,10 @@ def _check_overlaps(
     ------
     StudyError
     """
-    contact = CONTACT_IN_TABLES if array.free_blocks else CONTACT
+    # overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
+    # blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm.
+    rounding_overlap, table_overlap = 1e-6, 2e-4
+    contact = table_overlap if array.free_blocks else rounding_overlap
     cases = [(nominal_blocks(array, dimension), contact, "")]
     blocks = blocks_of_array(array, dimension)
     if dimension == 2:  # where a small tilt turns magnetizations, and moves nothing in the plane

@@ -95,8 +95,8 @@ def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
         known = [np.array(block.easy_axis), *(each for _, each in found)]
         nearest = min(np.linalg.norm(direction - each) for each in known)
         if nearest > same_direction and block.contains(
-                _shrunk(corners) @ matrix.T + corners.mean(axis=0)).all():
-            found.append((_as_turn(matrix), direction))
+                _shrink(corners) @ matrix.T + corners.mean(axis=0)).all():
+            found.append((_matrix_rows(matrix), direction))
     return tuple(turn for turn, _ in found)
 
 
@@ -109,10 +109,10 @@ def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
     kind : str
         ``exchanged``, ``turned`` (from slot to slot about z) or ``upside down``.
     """
-    return _moves(_in_slots(magnet.array), magnet.dimension, kind)
+    return _moves(_drop_exceptions(magnet.array), magnet.dimension, kind)
 
 
-def _in_slots(array: Array) -> Array:
+def _drop_exceptions(array: Array) -> Array:
     """Return an array without its exceptions, whose blocks are all in their slots."""
     return array.with_(exceptions=()) if array.exceptions else array
 
@@ -153,7 +153,7 @@ def _exchanges(
             up = _pairs(blocks, (groups[other], groups[one]), still, way)
             down = _pairs(blocks, (groups[one], groups[other]), still, -way)
             if up is not None and down is not None and not {*groups[one]} & {*groups[other]}:
-                yield Move(f"{other} and {one}", (*up, *down), _as_turn(still))
+                yield Move(f"{other} and {one}", (*up, *down), _matrix_rows(still))
 
 
 def _turns(
@@ -176,7 +176,7 @@ def _turns(
             pairs = _pairs(blocks, (numbers, numbers), turn.as_matrix(),
                            middle - turn.apply(middle))
             if pairs is not None:
-                yield Move(words, pairs, _as_turn(turn.as_matrix()))
+                yield Move(words, pairs, _matrix_rows(turn.as_matrix()))
 
 
 def _pairs(
@@ -195,7 +195,7 @@ def _pairs(
         corners = _corners(blocks[number])
         there = turn @ blocks[number].middle + shift
         slot = to[int(np.linalg.norm(places - there, axis=1).argmin())]
-        moved = (_shrunk(corners) + corners.mean(axis=0)) @ turn.T + shift
+        moved = (_shrink(corners) + corners.mean(axis=0)) @ turn.T + shift
         if not blocks[slot].contains(moved).all():
             return None
         found.append((slot, number))
@@ -210,7 +210,7 @@ def _corners(block: MagnetBlock) -> Floats:
         np.column_stack([outline, np.full(len(outline), z)]) for z in ends]))
 
 
-def _shrunk(corners: Floats) -> Floats:
+def _shrink(corners: Floats) -> Floats:
     """Return corners (n, 3) about their middle, of a body that is slightly smaller."""
     # A body whose size is reduced by this factor lies within its slot wherever it fits: slots are
     # wider than blocks by about a hundredth, and edges of a block may differ by as much
@@ -224,7 +224,7 @@ def _middle(blocks: Sequence[MagnetBlock], numbers: Sequence[int]) -> Floats:
     return np.array([0.0, 0.0, (min(heights) + max(heights)) / 2])
 
 
-def _as_turn(matrix: Floats) -> Turn:
+def _matrix_rows(matrix: Floats) -> Turn:
     """Return a matrix as a tuple."""
     rows = matrix.round(12) + 0.0
     return tuple((float(a), float(b), float(c)) for a, b, c in rows)

@@ -200,7 +200,7 @@ def thinnest_wall(polygons: Sequence[Floats], owners: Sequence[object]) -> tuple
                 continue
             apart = np.hypot(*(centres[second] - centre)) - reach[first] - reach[second]
             if apart < nearest[0]:
-                distance = _distance(polygons[first], polygons[second])
+                distance = _polygon_distance(polygons[first], polygons[second])
                 nearest = min(nearest, (distance, first, second))
     return nearest
 
@@ -209,17 +209,17 @@ def distance_from_origin(polygon: Floats) -> float:
     """Return the distance in m of a polygon (n, 2) from the origin; 0 if it is inside."""
     if _contains(polygon, np.zeros(2)):
         return 0.0
-    return float(_to_edges(np.zeros((1, 2)), polygon).min())
+    return float(_edge_distances(np.zeros((1, 2)), polygon).min())
 
 
-def _distance(first: Floats, second: Floats) -> float:
+def _polygon_distance(first: Floats, second: Floats) -> float:
     """Return the distance of two polygons, 0 if they overlap."""
-    if (_contains(first, second[0]) or _contains(second, first[0]) or _cross(first, second)):
+    if (_contains(first, second[0]) or _contains(second, first[0]) or _edges_cross(first, second)):
         return 0.0
-    return float(min(_to_edges(first, second).min(), _to_edges(second, first).min()))
+    return float(min(_edge_distances(first, second).min(), _edge_distances(second, first).min()))
 
 
-def _to_edges(points: Floats, polygon: Floats) -> Floats:
+def _edge_distances(points: Floats, polygon: Floats) -> Floats:
     """Return the distances (points, edges) of points from the edges of a polygon."""
     along = np.roll(polygon, -1, axis=0) - polygon
     apart = points[:, None] - polygon
@@ -236,7 +236,7 @@ def _contains(polygon: Floats, point: Floats) -> bool:
     return bool(np.sum(x > point[0]) % 2)
 
 
-def _cross(first: Floats, second: Floats) -> bool:
+def _edges_cross(first: Floats, second: Floats) -> bool:
     """Tell whether any edges of two polygons cross."""
     a, b = first[:, None], np.roll(first, -1, axis=0)[:, None]
     c, d = second[None], np.roll(second, -1, axis=0)[None]

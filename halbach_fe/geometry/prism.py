@@ -110,7 +110,7 @@ def widened(outline: Outline, distance: float) -> Outline | None:
 
     Corners stay sharp. It is None if an edge would vanish, so that there is no such outline.
     """
-    corners = [_moved_corner(outline[number - 1], edge, distance)
+    corners = [_offset_corner(outline[number - 1], edge, distance)
                for number, edge in enumerate(outline)]
     found = tuple(Edge(start, end, edge.arc) for start, end, edge in zip(
         corners, corners[1:] + corners[:1], outline, strict=True))
@@ -121,9 +121,9 @@ def widened(outline: Outline, distance: float) -> Outline | None:
     return found
 
 
-def _moved_corner(first: Edge, second: Edge, distance: float) -> tuple[float, float]:
+def _offset_corner(first: Edge, second: Edge, distance: float) -> tuple[float, float]:
     """Return the corner of two edges that are moved outwards."""
-    (point, one), (other, two) = (_moved(edge, at, distance) for edge, at in (
+    (point, one), (other, two) = (_offset_edge(edge, at, distance) for edge, at in (
         (first, 1.0), (second, 0.0)))
     if first.arc and second.arc:
         found = point  # of arcs about the same centre, with the same radius
@@ -145,7 +145,7 @@ def _moved_corner(first: Edge, second: Edge, distance: float) -> tuple[float, fl
     return float(found[0]), float(found[1])
 
 
-def _moved(edge: Edge, at: float, distance: float) -> tuple[Floats, Floats]:
+def _offset_edge(edge: Edge, at: float, distance: float) -> tuple[Floats, Floats]:
     """Return a point of an edge that is moved outwards, and the edge's direction there."""
     points, normals = edge.at(np.array([at]))
     normal = normals[0] / np.linalg.norm(normals[0])

@@ -5,8 +5,8 @@ magnetization of a block to B at x. Magnetization and B are axial vectors. The f
 block rotated by R is therefore ``F'(x) = R F(R^-1 x) R^T``, and of a block reflected by S in a
 plane ``F'(x) = S F(S x) S``: the sign of axial vectors under reflection cancels.
 
-`own_turns` returns those turns by which a magnet is turned onto itself, so that no field map tells
-its blocks apart.
+`symmetry_images` returns the turns by which a magnet is turned onto itself, so that no field map
+tells its blocks apart.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _same_shape(corners: Floats, others: Floats) -> bool:
     return bool((distance.min(axis=0) < 1e-9).all() and (distance.min(axis=1) < 1e-9).all())
 
 
-def turned_onto(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
+def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     """Return the number from 0 of the equal block onto which each block is turned.
 
     ``turn`` (3, 3) is a rotation about the origin of the magnet. None if a block has no equal one
@@ -205,8 +205,8 @@ def turned_onto(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     return tuple(found)
 
 
-def own_turns(magnet: Magnet) -> list[tuple[int, ...]]:
-    """Return what `turned_onto` says of every turn that brings the magnet onto itself.
+def symmetry_images(magnet: Magnet) -> list[tuple[int, ...]]:
+    """Return what `block_images` says of every turn that brings the magnet onto itself.
 
     Turns by right angles are tried, and those that bring a ring of blocks onto itself, alone and
     with half a turn about x.
@@ -219,7 +219,7 @@ def own_turns(magnet: Magnet) -> list[tuple[int, ...]]:
             about_z = Rotation.from_euler("z", 2 * np.pi * number / count)
             turns += [about_z.as_matrix(), (about_z * Rotation.from_euler(
                 "x", np.pi)).as_matrix()][not number:]
-    images = dict.fromkeys(image for turn in turns if (image := turned_onto(magnet, turn)))
+    images = dict.fromkeys(image for turn in turns if (image := block_images(magnet, turn)))
     return list(images)
 
 

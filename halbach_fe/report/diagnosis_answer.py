@@ -23,7 +23,7 @@ from halbach_fe.diagnosis.summary import (
 )
 from halbach_fe.diagnosis.uncertain_effects import is_uncertain
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import own_turns
+from halbach_fe.geometry.symmetry import symmetry_images
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.unknown_cause import (
@@ -178,7 +178,7 @@ def _also_possible(diagnosis: Diagnosis) -> str:
             any(one.rotation_rad) or any(one.translation_m) for one in instruments):
         return ""
     magnet = build_magnet(study)
-    images = own_turns(magnet)
+    images = symmetry_images(magnet)
     numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
     said = []
     for effect in diagnosis.identified:

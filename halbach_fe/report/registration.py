@@ -14,7 +14,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import turned_onto
+from halbach_fe.geometry.symmetry import block_images
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
@@ -346,7 +346,7 @@ def _fit_alike(one: Registration, other: Registration) -> bool:
 def is_symmetric_to(one: Registration, other: Registration) -> bool:
     """Tell whether the turn from one pose to another puts every nominal block onto an equal one.
 
-    Such poses predict the same readings, before and after an update. `turned_onto` says which
+    Such poses predict the same readings, before and after an update. `block_images` says which
     magnets are never symmetric.
     """
     first, second = (_axes(each) for each in (one, other))
@@ -359,7 +359,7 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
     if (off > wider * np.hypot(np.abs(turn) @ one.translation_sd_m,
                                other.translation_sd_m)).any():
         return False
-    return turned_onto(build_magnet(one.study), turn) is not None
+    return block_images(build_magnet(one.study), turn) is not None
 
 
 def _axes(one: Registration) -> np.ndarray:

@@ -105,7 +105,7 @@ class Variations:
             places = cells.nodes[mine]
             flat = places.reshape(-1, 3)
             easy = np.array(block.easy_axis) * block.remanence
-            own = Interaction(_some(cells, mine))
+            own = Interaction(_select_cells(cells, mine))
             effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)
             correlation = np.exp(-distance / (2 * length_m**2))
@@ -166,7 +166,7 @@ class Variations:
         return self.interaction.field_at(points, polarization)
 
 
-def _some(cells: Cells, chosen: slice) -> Cells:
+def _select_cells(cells: Cells, chosen: slice) -> Cells:
     """Return some of the cells."""
     return replace(cells, **{name: getattr(cells, name)[chosen] for name in (
         "block", "centre", "axes", "vertices", "half", "cuboid")})

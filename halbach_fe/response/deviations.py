@@ -17,7 +17,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.response.homogeneity import PPM, HomogeneityModel
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, correlated_values
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Deviations:
 
         It is estimated from standard normal numbers (count, k).
         """
-        values, vectors = np.linalg.eigh(self.root @ self.root.T + np.diag(self.error**2))
-        drawn = self.mean + normals * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        covariance = self.root @ self.root.T + np.diag(self.error**2)
+        drawn = correlated_values(self.mean, covariance, normals)
         return float(np.mean(np.einsum("ij,ij->i", drawn, drawn) <= limit**2))
 
 

@@ -22,8 +22,8 @@ from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.solver.azimuthal_modes import modes_needed, solve_modes
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import (
-    MESHES,
     ElementFields,
+    Route,
     choose_route,
     finite_element_part,
     solve_nominal,
@@ -53,10 +53,6 @@ BOUNDARY_SERIES = 1 / (1 - REFINEMENT**-3)
 """Error of a 3D outer boundary over the change by the farther boundary: 1.4. The field that the
 boundary reflects is that of a dipole at most, and falls with the cube of its distance."""
 
-DUAL = {"edge_elements": "scalar_potential", "scalar_potential": "edge_elements"}
-"""The dual formulation of each formulation that has one."""
-
-
 def refined(magnet: Magnet, factor: float) -> Magnet:
     """Return the magnet with all elements smaller by a factor (larger if it is below 1).
 
@@ -82,21 +78,13 @@ def _cells(cells: int, factor: float) -> int:
 def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
     """Return the magnet with the boundary farther away by a factor.
 
-    ``mesh`` is the kind of mesh, a value of `halbach_fe.solver.formulation_choice.MESHES`.
+    ``mesh`` is the kind of mesh, see `halbach_fe.solver.formulation_choice.Route.mesh`.
     """
     end = magnet.half_length
     update = {"radius_m": factor * boundary_radius(magnet, mesh)}
     if magnet.dimension == 3:
         update["half_length_m"] = end + factor * (boundary_half_length(magnet, mesh) - end)
     return magnet.with_(open_boundary=magnet.study.open_boundary.with_(**update))
-
-
-def dual(magnet: Magnet, route: str) -> Magnet:
-    """Return the magnet to be solved by the dual formulation of a route.
-
-    The magnetic energies of the two formulations bracket the exact energy.
-    """
-    return magnet.with_(solver__route=DUAL[route])
 
 
 def error_bar_session(session: Session) -> Session:
@@ -140,7 +128,7 @@ def reading_errors(
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return np.zeros(len(observation))  # the field is exact: finite elements add nothing
     route = choose_route(magnet, observation.points)
-    if route == "azimuthal_modes":
+    if route is Route.AZIMUTHAL_MODES:
         return sum((observation.magnitude(change) for change in _changes_of_modes(
             magnet, observation.points, nominal, session)), np.zeros(len(observation)))
 
@@ -149,10 +137,11 @@ def reading_errors(
             variant, observation.points, _error_bars(session, purpose), columns=False).nominal
         return observation.magnitude(other - nominal)
 
-    if route in DUAL:
-        return change(dual(magnet, route), "dual route")
-    return change(refined(magnet, 1 / REFINEMENT), "coarser mesh") + change(
-        farther(magnet, MESHES[route], REFINEMENT), "farther boundary")
+    if route.dual is not None:
+        return change(magnet.with_(solver__route=route.dual.value), "dual route")
+    coarser = change(refined(magnet, 1 / REFINEMENT), "coarser mesh")
+    return coarser if route.mesh is None else coarser + change(
+        farther(magnet, route.mesh, REFINEMENT), "farther boundary")
 
 
 def _error_bars(session: Session, purpose: str) -> Session:
@@ -175,9 +164,6 @@ def _changes_of_modes(
     series = IRON_SERIES if magnet.iron else 1.0
     return series * (coarser - nominal), BOUNDARY_SERIES * (distant - nominal)
 
-
-HARMONICS = 8
-"""Number of harmonics that are compared if the study does not state a number."""
 
 EXACT = "exact field"
 OWN, COARSEST, COARSER, FINER, FARTHER = (
@@ -328,8 +314,7 @@ def verify(
              "coarser mesh to the study's": (coarse, base),
              "the study's mesh to a finer": (base, fine)}
     pairs |= {description: (base, fields[purpose]) for purpose, description in (
-        (FARTHER, BOUNDARY), (f"the dual route, {DUAL.get(route)}",
-                              f"dual route, {DUAL.get(route)}"))
+        (FARTHER, BOUNDARY), (f"the dual route, {route.dual}", f"dual route, {route.dual}"))
         if purpose in fields}
     if magnet.study.solver.method == "direct" and magnet.is_vacuum:
         pairs[EXACT] = base, field_of(magnet.blocks, points)
@@ -347,7 +332,7 @@ def verify(
     return Verification(
         magnet=magnet, route=route, differences=tuple(steps), order=order, error_pointwise=error,
         error_fourier=fourier, main_field_T=compare.scale,
-        element_size_m=_element_size(magnet, route),
+        element_size_m=route.element_size_m(magnet),
         points=points, field=base, changes=np.array(
             [np.linalg.norm(first - second, axis=1) for first, second in pairs.values()]))
 
@@ -362,21 +347,12 @@ def variants_to_compare(magnet: Magnet, points: Floats) -> dict[str, Magnet]:
     coarser = refined(magnet, 1 / REFINEMENT)
     variants = {OWN: magnet, COARSEST: refined(coarser, 1 / REFINEMENT), COARSER: coarser,
                 FINER: refined(magnet, REFINEMENT)}
-    if route != "moments":
-        variants[FARTHER] = farther(magnet, MESHES[route], REFINEMENT)
-    if route in DUAL:
-        variants[f"the dual route, {DUAL[route]}"] = dual(magnet, route)
+    if route.mesh is not None:
+        variants[FARTHER] = farther(magnet, route.mesh, REFINEMENT)
+    if route.dual is not None:
+        variants[f"the dual route, {route.dual}"] = magnet.with_(
+            solver__route=route.dual.value)
     return variants
-
-
-def _element_size(magnet: Magnet, route: str) -> float:
-    """Return the size in m of the elements, or for the method of moments of the cells of blocks."""
-    if route == "azimuthal_modes":
-        return meridian_size(magnet)
-    if route == "moments":
-        smallest = min(block.volume for block in magnet.blocks) ** (1 / 3)
-        return float(smallest / (magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
-    return magnet.study.mesh.block_size_m
 
 
 def observed_order(*changes: float) -> float:
@@ -408,8 +384,10 @@ class _Comparison:
         self.scale = float(np.linalg.norm(field, axis=1).max())
         self._circles = None
         positions = magnet.study.observation.positions
+        # number of harmonics that are compared if the study does not state a number
+        default_harmonics = 8
         if positions.kind == "circles" and positions.angles > 2:
-            harmonics = getattr(magnet.study.observation, "harmonics", HARMONICS)
+            harmonics = getattr(magnet.study.observation, "harmonics", default_harmonics)
             self._circles, *_ = fourier_analysis(points, FourierCoefficients(
                 quantity="fourier_coefficients", positions=positions,
                 harmonics=min(harmonics, (positions.angles - 1) // 2)))

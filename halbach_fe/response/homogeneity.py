@@ -55,10 +55,6 @@ STARTS = 2
 """Number of points from which each extreme is looked for, the best ones that are not near each
 other: of two peaks the higher one may have the lower points."""
 
-NEAR, WEIGHED = 3.0, 1.5
-"""How far these points are from it, and the distance at which one counts less by a factor of e,
-in distances of points from each other."""
-
 SLICE = 25
 """Number of points along the sides of the slices that are drawn."""
 
@@ -533,10 +529,13 @@ def _climbed(
     # degrees of the solid harmonics about a point that are fitted to the field at the points near
     local_degrees = 7
     unknowns = local_degrees * (local_degrees + 2)
-    near = distance <= max(NEAR * step, np.sort(distance)[min(unknowns, len(unit)) - 1])
+    # how far these points are from it, and the distance at which one counts less by a factor of e,
+    # in distances of points from each other
+    near_distance, weighed_distance = 3.0, 1.5
+    near = distance <= max(near_distance * step, np.sort(distance)[min(unknowns, len(unit)) - 1])
     away = (unit[near] - unit[start]) * region.half_axes_m
     scale = float(np.linalg.norm(away, axis=1).max())
-    weight = np.exp(-(distance[near] / (WEIGHED * step))**2)[:, None, None]
+    weight = np.exp(-(distance[near] / (weighed_distance * step))**2)[:, None, None]
     design = solid_harmonic_fields(away / scale, local_degrees)
     amplitudes = np.linalg.lstsq((weight * design).reshape(-1, unknowns),
                                  (weight * fields[near]).reshape(-1, fields.shape[2]),

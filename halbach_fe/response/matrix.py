@@ -205,7 +205,8 @@ def response_matrix(
     if magnet.study.uncertain_of_magnet:
         changes = observation.apply(field_changes(magnet, observation.points, session))
     if similar is not None and _serves(similar, magnet, observation.points, session):
-        built = _of_similar(magnet, similar, observation, session, _beside(path, key), changes)
+        built = _similar_response(
+            magnet, similar, observation, session, _beside(path, key), changes)
     if built is None:
         parts = finite_element_part(magnet, observation.points, session)
         error = reading_errors(magnet, observation, parts, error_bar_session(session))
@@ -227,7 +228,7 @@ def _serves(similar: Magnet, magnet: Magnet, points: Floats, session: Session) -
             and all(runs_serve_other_points(each, points) for each in (similar, magnet)))
 
 
-def _of_similar(
+def _similar_response(
     magnet: Magnet, similar: Magnet, observation: Observation, session: Session, path: Path,
     changes: Floats
 ) -> Response | None:

@@ -32,7 +32,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, correlated_values
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
 from halbach_fe.study.types import COMPONENTS
@@ -159,8 +159,8 @@ class Multipoles:
 
     def sizes_of(self, normals: Floats) -> Floats:
         """Return |c_n| (count, k) of samples made from standard normal numbers (count, 2 k)."""
-        values, vectors = np.linalg.eigh(self.covariance + np.diag(self.error**2))
-        drawn = self.mean + normals * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        covariance = self.covariance + np.diag(self.error**2)
+        drawn = correlated_values(self.mean, covariance, normals)
         return np.hypot(*drawn.reshape(len(drawn), 2, -1).swapaxes(0, 1))
 
     def table(self) -> list[dict[str, float]]:

@@ -39,11 +39,10 @@ from halbach_fe.response.discretization_error import (
 from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.formulation_choice import (
-    MESHES,
+    Route,
     check_points,
     choose_route,
     finite_element_part,
-    formulation_of,
 )
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of
@@ -220,7 +219,7 @@ class Estimate:
             hints.append("take fewer mesh.cells_per_side" if self.route == "moments"
                          else "take fewer readings")
         else:
-            hints.append(COARSER[MESHES[largest.route]])
+            hints.append(COARSER[str(Route(largest.route).mesh)])
             if largest.route == "edge_elements" and self.route == largest.route:
                 hints.append("or take another solver.route or a lower solver.edge_order")
         return (f"This needs about {self.memory_GiB:.2g} GiB of memory, and the machine has "
@@ -278,10 +277,9 @@ def check_domain(magnet: Magnet, points: Floats) -> None:
     """Refuse points (n, 3) outside the mesh that the solver will make, as it does itself."""
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return
-    route = choose_route(magnet, points)
-    if route == "moments":  # the blocks need no boundary
+    kind = choose_route(magnet, points).mesh
+    if kind is None:  # blocks without a mesh need no boundary
         return
-    kind = MESHES[route]
     half_length = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
     check_inside(magnet.name, boundary_radius(magnet, kind), half_length, points)
 
@@ -316,7 +314,8 @@ def problems_of(magnet: Magnet, session: Session) -> list[Problem]:
 
 def _problem(magnet: Magnet, purpose: str, size: RunSize, processes: int) -> Problem:
     """Return the cost of some equal runs, by the `CostLaw` of their route."""
-    formulation = formulation_of(magnet, size.route)
+    route = Route(size.route)
+    formulation = route.formulation(magnet)
     law = {"cross_section": PLANE, "azimuthal_modes": PLANE, "edge_elements": EDGES[
         magnet.study.solver.edge_order]}.get(size.route, FACTORIZED)
     iron_iterations = 5.0  # factor by which thin iron increases the number of iterations
@@ -340,7 +339,7 @@ def _problem(magnet: Magnet, purpose: str, size: RunSize, processes: int) -> Pro
     seconds = (getdp_seconds + matrices * law.matrix_s * size.unknowns**law.power
                + solves * law.solve_s * size.unknowns)
     other_unknown_bytes = 30  # bytes per unknown of GetDP's list of unknowns for all other routes
-    disk = size.elements * MESH_BYTES[MESHES[size.route]] + size.unknowns * (
+    disk = size.elements * MESH_BYTES[str(route.mesh)] + size.unknowns * (
         UNKNOWN_BYTES.get(size.route, other_unknown_bytes) + 8 * solves)
     return Problem(purpose, size.route, size.elements, size.unknowns, processes, matrices, solves,
                    (getdp_bytes + size.unknowns * each) / GIB, seconds, disk / GIB)
@@ -417,7 +416,7 @@ def _cost_of_moments(
     from halbach_fe.solver.moments.interaction import Interaction  # import numba
 
     there = [magnet for magnet in magnets if not magnet.is_vacuum
-             and choose_route(magnet, points) == "moments"]
+             and choose_route(magnet, points) is Route.MOMENTS]
     found = [Interaction(cells_of(present_blocks(magnet.blocks),
                                   magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
              for magnet in there]

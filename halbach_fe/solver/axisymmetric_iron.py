@@ -46,6 +46,7 @@ from scipy.sparse.csgraph import connected_components
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import NotConvergedError
 from halbach_fe.geometry.symmetry import unique_points
+from halbach_fe.solver.azimuthal_modes import to_cartesian
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.interpolation import locate
 from halbach_fe.solver.iron_modes import (
@@ -371,10 +372,7 @@ def _evaluate(
         wave = np.exp(1j * mode * phi)[:, None]
         for component, operator in enumerate((at.along_r, 1j * mode * at.over_r, at.along_z)):
             cylindrical[component] -= ((operator @ part)[where] * wave).real
-    radial, tangential, axial = cylindrical.transpose(0, 2, 1)
-    cosine, sine = np.cos(phi), np.sin(phi)
-    return np.stack([radial * cosine - tangential * sine, radial * sine + tangential * cosine,
-                     axial], axis=-1)
+    return to_cartesian(cylindrical.transpose(2, 1, 0), phi)
 
 
 def to_angles(by_mode: Complexes, numbers: Ints, angles: int) -> Floats:

@@ -78,9 +78,6 @@ SHARED_UNKNOWNS = 100_000
 """Largest number of unknowns of the nominal array's modes that share a run of GetDP. It takes 0.2 s
 to start, as long as a mode of 10 000 unknowns. Large modes are runs of their own, side by side."""
 
-MAX_MODES = 64
-"""Highest mode up to which this route applies; points close to the blocks need more modes."""
-
 AXIS_RADIUS = 1e-8
 """Points nearer to the axis than this fraction of the inner radius count as points on the axis,
 where psi/r is a limit."""
@@ -110,10 +107,12 @@ def is_axisymmetric(magnet: Magnet) -> bool:
 
 
 def few_modes_suffice(magnet: Magnet, points: Floats) -> NDArray[np.bool_]:
-    """Tell at which points (n, 3) in m at most `MAX_MODES` modes matter, if the route applies."""
+    """Tell at which points (n, 3) in m at most 64 modes matter, if the route applies."""
     if not is_axisymmetric(magnet):
         return np.zeros(len(points), bool)
-    return np.asarray(mode_decay(magnet, points) <= MODE_TOLERANCE ** (1 / MAX_MODES))
+    # highest mode up to which this route applies; points close to the blocks need more modes
+    most_modes = 64
+    return np.asarray(mode_decay(magnet, points) <= MODE_TOLERANCE ** (1 / most_modes))
 
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
@@ -548,7 +547,7 @@ def _superpose(
         result[1 + 3 * number] = np.cos(middle) * along - np.sin(middle) * across
         result[2 + 3 * number] = np.sin(middle) * along + np.cos(middle) * across
         result[3 + 3 * number] = axial
-    return _to_cartesian(result, phi)
+    return to_cartesian(result, phi)
 
 
 def _field(gradients: dict[int, Floats], theta: Floats, sine: bool) -> Floats:
@@ -570,7 +569,7 @@ def _field(gradients: dict[int, Floats], theta: Floats, sine: bool) -> Floats:
     return field
 
 
-def _to_cartesian(field: Floats, phi: Floats) -> Floats:
+def to_cartesian(field: Floats, phi: Floats) -> Floats:
     """Convert B_r, B_theta, B_z (..., n, 3) at azimuths phi (n,) in rad to B_x, B_y, B_z."""
     cosine, sine = np.cos(phi), np.sin(phi)
     radial, tangential = field[..., 0], field[..., 1]

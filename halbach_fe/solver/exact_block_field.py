@@ -42,10 +42,6 @@ from halbach_fe.geometry.outline import Outline
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 
-_SHARE, _SHARE_OF_CUBOID = 10_000, 30_000
-"""Number of points that a thread evaluates at a time: several milliseconds of work, beside which
-0.3 ms of starting a thread do not count. A point takes 0.1 us by the closed form of cuboids."""
-
 _RECTANGULAR = 1e-13
 """Largest deviation of a rectangle's corners, relative to its sides: some rounding errors."""
 
@@ -100,14 +96,17 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
 
     out = np.empty((len(points), 6))
     rectangle = _rectangle(block.outline)
+    # number of points that a thread evaluates at a time: several milliseconds of work, beside which
+    # 0.3 ms of starting a thread do not count. A point takes 0.1 us by the closed form of cuboids.
+    points_per_thread, cuboid_points_per_thread = 10_000, 30_000
     if rectangle is not None and np.isfinite(block.z_max):
         (x, y), (a, b), cosine, sine = rectangle
-        share = _SHARE_OF_CUBOID
+        share = cuboid_points_per_thread
         work = partial(
             cuboid_fields, np.array([x, y, (block.z_min + block.z_max) / 2]),
             np.array([a, b, (block.z_max - block.z_min) / 2]), cosine, sine, points)
     else:
-        share = _SHARE
+        share = points_per_thread
         edges = [(*edge.start, *edge.end) for edge in block.outline if not edge.arc]
         arcs = [(edge.radius, *edge.angles) for edge in block.outline if edge.arc]
         tables = [arc_table(sweep) for _, _, sweep in arcs] or [arc_table(0.0)]

@@ -469,7 +469,7 @@ def grid_operators(
     first_r = _first_line(r, points[:, 0], "right", from_the_first=True)
     both_z = [_first_line(z, points[:, 1], side) for side in ("left", "right")]
     smooth = np.flatnonzero(np.all([
-        (first_r >= 0) & (first_z >= 0) & _in_air(
+        (first_r >= 0) & (first_z >= 0) & _are_air(
             material, _cells_around(r, first_r), _cells_around(z, first_z))
         for first_z in both_z], axis=0))
     if not len(smooth):
@@ -534,7 +534,7 @@ def _cells_around(lines: Floats, first: Ints) -> tuple[Ints, Ints]:
             np.minimum(np.searchsorted(lines, of_window[:, -1] + widest), len(lines) - 1))
 
 
-def _in_air(
+def _are_air(
     material: NDArray[np.bool_], of_r: tuple[Ints, Ints], of_z: tuple[Ints, Ints]
 ) -> NDArray[np.bool_]:
     """Tell of which ranges of cells along r and z, from the first to before the last, are air."""

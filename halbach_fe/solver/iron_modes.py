@@ -38,7 +38,7 @@ from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
 from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
 from halbach_fe.study.materials import Curve
 
-SAME = 1e-9
+ONE_LINE_M = 1e-9
 """Grid lines that are closer than this, in m, are one."""
 
 
@@ -110,8 +110,9 @@ def check_bodies(bodies: Sequence[IronRectangle]) -> None:
             raise StudyError(must_be("Iron", "the magnet", "a rectangle of the (r, z) half-plane",
                                      f"{body}", "Correct its radii and ends."))
     for a, b in combinations(bodies, 2):
-        if (min(a.outer_radius_m, b.outer_radius_m) - max(a.inner_radius_m, b.inner_radius_m) > SAME
-                and min(a.z_max_m, b.z_max_m) - max(a.z_min_m, b.z_min_m) > SAME):
+        across = min(a.outer_radius_m, b.outer_radius_m) - max(a.inner_radius_m, b.inner_radius_m)
+        along = min(a.z_max_m, b.z_max_m) - max(a.z_min_m, b.z_min_m)
+        if min(across, along) > ONE_LINE_M:
             raise StudyError(must_be("Iron", "the magnet", "bodies that do not overlap",
                                      f"{a} and {b}", "Split them into separate rectangles."))
 
@@ -127,19 +128,20 @@ def grid_lines(bodies: Sequence[IronRectangle], resolution: Resolution) -> tuple
                    for body in bodies)
     size, most = resolution.edge * thinnest, resolution.largest * outer
     far = resolution.boundary * extent
-    r = _distinct(radius for body in bodies
+    r = _distinct_values(radius for body in bodies
                   for radius in (body.inner_radius_m, body.outer_radius_m))
-    z = _distinct(end for body in bodies for end in (body.z_min_m, body.z_max_m))
+    z = _distinct_values(end for body in bodies for end in (body.z_min_m, body.z_max_m))
     growth = resolution.growth
-    radii = [] if r[0] < SAME else [0.0, *(r[0] - _growing(r[0], size, growth, most))[::-1][1:]]
+    is_disc = r[0] < ONE_LINE_M
+    radii = [] if is_disc else [0.0, *(r[0] - _spaced(r[0], size, growth, most))[::-1][1:]]
     middle = [line for low, high in pairwise(r)
-              for line in low + _between(high - low, size, growth, most)]
-    radii = [*radii, *([0.0] if r[0] < SAME else [r[0]]), *middle,
-             *r[-1] + _outward(far - r[-1], size, growth, most, extent / 2)]
-    heights = [*(z[0] - _outward(far + z[0], size, growth, most, extent / 2))[::-1], z[0],
+              for line in low + _refined_at_ends(high - low, size, growth, most)]
+    radii = [*radii, 0.0 if is_disc else r[0], *middle,
+             *r[-1] + _spaced_outward(far - r[-1], size, growth, most, extent / 2)]
+    heights = [*(z[0] - _spaced_outward(far + z[0], size, growth, most, extent / 2))[::-1], z[0],
                *(line for low, high in pairwise(z)
-                 for line in low + _between(high - low, size, growth, most)),
-               *z[-1] + _outward(far - z[-1], size, growth, most, extent / 2)]
+                 for line in low + _refined_at_ends(high - low, size, growth, most)),
+               *z[-1] + _spaced_outward(far - z[-1], size, growth, most, extent / 2)]
     return np.array(radii), np.array(heights)
 
 
@@ -152,13 +154,13 @@ def iron_cells(bodies: Sequence[IronRectangle], r: Floats, z: Floats) -> NDArray
     return result
 
 
-def _distinct(values: Iterable[float]) -> list[float]:
+def _distinct_values(values: Iterable[float]) -> list[float]:
     """Return values in ascending order, without those that repeat the one before."""
     ordered = sorted(values)
-    return ordered[:1] + [b for a, b in pairwise(ordered) if b - a > SAME]
+    return ordered[:1] + [b for a, b in pairwise(ordered) if b - a > ONE_LINE_M]
 
 
-def _growing(length: float, size: float, growth: float, most: float) -> Floats:
+def _spaced(length: float, size: float, growth: float, most: float) -> Floats:
     """Return positions up to ``length`` with distances that grow from ``size`` up to ``most``.
 
     All distances are then scaled to end at ``length``.
@@ -170,13 +172,13 @@ def _growing(length: float, size: float, growth: float, most: float) -> Floats:
     return np.asarray(positions * (length / positions[-1]))
 
 
-def _between(length: float, size: float, growth: float, most: float) -> Floats:
+def _refined_at_ends(length: float, size: float, growth: float, most: float) -> Floats:
     """Return positions up to ``length`` with distances that grow from both ends to the middle."""
-    half = _growing(length / 2, size, growth, most)
+    half = _spaced(length / 2, size, growth, most)
     return np.concatenate([half, length - half[-2::-1], [length]])
 
 
-def _outward(length: float, size: float, growth: float, most: float, near: float) -> Floats:
+def _spaced_outward(length: float, size: float, growth: float, most: float, near: float) -> Floats:
     """Return positions up to ``length``; the distances are limited up to the distance ``near``."""
     steps = [size]
     while (position := sum(steps)) < length:

@@ -126,10 +126,10 @@ def solve_separate(
     """
     own = _Blocks.of(magnet, 2 if estimate else 1)
     if not magnet.iron:
-        return _alone(own)
+        return _reaction_without_iron(own)
     blocks, systems = own.blocks, own.systems()
     bodies = iron_rectangles(magnet)
-    remanent = _remembered(field_in_vacuum(blocks))
+    remanent = _cached_field(field_in_vacuum(blocks))
     if not systems:
         return SeparateReaction((), solve_iron(
             bodies, remanent, session, magnet.name, estimate=estimate))
@@ -148,7 +148,7 @@ def solve_separate(
     iron_degree = 8
     for _ in range(most_turns):
         polarized = own.polarized(systems[0], iron.field)
-        source = _sum(remanent, partial(polarized.reaction, degree=iron_degree))
+        source = _sum_of_fields(remanent, partial(polarized.reaction, degree=iron_degree))
         iron = solve_iron(
             bodies, source, session.within("turns"), magnet.name, rough, False, start=iron)
         now = iron.field(middles)
@@ -243,7 +243,7 @@ def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     return interaction.field_function(polarization)
 
 
-def _remembered(function: Field) -> Field:
+def _cached_field(function: Field) -> Field:
     """Return a function that does not compute the field at the same points again."""
     known: dict[bytes, Floats] = {}
 
@@ -256,7 +256,7 @@ def _remembered(function: Field) -> Field:
     return field
 
 
-def _sum(first: Field, second: Field) -> Field:
+def _sum_of_fields(first: Field, second: Field) -> Field:
     """Return the sum of two fields."""
     return lambda points: first(points) + second(points)
 
@@ -341,9 +341,9 @@ class _Blocks:
 
 
 @lru_cache(maxsize=2)  # every map of a campaign, and every round of an update, asks for the same
-def _alone(own: _Blocks) -> SeparateReaction:
+def _reaction_without_iron(own: _Blocks) -> SeparateReaction:
     """Return the reaction of blocks without iron."""
-    known = _alone(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
+    known = _reaction_without_iron(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
     return own.reaction(own.systems(), known=known)
 
 

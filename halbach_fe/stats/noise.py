@@ -22,10 +22,6 @@ from halbach_fe.core.errors import MeasurementError, must_be
 
 Rows = slice | Ints | NDArray[np.bool_]
 
-ASYMMETRY = 1e-9
-"""Largest asymmetry of a covariance, relative to the product of the two standard deviations.
-Rounding in products of sparse matrices gives 1e-15."""
-
 
 @dataclass(frozen=True)
 class NoiseCovariance:
@@ -54,7 +50,10 @@ class NoiseCovariance:
             return
         asymmetry = abs(self.covariance - self.covariance.T).tocoo()
         rows, columns = asymmetry.coords
-        if (asymmetry.data > ASYMMETRY * self.sd[rows] * self.sd[columns]).any():
+        # largest asymmetry of a covariance, relative to the product of the two standard deviations.
+        # Rounding in products of sparse matrices gives 1e-15.
+        largest_asymmetry = 1e-9
+        if (asymmetry.data > largest_asymmetry * self.sd[rows] * self.sd[columns]).any():
             worst = int(np.argmax(asymmetry.data / (self.sd[rows] * self.sd[columns])))
             raise _covariance_error("symmetric", "two different values for readings "
                                     f"{rows[worst] + 1} and {columns[worst] + 1}")

@@ -173,7 +173,7 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     """Return centres, axes, vertices, half heights and cuboid flags in the block's frame."""
     height = block.z_max - block.z_min
     size = np.cbrt(block.volume) / per_side
-    quads = _corrected(quadrilaterals(block.outline, size, per_side), block)
+    quads = _scale_to_outline(quadrilaterals(block.outline, size, per_side), block)
     layers = max(per_side, round(height / size))
     levels = block.z_min + height * (np.arange(layers) + 0.5) / layers
     _, middle = area_and_centroid(quads)
@@ -221,7 +221,7 @@ def _outline_centroid(block: MagnetBlock) -> Floats:
     return total / block.area
 
 
-def _corrected(quads: Floats, block: MagnetBlock) -> Floats:
+def _scale_to_outline(quads: Floats, block: MagnetBlock) -> Floats:
     """Scale and move quadrilaterals (k, 4, 2) to the area and the centroid of an outline."""
     if not any(edge.arc for edge in block.outline):
         return quads
@@ -240,7 +240,7 @@ def quadrilaterals(outline: Outline, size: float, least: int = 1) -> Floats:
     if grid is not None:
         return _grid(grid, size, least)
     polygon = _polygon(outline, size)
-    pieces = _from_centroid(polygon) if _is_convex(polygon) else _merged(
+    pieces = _cut_from_centroid(polygon) if _is_convex(polygon) else _merge_triangles(
         polygon, _triangles(polygon))
     return np.concatenate([_grid(_edges(piece), size) for piece in pieces])
 
@@ -312,7 +312,7 @@ def _is_convex(polygon: Floats) -> bool:
                for i in range(len(polygon)))
 
 
-def _from_centroid(polygon: Floats) -> list[Floats]:
+def _cut_from_centroid(polygon: Floats) -> list[Floats]:
     """Cut a convex polygon (m, 2) into quadrilaterals about its centroid."""
     centre = area_and_centroid(polygon[None])[1][0]
     count = len(polygon)
@@ -348,7 +348,7 @@ def _triangles(polygon: Floats) -> list[tuple[int, int, int]]:
     return [*found, (left[0], left[1], left[2])]
 
 
-def _merged(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floats]:
+def _merge_triangles(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floats]:
     """Return quadrilaterals of the triangles of a polygon (m, 2).
 
     Two triangles that share a side become one if it is convex; others are cut in three.
@@ -370,5 +370,5 @@ def _merged(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floa
                 continue
             break
         else:
-            pieces += _from_centroid(polygon[list(triangle)])
+            pieces += _cut_from_centroid(polygon[list(triangle)])
     return pieces

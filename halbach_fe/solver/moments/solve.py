@@ -277,7 +277,7 @@ def reaction_with_errors(
     return field_with_errors(fine, coarse, points)
 
 
-AT_ONCE = 40_000_000
+ENTRIES_AT_ONCE = 40_000_000
 """Largest number of readings times unknowns at a time, 320 MB."""
 
 Columns = Callable[[int, Ints | slice], Floats]
@@ -305,16 +305,16 @@ def reaction_columns(
     if np.any(system.susceptibility):
         deviations, extra = _deviations(system)
         panels = _Panels(system, extra, {})
-        step = max(1, AT_ONCE // (9 * len(system.remanence)))
+        step = max(1, ENTRIES_AT_ONCE // (9 * len(system.remanence)))
         for first in range(0, len(points), step):
             part = slice(first, first + step)
-            found[:, part] = _some(
+            found[:, part] = _columns_at(
                 system, np.array(points[part], float), deviations, panels,
-                partial(_advance, progress, first, len(points)))
+                partial(_report_progress, progress, first, len(points)))
     return lambda number, some: found[number, some]
 
 
-def _advance(progress: Progress | None, before: int, total: int, done: int) -> None:
+def _report_progress(progress: Progress | None, before: int, total: int, done: int) -> None:
     """Report that points are done after others."""
     if progress is not None:
         progress(before + done, total)
@@ -402,7 +402,7 @@ class _Panels:
             to[:, 3 * first:3 * last] += short @ panel
 
 
-def _some(
+def _columns_at(
     system: System, points: Floats, deviations: _Deviations, panels: _Panels,
     done: Callable[[int], object],
 ) -> Floats:
@@ -414,7 +414,7 @@ def _some(
     count = len(chi)
     rows, size = 3 * len(points), 3 * count
     uniform, start = np.empty((rows, size)), np.empty((rows, size))
-    step = max(1, AT_ONCE // (9 * interaction.cells.weights.size))
+    step = max(1, ENTRIES_AT_ONCE // (9 * interaction.cells.weights.size))
     for first in range(0, len(points), step):
         by_node = interaction.readings(points[first:first + step])
         part = slice(3 * first, 3 * first + 3 * len(by_node))
