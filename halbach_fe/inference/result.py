@@ -30,6 +30,7 @@ from halbach_fe.measurement.doubted_terms import (
     doubts_in_words,
     factor_in_words,
     factor_of,
+    held_back,
     likeness_of,
     shared_doubts,
     words_of,
@@ -551,6 +552,11 @@ class InferenceResult(ShownInNotebook):
             self.response.error, self.prediction_posterior.mean))
         return () if self.doubts else shared_doubts(
             self.magnet, self.posterior.mean, self.prior, float(error / size) if size else 0.0)
+
+    @cached_property
+    def held_back(self) -> tuple[Term, ...]:
+        """Blocks so far off that their prior is refuted, which holds them back nevertheless."""
+        return held_back(self.magnet, self.posterior.mean, self.posterior.sd, self.prior)
 
     @property
     def _doubted(self) -> str:

@@ -185,6 +185,37 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
                         float(of.change[block, axis]), float(of.sd[block, axis]))], of.sd.size)
 
 
+def held_back(magnet: Magnet, mean: Floats, sd: Floats, prior: Gaussian) -> tuple[Term, ...]:
+    """Return the blocks that an update takes far from their priors, which still hold them back.
+
+    Without its prior of standard deviation p, a block with the mean m and the standard deviation s
+    after the update would be at ``m / (1 - (s / p)**2)``. Where the readings alone determine a
+    block, that is m, however far m is. Where they do not, its error bar is not to be believed.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    mean, sd : ndarray, shape (m,), in A/m
+        After the update, of all parameters, of which the first are the magnetizations of blocks.
+    prior : Gaussian
+
+    Returns
+    -------
+    tuple of Term
+        Of each such block the direction that is farthest off, the farthest block first.
+    """
+    of = _Changes.of(magnet, mean - prior.mean, prior.sd)
+    after = _Changes.of(magnet, mean - prior.mean, sd).sd if len(of.numbers) else of.sd
+    ratio = np.minimum(after / np.where(of.sd > 0, of.sd, np.inf), np.sqrt(0.5))
+    held = (of.away > doubted_from(of.sd.size)) & (of.away * ratio / (1 - ratio**2) > 1)
+    found = []
+    for number in np.flatnonzero(held.any(axis=1)):
+        axis = int(np.argmax(np.where(held[number], of.away[number], 0.0)))
+        found.append(Term(f"block {magnet.blocks[of.numbers[number]].name}", "",
+                          float(of.change[number, axis]), float(of.sd[number, axis])))
+    return tuple(sorted(found, key=lambda one: -one.distance))
+
+
 def shared_doubts(magnet: Magnet, mean: Floats, prior: Gaussian, model_error: float = 0.0,
                   ) -> tuple[Term, ...]:
     """Return the doubts about what an update has done to all blocks alike, in strength and turn.

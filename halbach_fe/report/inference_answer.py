@@ -8,7 +8,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
-from halbach_fe.measurement.doubted_terms import ALL_BLOCKS
+from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, MOST_NAMED
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
@@ -16,6 +16,7 @@ from halbach_fe.report.words import (
     faults_in_words,
     flux_density,
     fraction,
+    in_a_row,
     place_of,
     with_error,
 )
@@ -52,14 +53,17 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
     shared = _of_all_blocks(result)
+    single = _of_single_blocks(result)
+    verdict = (f"Only in part. {single} Model" if single else
+               f"Only with care. {shared} But model" if shared else "Yes. Model")
     return Answer(
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
-        f"{f'Only with care. {shared} But model' if shared else 'Yes. Model'} and readings agree: "
-        "chi² per reading "
-        f"before the update is {decimals(result.prior_conflict)}, where 1 is expected and more "
-        f"than {result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
+        f"{verdict} and readings agree: chi² per reading before the update is "
+        f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
+        f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
-        *(AGAIN if shared else _after_agreement(result)))
+        *(_after_a_conflict(result) if single else AGAIN if shared else _after_agreement(result)),
+        sound=not single)
 
 
 def _after_agreement(result: InferenceResult) -> tuple[str, str]:
@@ -95,6 +99,22 @@ def _of_all_blocks(result: InferenceResult) -> str:
                 f": state how far either may be off ({' and '.join(keys)}), and update again."
                 if keys else "."))
     return " ".join(said)
+
+
+def _of_single_blocks(result: InferenceResult) -> str:
+    """Say which blocks are so far off that their prior is wrong and still acts; else nothing."""
+    blocks = result.held_back
+    if not blocks:
+        return ""
+    first, one = blocks[0], len(blocks) == 1
+    named = in_a_row([each.name.removeprefix("block ") for each in blocks[:MOST_NAMED]])
+    more = f" and {len(blocks) - MOST_NAMED} more" if len(blocks) > MOST_NAMED else ""
+    return (f"{'Block' if one else 'Blocks'} {named}{more} {'is' if one else 'are'} up to "
+            f"{decimals(first.distance, 2)} standard deviations away from what the study says, "
+            f"which still draws {'it' if one else 'them'} back: the error bars of "
+            f"{'this block and its' if one else 'these blocks and their'} neighbours are too "
+            "short. Find out what is the matter (diagnose), or state it in the study "
+            "([[array.exceptions]], or a wider [prior]), and update again.")
 
 
 def _of_the_probe(result: InferenceResult) -> str:

@@ -28,6 +28,7 @@ from halbach_fe.inference.registration import (
     register,
     turn_from_axes,
 )
+from halbach_fe.magnets import to_magpylib
 from halbach_fe.measurement.doubted_terms import (
     ALL_AXES,
     ALL_BLOCKS,
@@ -307,6 +308,33 @@ def test_what_all_blocks_share_is_compared_with_the_prior_of_their_mean(
         assert term.distance > 4.5
         assert ("gain of the instrument" in said.trust) == (factor != 1)
         assert f"[instrument_sd] {'rotation_rad' if turn else 'gain'}" in said.trust
+
+
+@pytest.mark.parametrize(("weak", "sigma_T", "held"), [
+    (0.12, 1e-3, True),
+    (0.015, 1e-3, False),  # 1.5 standard deviations of its prior
+    (0.12, 2e-6, False)])  # the readings alone say where it is
+def test_a_block_that_its_prior_holds_back_is_named(generator, tmp_path, weak, sigma_T, held):
+    """One block is weaker than a prior of 1 % allows, and the readings know it to 0.5 % only."""
+    magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
+    source = to_magpylib(magnet)
+    source[2].polarization = (1 - weak) * source[2].polarization
+    points = 0.6 * GRID
+    result = infer(magnet, field_map(points, source.getB(points) + sigma_T * (
+        generator.standard_normal(points.shape)), sigma_T), Session.open(tmp_path))
+    block = np.linalg.norm(result.posterior.mean[6:9]) / np.linalg.norm(
+        magnet.nominal_magnetization[6:9])
+    said = inference_answer(result)
+    assert [one.name for one in result.held_back][:1] == ["block r01s03"] * held
+    if held:
+        assert not said.sound
+        assert block > 1 - weak + 0.005  # it is held back indeed
+        assert said.trust.startswith("Only in part. Block")
+        assert "r01s03" in said.trust
+        assert "halbach-fe diagnose" in said.command
+    else:
+        assert block == pytest.approx(1 - weak, abs=0.01)
+        assert "Only in part" not in said.trust
 
 
 def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path):
