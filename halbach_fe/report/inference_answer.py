@@ -27,6 +27,10 @@ ALONG_AN_AXIS = 1e-6
 """Angle in rad up to which the direction of a sensor counts as an axis: of 1 T across it shows
 1 µT."""
 
+LOOK = ("Look for what the study lacks. (Before that, halbach-fe check tests the map by itself, and "
+        "register finds where it lies.)", "halbach-fe diagnose STUDY --measurements MAP -o DIR")
+"""The next step, and its command, if model and measurement disagree, or a block and its prior."""
+
 AGAIN = ("State in the study how far that may be off, and update again.",
          "halbach-fe infer STUDY --measurements MAP -o DIR")
 """The next step, and its command, if something of all blocks is in doubt."""
@@ -62,7 +66,7 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
         f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
-        *(_after_a_conflict(result) if single else AGAIN if shared else _after_agreement(result)),
+        *(LOOK if single else AGAIN if shared else _after_agreement(result)),
         sound=not single)
 
 
@@ -159,9 +163,7 @@ def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
         return ("First lower the solver's error, as is said above, and update again: as it is, it "
                 "hides what the study may lack. This command shows how it falls.",
                 "halbach-fe verify STUDY -o DIR")
-    return ("Look for what the study lacks. (Before that, halbach-fe check tests the map by "
-            "itself, and register finds where it lies.)",
-            "halbach-fe diagnose STUDY --measurements MAP -o DIR")
+    return LOOK
 
 
 def _of_the_sign(result: InferenceResult) -> str:
