@@ -27,8 +27,8 @@ ALONG_AN_AXIS = 1e-6
 """Angle in rad up to which the direction of a sensor counts as an axis: of 1 T across it shows
 1 µT."""
 
-LOOK = ("Look for what the study lacks. (Before that, halbach-fe check tests the map by itself, and "
-        "register finds where it lies.)", "halbach-fe diagnose STUDY --measurements MAP -o DIR")
+LOOK = ("Look for what the study lacks. (Before that, halbach-fe check tests the map by itself, "
+        "and register finds where it lies.)", "halbach-fe diagnose STUDY --measurements MAP -o DIR")
 """The next step, and its command, if model and measurement disagree, or a block and its prior."""
 
 AGAIN = ("State in the study how far that may be off, and update again.",
