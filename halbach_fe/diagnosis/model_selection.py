@@ -275,6 +275,7 @@ def select_effects(
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
+    seen: set[frozenset[int]] = set()
     while candidates and len(chosen) < max_effects:
         conditional = with_candidates(evidence, [candidates[number] for number in chosen])
         odds = log_bayes_factors(conditional, candidates) + prior
@@ -287,10 +288,12 @@ def select_effects(
             break
         before = len(chosen)
         chosen = _at_best_places(evidence, candidates, [*chosen, best], excluded)
+        chosen = _exchanged(evidence, candidates, chosen, prior, excluded)
         best = chosen[-1]
         chosen = _without_needless(evidence, candidates, chosen, prior)
-        if best not in chosen or len(chosen) <= before - 1:
+        if best not in chosen or len(chosen) <= before - 1 or frozenset(chosen) in seen:
             break  # else the same candidates would be added and dropped for ever
+        seen.add(frozenset(chosen))
     return [selected_effect(evidence, candidates, chosen, number, prior, excluded)
             for number in chosen]
 
@@ -309,6 +312,29 @@ def _at_best_places(
             factors = log_bayes_factors(with_candidates(evidence, others),
                                         [candidates[k] for k in places])
             chosen[index] = places[int(np.argmax(factors))]
+    return chosen
+
+
+def _exchanged(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int], prior: Floats,
+    excluded: Collection[int],
+) -> list[int]:
+    """Put likelier candidates in place of chosen ones, given the other chosen ones.
+
+    What came first had to explain what others explain now: a block that was displaced as far as a
+    turned map looked like it may be a weak one.
+    """
+    chosen = list(chosen)
+    for index, number in enumerate(chosen):
+        others = [k for k in chosen if k != number]
+        odds = log_bayes_factors(
+            with_candidates(evidence, [candidates[k] for k in others]), candidates) + prior
+        taken = {candidates[k].effect for k in others if candidates[k].unique}
+        odds[[k for k, one in enumerate(candidates)
+              if k in others or k in excluded or one.effect in taken]] = -np.inf
+        best = int(np.argmax(odds))
+        if odds[best] > odds[number] + INDISTINGUISHABLE_LOG_EVIDENCE:
+            chosen[index] = best
     return chosen
 
 

@@ -148,6 +148,25 @@ def test_twins_are_named_together():
     assert set(found.effects) == {"effect 0", "effect 19"}
 
 
+@pytest.mark.parametrize(("apart", "named"), [(0.4, {"true", "late"}), (0.02, {"mixed", "late"})])
+def test_what_came_first_gives_way_to_what_is_likelier_in_the_end(generator, apart, named):
+    """A cause that looks like two together comes first; beside the second, the first is likelier.
+
+    Negative control: one that is hardly apart from it then stays, and the true one is a rival.
+    """
+    first, late, other = generator.standard_normal((3, 400))
+    signatures = np.column_stack([first, late, first + 0.6 * late + apart * other])
+    residual = first + 0.6 * late + 0.5 * generator.standard_normal(400)
+    candidates = [Candidate(name, "", (number,)) for number, name in enumerate(
+        ("true", "late", "mixed"))]
+    residual = residual + 0.3 * late
+    evidence = Marginal.of(np.zeros((400, 1))).evidence(2 * signatures, 2 * residual)
+    found = {one.candidate.effect: one for one in select_effects(evidence, candidates)}
+    assert found.keys() == named
+    if "mixed" in named:
+        assert "true" in found["mixed"].effects
+
+
 def test_factors_beside_others_are_what_is_left_for_an_effect():
     evidence, candidates = hidden({0: 1.0, 3: 1.0})
     alone = best_factors(evidence, candidates)
