@@ -148,7 +148,7 @@ def test_twins_are_named_together():
     assert set(found.effects) == {"effect 0", "effect 19"}
 
 
-@pytest.mark.parametrize(("apart", "named"), [(0.4, {"true", "late"}), (0.02, {"mixed", "late"})])
+@pytest.mark.parametrize(("apart", "named"), [(0.1, {"true", "late"}), (0.02, {"mixed", "late"})])
 def test_what_came_first_gives_way_to_what_is_likelier_in_the_end(generator, apart, named):
     """A cause that looks like two together comes first; beside the second, the first is likelier.
 
