@@ -27,14 +27,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of
-from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.outline import Outline, plane_rotation
 from halbach_fe.geometry.symmetry import rotation_about_z
 
 _STEP = 1e-4
@@ -55,6 +55,9 @@ errors."""
 _SAME_FIELD = 1e-11
 """Relative difference of the fields of two blocks that is rounding. A block that is displaced by a
 nanometre differs by more."""
+
+_DIGITS = 13
+"""Of lengths in m, of blocks of the same shape: more than some rounding errors."""
 
 _RECTANGULAR = 1e-13
 """Largest deviation of a rectangle's corners, relative to its sides: some rounding errors."""
@@ -155,13 +158,14 @@ def matrix_of(six: Floats) -> Floats:
 def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     """Return B (n, 3) in T of blocks with their nominal remanence in vacuum.
 
-    Blocks of the same shape are evaluated at once, each at the points of its frame. At points
-    inside a block the result lacks the block's own remanence, see `unit_field`.
+    Blocks of the same shape, such as those of a ring, are evaluated at once, each at the points of
+    its frame. At points inside a block the result lacks the block's own remanence, see
+    `unit_field`.
     """
     alike: dict[object, list[MagnetBlock]] = defaultdict(list)
     for block in blocks:
-        alike[block.outline, block.z_min, block.z_max, block.gradient, block.corner_loss].append(
-            block)
+        alike[_upright(block.outline, _turn_deg(block)), round(block.z_max - block.z_min, _DIGITS),
+              block.gradient, block.corner_loss].append(block)
     total, most = np.zeros((len(points), 3)), 1 + _AT_ONCE // max(1, len(points))
     for same in alike.values():
         for first in range(0, len(same), most):
@@ -169,9 +173,27 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     return total
 
 
+def _turn_deg(block: MagnetBlock) -> float:
+    """Return the angle by which a block's outline is turned in its frame, in degrees."""
+    return 0.0 if any(block.origin_m) or any(block.orientation_rad) else block.angle_deg
+
+
+@lru_cache(maxsize=4096)
+def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
+    """Return what outlines have in common that are turned by different angles about z."""
+    corners = [corner for edge in outline for corner in (edge.start, edge.end)]
+    turned = np.round(corners @ plane_rotation(np.radians(angle_deg)), _DIGITS)
+    return tuple(turned.ravel().tolist()), tuple(edge.arc for edge in outline)
+
+
 def _field_of_alike(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
-    """Return `field_of` of blocks of the same shape."""
+    """Return `field_of` of blocks of the same shape, but for turns and shifts in their frames."""
     positions, axes = frames_of(blocks)
+    axes = axes @ np.array([rotation_about_z(np.radians(_turn_deg(block) - _turn_deg(blocks[0])))
+                            for block in blocks])
+    if np.isfinite(blocks[0].z_min):
+        z = np.array([block.z_min for block in blocks])
+        positions = positions + (z - z[0])[:, None] * axes[:, :, 2]
     places = (points - positions[:, None]) @ axes
     fields = _frame_field(blocks[0], places.reshape(-1, 3)).reshape(len(blocks), -1, 6)
     remanences = np.array([block.easy_axis for block in blocks]) * np.array(
@@ -196,12 +218,13 @@ def field_on_circles(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
 
     Points (angles k, 3) at equidistant angles, angle by angle, are mapped onto each other by turns
     about z. Of blocks that such turns map onto each other, as those of a ring, one is evaluated.
-    Points elsewhere are evaluated for every block.
     """
     angles = _equidistant_angles(points)
+    if angles == 1:
+        return field_of(blocks, points)
     total = np.zeros((angles, len(points) // angles, 3))
     for members in _turned_blocks(blocks, points[[0, len(points) // 3, 2 * len(points) // 3]],
-                                  angles) if angles > 1 else [[(0, block)] for block in blocks]:
+                                  angles):
         first = members[0][1]
         local = _local_field(first, points)
         for steps, block in members:
