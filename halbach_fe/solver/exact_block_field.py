@@ -99,9 +99,17 @@ def _frame_field(block: MagnetBlock, points: Floats) -> Floats:
 
 
 def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
-    """Yield `unit_field` of every block, in order."""
-    for block in blocks:
-        yield unit_field(block, points)
+    """Yield `unit_field` of every block, in order; blocks of one shape are evaluated at once."""
+    most = 1 + _AT_ONCE // max(1, len(points))
+    basis = matrix_of(np.eye(6))
+    for first in range(0, len(blocks), most):
+        some = blocks[first:first + most]
+        found = np.empty((len(some), len(points), 6))
+        for same in _alike(some):
+            fields, axes = _fields_of_alike([some[number] for number in same], points)
+            turned = axes[:, None] @ basis @ axes[:, None].transpose(0, 1, 3, 2)
+            found[same] = fields @ turned[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        yield from map(matrix_of, found)
 
 
 def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
@@ -162,15 +170,25 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     its frame. At points inside a block the result lacks the block's own remanence, see
     `unit_field`.
     """
-    alike: dict[object, list[MagnetBlock]] = defaultdict(list)
-    for block in blocks:
-        alike[_upright(block.outline, _turn_deg(block)), round(block.z_max - block.z_min, _DIGITS),
-              block.gradient, block.corner_loss].append(block)
     total, most = np.zeros((len(points), 3)), 1 + _AT_ONCE // max(1, len(points))
-    for same in alike.values():
+    for same in _alike(blocks):
         for first in range(0, len(same), most):
-            total += _field_of_alike(same[first:first + most], points)
+            some = [blocks[number] for number in same[first:first + most]]
+            fields, axes = _fields_of_alike(some, points)
+            remanences = np.array([block.easy_axis for block in some]) * np.array(
+                [[block.remanence] for block in some])
+            sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
+            total += np.einsum("bnk,bki->ni", fields, sums, optimize=True)
     return total
+
+
+def _alike(blocks: Sequence[MagnetBlock]) -> list[list[int]]:
+    """Return the numbers of blocks of the same shape, but for turns and shifts in their frames."""
+    alike: dict[object, list[int]] = defaultdict(list)
+    for number, block in enumerate(blocks):
+        alike[_upright(block.outline, _turn_deg(block)), round(block.z_max - block.z_min, _DIGITS),
+              block.gradient, block.corner_loss].append(number)
+    return list(alike.values())
 
 
 def _turn_deg(block: MagnetBlock) -> float:
@@ -186,8 +204,14 @@ def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
     return tuple(turned.ravel().tolist()), tuple(edge.arc for edge in outline)
 
 
-def _field_of_alike(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
-    """Return `field_of` of blocks of the same shape, but for turns and shifts in their frames."""
+def _fields_of_alike(
+    blocks: Sequence[MagnetBlock], points: Floats
+) -> tuple[Floats, Floats]:
+    """Return the field matrices (blocks, n, 6) of `_alike` blocks along their axes, and the axes
+    (blocks, 3, 3) as columns, turned so that all outlines are that of the first block.
+    """
+    if len(blocks) == 1:
+        return _local_field(blocks[0], points)[None], blocks[0].axes[None]
     positions, axes = frames_of(blocks)
     axes = axes @ np.array([rotation_about_z(np.radians(_turn_deg(block) - _turn_deg(blocks[0])))
                             for block in blocks])
@@ -195,11 +219,7 @@ def _field_of_alike(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
         z = np.array([block.z_min for block in blocks])
         positions = positions + (z - z[0])[:, None] * axes[:, :, 2]
     places = (points - positions[:, None]) @ axes
-    fields = _frame_field(blocks[0], places.reshape(-1, 3)).reshape(len(blocks), -1, 6)
-    remanences = np.array([block.easy_axis for block in blocks]) * np.array(
-        [[block.remanence] for block in blocks])
-    sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
-    return np.einsum("bnk,bki->ni", fields, sums, optimize=True)
+    return _frame_field(blocks[0], places.reshape(-1, 3)).reshape(len(blocks), -1, 6), axes
 
 
 def _sums(polarization: Floats) -> Floats:
