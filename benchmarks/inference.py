@@ -19,10 +19,9 @@ from halbach_fe.response.nonlinear import nonlinear_model
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.convergence import assess_convergence
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.stats.noise import independent_noise
-from halbach_fe.stats.pcn import Posterior, Proposal, prior_reference, sample
+from halbach_fe.stats.pcn import Posterior, Proposal, assess_convergence, prior_reference, sample
 from halbach_fe.study.reader import read_study
 
 STUDIES = Path(__file__).parent.parent / "studies"

@@ -25,8 +25,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.moments.columns import reaction_columns
-from halbach_fe.solver.moments.solve import reaction_with_errors, solve_moments
+from halbach_fe.solver.moments.solve import reaction_columns, reaction_with_errors, solve_moments
 from tests.solver.moments.test_solve import (
     around,
     near_points,

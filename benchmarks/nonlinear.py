@@ -19,9 +19,8 @@ from halbach_fe.response.discretization_error import error_bar_session, reading_
 from halbach_fe.response.nonlinear import newton_readings, nonlinear_model
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, vacuum_part
-from halbach_fe.solver.formulations import CROSS_SECTION
 from halbach_fe.solver.getdp import find_getdp
-from halbach_fe.solver.magnetostatics import RunRequest, fill_run_folder
+from halbach_fe.solver.magnetostatics import CROSS_SECTION, RunRequest, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior

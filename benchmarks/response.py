@@ -16,9 +16,8 @@ from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import reading_errors, refined
+from halbach_fe.response.discretization_error import reading_errors, refined, verify
 from halbach_fe.response.matrix import Response, response_matrix
-from halbach_fe.response.mesh_convergence import verify
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.azimuthal_modes import solve_modes
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part

@@ -27,7 +27,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from halbach_fe.cli.guard import claim_buffers, guarded
 from halbach_fe.cli.streams import say as say
 from halbach_fe.cli.streams import show
-from halbach_fe.core.errors import MAX_QUOTED, OutputError, StudyError, must_be, printable
+from halbach_fe.core.errors import (
+    MAX_QUOTED,
+    MeasurementError,
+    OutputError,
+    StudyError,
+    must_be,
+    printable,
+)
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import HIGHEST_ORDER, LIMIT_PPM, LIMIT_UNITS
 
@@ -368,15 +375,29 @@ def read_measurements(
 
 
 def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
-    """Read a map, in halbach-fe's own columns or as the options of `import-map` describe it."""
-    from halbach_fe.measurement.field_map import read_map
-
-    if not _describes_a_format(arguments):
-        return read_map(path)
+    """Read a map in halbach-fe's own columns, as the options of `import-map` describe it, or as
+    the file itself says.
+    """
     from halbach_fe.cli.format_options import declared_format
+    from halbach_fe.measurement.field_map import FOREIGN, read_map
+    from halbach_fe.measurement.formats.declared import DeclaredFormat
     from halbach_fe.measurement.formats.files import import_map
 
-    imported = import_map(path, declared_format(arguments), arguments.format)
+    if _describes_a_format(arguments):
+        imported = import_map(path, declared_format(arguments), arguments.format)
+    else:
+        try:
+            return read_map(path)
+        except MeasurementError as refused:
+            if FOREIGN not in str(refused):  # it is our own, and has a fault
+                raise
+            try:
+                imported = import_map(path, DeclaredFormat())
+            except MeasurementError:
+                raise refused from None
+        units = imported.imported
+        say(f"Read {path.name} as {imported.format}, with positions in "
+            f"{', '.join(units.length_units)} and B in {', '.join(units.field_units)}.")
     for remark in imported.imported.remarks:
         say(remark)
     data = imported.data

@@ -128,12 +128,10 @@ def _format_names() -> frozenset[str]:
 def run(arguments: argparse.Namespace) -> int:
     """Run what is needed, and join the pages."""
     from halbach_fe.cli import report
+    from halbach_fe.explanation import follow
 
     steps = _Explanation(arguments, arguments.study, arguments.map)
-    steps.check()
-    if not (steps.infer("inferred") or (steps.register() and steps.infer("updated"))
-            ) and steps.diagnose():
-        steps.infer("explained")
+    follow(steps)
     common.say("")
     return report.run(argparse.Namespace(
         folders=steps.folders, output=arguments.output / PAGE, json=arguments.json))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from halbach_fe.cli import common
 from halbach_fe.core.result_folder import single_file
-from halbach_fe.geometry.block_export import blocks_table
+from halbach_fe.geometry.free_blocks import blocks_table
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
 from halbach_fe.measurement.formats.files import WRITERS, export_map

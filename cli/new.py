@@ -9,24 +9,11 @@ import argparse
 import os
 import shlex
 from collections.abc import Mapping
-from dataclasses import replace
-
-import numpy as np
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CommandLineError, must_be
-from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.measurement.positions import points_from
-from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study, write_new_study
-
-LEAST_SIGMA_T = 1e-6
-"""Noise of the best probes in T."""
-
-STAGES_M = (1e-5, 1e-4)
-"""Errors in m of good and of usual stages."""
-
-FIELDS = 200
-"""About so many points suffice for the size of the field."""
+from halbach_fe.magnets import new_magnet
+from halbach_fe.study.template import MagnetTemplate, write_new_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,37 +85,17 @@ def run(arguments: argparse.Namespace) -> int:
     path, folder = arguments.study, arguments.study.parent
     if "free_blocks" in given:
         given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)
-    template = MagnetTemplate(**given)
-    magnet = build_magnet(parse_new_study(new_study(path.stem, template, folder), folder))
+    magnet, template = new_magnet(MagnetTemplate(**given), path.stem, folder)
     if template.dsv_m is not None:
         from halbach_fe.response.homogeneity import Region, region_points
 
         region_points(magnet, Region.sphere(template.dsv_m / 2))  # refuses one that is not in air
-    sigma, position = _noise(magnet)
-    write_new_study(path, replace(template, sigma_T=sigma, position_sd_m=position))
+    write_new_study(path, template)
     name = str(path) if not str(path).startswith("-") else f"./{path}"
-    common.say(f"Wrote {path}. Its noise suits the field of the magnet: {1e6 * sigma:g} µT for a "
-               f"reading, {1e6 * position:g} µm for a position. Next: halbach-fe solve "
-               f"{shlex.quote(name)} -o DIR")
+    common.say(f"Wrote {path}. Its noise suits the field of the magnet: "
+               f"{1e6 * template.sigma_T:g} µT for a reading, {1e6 * template.position_sd_m:g} µm "
+               f"for a position. Next: halbach-fe solve {shlex.quote(name)} -o DIR")
     return 0
-
-
-def _noise(magnet: Magnet) -> tuple[float, float]:
-    """Return standard deviations of a reading in T and of a position in m that suit a magnet, of
-    one digit.
-
-    A good probe reads to a ten-thousandth of the largest field, but not below `LEAST_SIGMA_T`. A
-    stage is so exact that its errors make about the same noise, within `STAGES_M`. The field is
-    that of the blocks alone.
-    """
-    from halbach_fe.solver.exact_block_field import field_of, gradient_of
-
-    points = points_from(magnet.study.observation.positions)
-    points = points[::max(1, len(points) // FIELDS)]
-    sigma = max(LEAST_SIGMA_T, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
-    slope = float(np.sqrt(np.mean(gradient_of(magnet.blocks, points) ** 2)))
-    stage = float(np.clip(sigma / slope if slope else np.inf, *STAGES_M))
-    return float(f"{sigma:.1g}"), float(f"{stage:.1g}")
 
 
 def _check(given: Mapping[str, object], radius_m: float | None) -> None:

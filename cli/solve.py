@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.response.solution import solve, study_observation, write_solution
     from halbach_fe.solver.formulation_choice import choose_route
-    from halbach_fe.solver.runs import newton_history
+    from halbach_fe.solver.session import newton_history
     from halbach_fe.study.reader import read_study
 
     started = time.monotonic()

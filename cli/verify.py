@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.report.verification import answer, difference_table, write_verification
     from halbach_fe.report.words import flux_density
-    from halbach_fe.response.mesh_convergence import verify
+    from halbach_fe.response.discretization_error import verify
     from halbach_fe.response.resource_estimate import estimate_verify
     from halbach_fe.study.reader import read_study
 

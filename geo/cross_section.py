@@ -11,18 +11,13 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geo.element_size import set_element_sizes
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.geometry import regions as tags
+from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.domain import boundary_radius
+from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_radius
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.regions import BlockRegion, Regions
-
-LINE, TRIANGLE = 1, 2
-"""Gmsh's element types of straight edges and triangles."""
 
 COUNTED = 4000
 """Number of triangles up to which an estimate of a mesh's size builds the mesh itself; finer meshes
@@ -31,12 +26,6 @@ are extrapolated from one of about this size, which takes half a second."""
 DRAWN = 64
 """Number of blocks up to which an estimate of a mesh's size draws all of them; larger rings are
 extrapolated from so many blocks, which takes a second."""
-
-ALONG_CURVES = 0.7
-"""Exponent of the refinement with which the number of excess triangles grows. A mesh has more
-triangles than area and element size imply, because every curve is cut into whole edges. Measured
-are 0.55 to 0.85 on four cross-sections of trapezoids, cubes and sectors, refined by steps of two.
-The excess is about a quarter of all triangles, so that this range means an error of 3 %."""
 
 
 def mesh_2d(magnet: Magnet, mesh_path: Path) -> Regions:
@@ -124,22 +113,31 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     drawn = magnet.with_study(magnet.study.model_copy(update={"mesh": mesh.model_copy(update={
         "block_size_m": mesh.block_size_m * coarser,
         "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})}))
-    triangles, rim = _counted(drawn, blocks[:DRAWN], radius)
+    triangles, rim = _count_triangles(drawn, blocks[:DRAWN], radius)
     excess = triangles - _equilateral(drawn, radius)
     if len(blocks) > DRAWN:  # every further block adds the same number of triangles
-        fewer, _ = _counted(drawn, blocks[:DRAWN // 2], radius)
+        fewer, _ = _count_triangles(drawn, blocks[:DRAWN // 2], radius)
         excess += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
-    return wanted + excess * coarser**ALONG_CURVES, rim
+    # exponent of the refinement with which the number of excess triangles grows. A mesh has more
+    # triangles than area and element size imply, because every curve is cut into whole edges.
+    # Measured are 0.55 to 0.85 on four cross-sections of trapezoids, cubes and sectors, refined by
+    # steps of two. The excess is about a quarter of all triangles, so that this range means an
+    # error of 3 %.
+    excess_exponent = 0.7
+    return wanted + excess * coarser**excess_exponent, rim
 
 
-def _counted(magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float) -> tuple[int, int]:
+def _count_triangles(
+    magnet: Magnet, blocks: tuple[MagnetBlock, ...], radius: float
+) -> tuple[int, int]:
     """Return the numbers of triangles and of outer edges of the plane mesh of these blocks."""
+    line, triangle = 1, 2  # Gmsh's element types of straight edges and triangles
     with gmsh_session(magnet.name):
         draw(magnet, blocks, radius)
         gmsh.model.mesh.generate(2)
         mesh = gmsh.model.mesh
-        rim = sum(len(mesh.getElementsByType(LINE, curve)[0]) for curve in outer_curves(radius))
-        return len(mesh.getElementsByType(TRIANGLE)[0]), rim
+        rim = sum(len(mesh.getElementsByType(line, curve)[0]) for curve in outer_curves(radius))
+        return len(mesh.getElementsByType(triangle)[0]), rim
 
 
 def _equilateral(magnet: Magnet, radius: float) -> float:
@@ -218,3 +216,30 @@ def _surface(outline: Outline, place: Callable[[Floats], Floats] | None = None) 
         else:
             curves.append(occ.addLine(*ends))
     return int(occ.addPlaneSurface([occ.addCurveLoop(curves)]))
+
+
+def set_element_sizes(magnet: Magnet) -> None:
+    """Set the element sizes in Gmsh.
+
+    The size is constant in the bore and in the magnet, and grows linearly outside. The sizes are
+    Gmsh fields, because a Python callback would swallow Ctrl-C during meshing.
+    """
+    block_size = magnet.study.mesh.block_size_m
+    bore_size = magnet.study.mesh.bore_size_m or block_size
+    rise, outer_radius = magnet.study.mesh.growth - 1, magnet.radius
+    field = gmsh.model.mesh.field
+    constant, growing, bore = field.add("MathEval"), field.add("MathEval"), field.add("Cylinder")
+    field.setString(constant, "F", f"{block_size:.17g}")
+    field.setString(growing, "F",
+                    f"{block_size:.17g} + {rise:.17g} * (sqrt(x^2 + y^2) - {outer_radius:.17g})")
+    outside = field.add("Max")
+    field.setNumbers(outside, "FieldsList", [constant, growing])
+    finer = bore_size < block_size
+    for name, value in (("Radius", magnet.bore_radius * (1 - 1e-9)), ("ZAxis", 1.0),
+                        ("VIn", bore_size), ("VOut", 1e22 if finer else 0.0)):
+        field.setNumber(bore, name, value)
+    size = field.add("Min" if finer else "Max")
+    field.setNumbers(size, "FieldsList", [bore, outside])
+    field.setAsBackgroundMesh(size)
+    for option in ("ExtendFromBoundary", "FromPoints", "FromCurvature"):
+        gmsh.option.setNumber(f"Mesh.MeshSize{option}", 0)

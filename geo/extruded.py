@@ -17,10 +17,9 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geo.cross_section import draw, regions_of
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.geometry import regions as tags
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry import domain as tags
+from halbach_fe.geometry.domain import Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.regions import Regions
 
 TRIANGLE6, TETRAHEDRON10 = 9, 11
 """Gmsh's element types of second-order triangles and tetrahedra."""

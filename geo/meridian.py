@@ -1,7 +1,8 @@
-"""Mesh of the (r, z) half-plane of a rotationally symmetric magnet, in rectangles.
+"""Meshes of the (r, z) half-plane in rectangles: of a magnet, and of rotationally symmetric iron.
 
-The azimuthal-mode solver uses it. The mesh's x is r and its y is z. All blocks of a ring form one
-region, because their permeability does not depend on the azimuth.
+The mesh has r as its x and z as its y. The azimuthal-mode solver uses that of a magnet; all blocks
+of a ring form one region, because their permeability does not depend on the azimuth. In the mesh
+around iron alone blocks are air, and its grid lines come from `halbach_fe.solver.iron_modes`.
 """
 
 from __future__ import annotations
@@ -11,21 +12,15 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
+import gmsh
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geo.grid import add_grid
 from halbach_fe.geo.session import gmsh_session, write_mesh
-from halbach_fe.geometry import regions as tags
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry import domain as tags
+from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.regions import BlockRegion, Regions
-
-_GROWTH = 1.35
-"""Ratio of the sizes of neighbouring elements towards the outer boundary."""
-
-_GRADING, _LEVELS = 0.3, 2
-"""Refinement at corners of materials: ratio of successive subdivisions, and their number."""
 
 
 def mesh_meridian(magnet: Magnet, size: float, mesh_path: Path) -> Regions:
@@ -107,11 +102,13 @@ def _graded(positions: list[float], corners: list[float]) -> Floats:
     """
     x = np.array(positions)
     added = []
+    # refinement at corners of materials: ratio of successive subdivisions, and their number
+    grading, levels = 0.3, 2
     for corner in corners:
         i = int(np.argmin(np.abs(x - corner)))
         for neighbour in (i - 1, i + 1):
             step = x[neighbour] - x[i]
-            added += [x[i] + step * _GRADING**level for level in range(1, _LEVELS + 1)]
+            added += [x[i] + step * grading**level for level in range(1, levels + 1)]
     return np.unique(np.concatenate([x, added]))
 
 
@@ -131,8 +128,9 @@ def _uniform(stops: list[float], size: float) -> list[float]:
 def _growing(start: float, size: float, stop: float) -> list[float]:
     """Return positions after ``start`` up to ``stop`` with geometrically growing distances."""
     result, position = [], start
+    growth = 1.35  # ratio of the sizes of neighbouring elements towards the outer boundary
     while position < stop:
-        size *= _GROWTH
+        size *= growth
         position = stop if stop - position < 1.5 * size else position + size
         result.append(position)
     return result
@@ -145,3 +143,72 @@ def _materials(magnet: Magnet, r: Floats, z: Floats) -> Ints:
     for inner, outer, low, high, tag in _rectangles(magnet):
         result[(r > inner) & (r < outer) & (z > low) & (z < high)] = tag
     return result
+
+
+def mesh_half_plane(
+    name: str, r: Floats, z: Floats, in_iron: NDArray[np.bool_], mesh_path: Path
+) -> Regions:
+    """Mesh the half-plane by a grid, write the mesh, and return its regions.
+
+    Parameters
+    ----------
+    name : str
+        Name of the study.
+    r, z : ndarray, in m
+        Grid lines, ascending; ``r`` starts at 0.
+    in_iron : ndarray of bool, shape (len(r) - 1, len(z) - 1)
+        The rectangles of the grid that are iron.
+    mesh_path : Path
+
+    Raises
+    ------
+    MeshError
+        If Gmsh fails.
+    """
+    with gmsh_session(name):
+        add_grid(r, z, np.where(in_iron, tags.IRON_TAG, tags.AIR_TAG))
+        write_mesh(mesh_path)
+    return Regions(study=name, dimension=2, air=tags.AIR_TAG, iron=tags.IRON_TAG,
+                   outer_boundary=tags.OUTER_BOUNDARY_TAG, axis=tags.AXIS_TAG, blocks=())
+
+
+def add_grid(r: Floats, z: Floats, material: Ints) -> None:
+    """Add the rectangles of a grid to the Gmsh model, as one discrete entity per material.
+
+    The axis and the other limits of the grid become physical curves.
+
+    Parameters
+    ----------
+    r, z : ndarray, in m
+        Grid lines, ascending; ``r`` starts at 0.
+    material : ndarray of int, shape (len(r) - 1, len(z) - 1)
+        Physical tags of the rectangles.
+    """
+    columns, rows = len(r), len(z)
+    points = np.zeros((columns * rows, 3))
+    points[:, 0] = np.repeat(r, rows)
+    points[:, 1] = np.tile(z, columns)
+    i, j = (index.ravel() for index in np.meshgrid(
+        np.arange(columns - 1), np.arange(rows - 1), indexing="ij"))
+    corner = i * rows + j
+    cells = np.column_stack([corner, corner + rows, corner + rows + 1, corner + 1])
+    up, out = np.arange(rows - 1), np.arange(columns - 1) * rows
+    axis = np.column_stack([up, up + 1])
+    rim = np.vstack([axis + (columns - 1) * rows] + [
+        np.column_stack([out, out + rows]) + level for level in (0, rows - 1)])
+    present = np.unique(material).tolist()
+    for tag in present:
+        gmsh.model.addDiscreteEntity(2, tag)
+    gmsh.model.mesh.addNodes(2, present[0], np.arange(1, len(points) + 1), points.ravel())
+    line, quadrangle = 1, 3  # Gmsh's element types of edges and quadrangles
+    for tag in present:
+        _add(2, quadrangle, tag, cells[material.ravel() == tag])
+    for tag, lines in ((tags.AXIS_TAG, axis), (tags.OUTER_BOUNDARY_TAG, rim)):
+        gmsh.model.addDiscreteEntity(1, tag)
+        _add(1, line, tag, lines)
+
+
+def _add(dimension: int, kind: int, tag: int, nodes: Ints) -> None:
+    """Add elements, rows of ``nodes`` counted from 0, to the discrete entity ``tag``."""
+    gmsh.model.mesh.addElementsByType(tag, kind, [], (nodes + 1).ravel())
+    gmsh.model.addPhysicalGroup(dimension, [tag], tag)

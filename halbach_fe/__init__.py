@@ -3,11 +3,11 @@
 Examples
 --------
 >>> import halbach_fe as hf
+>>> magnet = hf.halbach_ring(order=2, inner_radius_m=0.015, outer_radius_m=0.04, length_m=0.05)
+>>> magnet.field_T([0.01, 0.0, 0.0]).shape
+(3,)
 >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
->>> session = hf.Session.open("results")
->>> hf.solve(magnet, session).flux_density.shape
-(24, 3)
->>> result = hf.infer(magnet, hf.read_map("map.csv"), session)
+>>> result = hf.infer(magnet, hf.read_map("map.csv"), hf.Session.open("results"))
 >>> result.kind
 'closed form'
 """
@@ -48,23 +48,35 @@ if TYPE_CHECKING:
     from halbach_fe.design.tolerance import HomogeneityTolerance as HomogeneityTolerance
     from halbach_fe.design.tolerance import Tolerance as Tolerance
     from halbach_fe.diagnosis.result import Diagnosis as Diagnosis
+    from halbach_fe.explanation import Explanation as Explanation
+    from halbach_fe.explanation import explain as explain
     from halbach_fe.geometry.magnet import Magnet as Magnet
     from halbach_fe.geometry.magnet import build_magnet as build_magnet
+    from halbach_fe.inference.block_prior import prior_from_blocks as prior_from_blocks
     from halbach_fe.inference.infer import infer as infer
+    from halbach_fe.inference.pose_result import Registration as Registration
+    from halbach_fe.inference.registration import register as register
     from halbach_fe.inference.result import InferenceResult as InferenceResult
+    from halbach_fe.magnets import from_magpylib as from_magpylib
+    from halbach_fe.magnets import halbach_ring as halbach_ring
+    from halbach_fe.magnets import magnet_of_blocks as magnet_of_blocks
+    from halbach_fe.magnets import to_magpylib as to_magpylib
+    from halbach_fe.magnets import write_study as write_study
     from halbach_fe.measurement.block_table import BlockTable as BlockTable
     from halbach_fe.measurement.block_table import read_blocks as read_blocks
     from halbach_fe.measurement.campaign import read_maps as read_maps
+    from halbach_fe.measurement.field_map import field_map as field_map
     from halbach_fe.measurement.field_map import read_map as read_map
+    from halbach_fe.measurement.field_map import write_map as write_map
     from halbach_fe.measurement.map_check import MapCheck as MapCheck
     from halbach_fe.measurement.map_check import check_map as check_map
     from halbach_fe.report.campaign_report import campaign_report as campaign_report
     from halbach_fe.report.result_files import write_report as write_report
+    from halbach_fe.response.discretization_error import Verification as Verification
+    from halbach_fe.response.discretization_error import verify as verify
     from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
     from halbach_fe.response.magnetic_axis import magnetic_axis as magnetic_axis
-    from halbach_fe.response.mesh_convergence import Verification as Verification
-    from halbach_fe.response.mesh_convergence import verify as verify
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
     from halbach_fe.response.solution import Solution as Solution
     from halbach_fe.response.solution import solve as solve
@@ -76,12 +88,18 @@ if TYPE_CHECKING:
     from halbach_fe.synthetic.simulate import SimulatedCampaign as SimulatedCampaign
 
 _HOME = {
+    **dict.fromkeys(("halbach_ring", "magnet_of_blocks", "from_magpylib", "to_magpylib",
+                     "write_study"), "magnets"),
+    "explain": "explanation", "Explanation": "explanation",
+    "field_map": "measurement.field_map", "write_map": "measurement.field_map",
+    "register": "inference.registration", "Registration": "inference.pose_result",
+    "prior_from_blocks": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
     "read_map": "measurement.field_map", "read_maps": "measurement.campaign",
     "read_blocks": "measurement.block_table",
     "check_map": "measurement.map_check", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
-    "verify": "response.mesh_convergence", "multipoles": "api", "homogeneity": "api",
+    "verify": "response.discretization_error", "multipoles": "api", "homogeneity": "api",
     "stray_field": "response.stray_field", "StrayField": "response.stray_field",
     "magnetic_axis": "response.magnetic_axis", "MagneticAxis": "response.magnetic_axis",
     "forces": "design.forces",
@@ -94,7 +112,7 @@ _HOME = {
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
     "MapCheck": "measurement.map_check", "Solution": "response.solution",
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",
-    "Verification": "response.mesh_convergence",
+    "Verification": "response.discretization_error",
     "MultipoleReference": "response.multipoles", "MultipoleTables": "api",
     "Region": "response.homogeneity", "HomogeneityResult": "api",
     "Forces": "design.forces",
@@ -110,6 +128,10 @@ __all__ = list(_HOME)
 
 def __getattr__(name: str) -> Any:
     """Import a name of the interface when it is first used."""
+    if name == "__version__":
+        from halbach_fe.core.versions import version
+
+        return version("halbach-fe")
     if name not in _HOME:
         raise AttributeError(f"module 'halbach_fe' has no attribute '{name}'")
     value = getattr(importlib.import_module(f"halbach_fe.{_HOME[name]}"), name)

@@ -60,7 +60,7 @@ from halbach_fe.response.multipoles import (
     multipole_models,
 )
 from halbach_fe.response.stray_field import StrayField, stray_field
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
@@ -147,7 +147,7 @@ class HomogeneityResult(ShownInNotebook):
 
 @alone
 def diagnose(
-    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
+    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session = NOT_KEPT,
     blocks: BlockTable | None = None, effects: Sequence[str | Effect] | None = None,
     validation_map: xr.Dataset | None = None, say: Say = lambda text: None,
     floor_T: Mapping[str, float] | Mapping[str, Mapping[str, float]] | None = None,
@@ -162,7 +162,7 @@ def diagnose(
     data : Dataset or dict of str to Dataset
         The measured map, see `halbach_fe.read_map`; or all maps that the study lists, see
         `halbach_fe.read_maps`.
-    session : Session
+    session : Session, optional
         Its folder receives a subfolder for each round of solving and searching.
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.
@@ -221,7 +221,7 @@ def diagnose(
 
 @alone
 def multipoles(
-    magnet: Magnet, session: Session, reference: MultipoleReference | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, reference: MultipoleReference | None = None,
     posterior: Mapping[str, Gaussian] | InferenceResult | None = None,
 ) -> MultipoleTables:
     """Compute the multipoles of a magnet, with standard deviations.
@@ -232,7 +232,7 @@ def multipoles(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP and the response matrix.
     reference : MultipoleReference, optional
         Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
@@ -275,7 +275,7 @@ def multipoles(
 
 @alone
 def homogeneity(
-    magnet: Magnet, session: Session, region: Region | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, region: Region | None = None,
     posterior: Mapping[str, Gaussian] | InferenceResult | None = None,
     degrees: int = SHOWN_DEGREES, data: xr.Dataset | Mapping[str, xr.Dataset] | None = None,
 ) -> HomogeneityResult:
@@ -284,7 +284,7 @@ def homogeneity(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP and the response matrix.
     region : Region, optional
         By default the study's, or the sphere about the origin of half the radius of the bore.
@@ -331,7 +331,7 @@ def homogeneity(
 
 
 @alone
-def plan(magnet: Magnet, session: Session, points: int | None = None) -> MeasurementPlan:
+def plan(magnet: Magnet, session: Session = NOT_KEPT, points: int | None = None) -> MeasurementPlan:
     """Choose the positions whose readings carry most information about the magnetizations.
 
     If the study has a table ``homogeneity``, they tell most about the deviation of |B| in that
@@ -342,7 +342,7 @@ def plan(magnet: Magnet, session: Session, points: int | None = None) -> Measure
     magnet : Magnet
         The candidates are the positions ``plan.candidates`` of its study, or, by default, the
         positions that the study measures.
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP and the response matrix.
     points : int, optional
         Number of positions to choose; by default the study's ``plan.points``, else the number of
@@ -373,7 +373,8 @@ def plan(magnet: Magnet, session: Session, points: int | None = None) -> Measure
 
 @alone
 def shim(
-    result: InferenceResult, session: Session, reference: MultipoleReference | None = None,
+    result: InferenceResult, session: Session = NOT_KEPT,
+    reference: MultipoleReference | None = None,
     swaps: int = 8, turns: int = 8, replacements: int = 0, limit_units: float | None = None,
     stock: BlockTable | None = None, seed: int = 1, limit_ppm: float | None = None,
     cycles: int = 0,
@@ -386,7 +387,7 @@ def shim(
     ----------
     result : InferenceResult
         The inference of the measured magnet, whose posterior describes the blocks.
-    session : Session
+    session : Session, optional
     reference : MultipoleReference, optional
         Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
         thirds of the bore radius, and orders 1 to 10.
@@ -447,7 +448,7 @@ def shim(
 
 @alone
 def sort(
-    magnet: Magnet, blocks: BlockTable, session: Session,
+    magnet: Magnet, blocks: BlockTable, session: Session = NOT_KEPT,
     reference: MultipoleReference | None = None, seed: int = 1, progress: Progress | None = None,
     turns: bool = False,
 ) -> SortedBlocks:
@@ -462,7 +463,7 @@ def sort(
     magnet : Magnet
     blocks : BlockTable
         The measured blocks, see `halbach_fe.read_blocks`.
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP and the response matrix.
     reference : MultipoleReference, optional
         Radius, orders and z of the multipoles; by default the radius of the study's circle, or two
@@ -506,7 +507,7 @@ def sort(
 
 @alone
 def tolerance(
-    magnet: Magnet, session: Session, blocks: BlockTable | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, blocks: BlockTable | None = None,
     reference: MultipoleReference | None = None, draws: int = 10_000,
     limit_units: float | None = None, seed: int = 1, limit_ppm: float | None = None,
 ) -> Tolerance | HomogeneityTolerance:
@@ -517,7 +518,7 @@ def tolerance(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP and the response matrix.
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.
@@ -566,7 +567,7 @@ def tolerance(
 
 @alone
 def demagnetization(
-    magnet: Magnet, session: Session, across: int = demagnetization_room.ACROSS
+    magnet: Magnet, session: Session = NOT_KEPT, across: int = demagnetization_room.ACROSS
 ) -> DemagnetizationMap:
     """Map how near the blocks are to the knee of their demagnetization curve when they are hot.
 
@@ -574,7 +575,7 @@ def demagnetization(
     ----------
     magnet : Magnet
         Its study needs the table ``demagnetization`` with the material's data and temperature.
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP.
     across : int
         Number of cells across the radial thickness of a block.

@@ -26,9 +26,6 @@ points on the sphere grow with the square of the degree."""
 EMPTY_CELL = "–"
 """Text of a table's cell without an entry."""
 
-TINY = 1e-6
-"""Size below which a number that is shown to people is zero."""
-
 DENSITY = 1000, 20000
 """Smallest and largest density of a magnet in kg/m^3; 7.5 is one in g/cm^3."""
 
@@ -51,9 +48,10 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d{1,4})?", re.ASCII)
 def decimals(value: float, digits: int = 3) -> str:
     """Return a number for people: so many significant digits, no exponent, thousands apart.
 
-    It is "0" below `TINY`.
+    It is "0" below 1e-6.
     """
-    if abs(value) < TINY:
+    tiny = 1e-6  # size below which a number that is shown to people is zero
+    if abs(value) < tiny:
         return "0"
     text = f"{value:.{digits}g}"
     if "e" not in text:

@@ -12,12 +12,6 @@ Progress = Callable[[int, int], None]
 QUIET_S = 10.0
 """Time in s between two lines about the progress of one step."""
 
-FORETOLD = 0.01
-"""Part of a step that must be done before its pace foretells the time left: the first part often
-prepares what all others use."""
-
-MINUTE_S, HOUR_S = 60.0, 3600.0
-
 
 @dataclass
 class Pace:
@@ -65,12 +59,15 @@ class Pace:
         if self.show is not None:
             self.show(done, total)
         now = self.clock()
+        # part of a step that must be done before its pace foretells the time left: the first part
+        # often prepares what all others use
+        foretold_share = 0.01
         # a step may count anew, from 0 or from 1
         if not done or done < self._done or self._total not in (0, total):
             self._step_begun, self._first = now, done
         elif done < total and now - self._said >= QUIET_S:
             left = (now - self._step_begun) * (total - done) / max(done - self._first, 1)
-            foretold = f", about {duration(left)} left" if done >= FORETOLD * total else ""
+            foretold = f", about {duration(left)} left" if done >= foretold_share * total else ""
             self.say(f"{self._step}: {done} of {total}{foretold}")
             self._said = now
         self._total, self._done = total, done
@@ -78,8 +75,9 @@ class Pace:
 
 def duration(seconds: float) -> str:
     """Return a duration in s, min or h, whichever is read most easily."""
-    if seconds < MINUTE_S:
+    minute_s, hour_s = 60.0, 3600.0
+    if seconds < minute_s:
         return f"{seconds:.0f} s"
-    if seconds < HOUR_S:
-        return f"{seconds / MINUTE_S:.0f} min"
-    return f"{seconds / HOUR_S:.1f} h"
+    if seconds < hour_s:
+        return f"{seconds / minute_s:.0f} min"
+    return f"{seconds / hour_s:.1f} h"

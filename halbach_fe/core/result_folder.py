@@ -77,9 +77,6 @@ unless it is its own. A name that is missing here is refused only as it is writt
 RUNS = "getdp-"
 """Beginning of the names of run folders of GetDP."""
 
-MOST_NAMED = 5
-"""Largest number of files that a refusal names."""
-
 _HELD: ContextVar[tuple[Path, ...]] = ContextVar("held", default=())
 """The folders that this run, or this thread, has locked."""
 
@@ -240,9 +237,10 @@ class _Writer:
             return
         names = [str(path.relative_to(self.base)) for path in foreign]
         changed = set(names) <= self.record.files.keys()
-        others = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        named = 5  # largest number of files that a refusal names
+        others = f" and {len(names) - named} more" if len(names) > named else ""
         raise OutputError(
-            f"File {', '.join(names[:MOST_NAMED])}{others} in folder {self.base} "
+            f"File {', '.join(names[:named])}{others} in folder {self.base} "
             + (f"changed after `{self.record.command}` had written it" if changed else
                f"was not written by `{self.record.command}`")
             + f", which would replace it. Name another {self.other}, or move this elsewhere.")
@@ -291,7 +289,7 @@ def result_folder(
     """
     base, inputs = folder.absolute(), list(inputs)
     with _locked(folder) as file:
-        before = _own(file, folder / RECORD)
+        before = _read_or_refuse(file, folder / RECORD)
         if before is None or not any(
                 (folder / name).exists() for name in (*before.files, *before.writing)):
             before = Record(command=command, study=study, kept=before.kept if before else [])
@@ -307,7 +305,7 @@ def result_folder(
                     f"Input {path} is a result of an earlier run in folder {folder}, which this "
                     "run would replace. Name another folder, or copy the input to another place.")
         writer = _Writer(base, before.model_copy(deep=True), "folder", file)
-        writer.refuse(_to_write(base, command, solving))
+        writer.refuse(_writable_paths(base, command, solving))
         writer.record.inputs, writer.record.ended = _inputs(inputs), ""
         writer.record.named = {
             word: printable(path, MAX_QUOTED) for word, path in named.items()}
@@ -321,7 +319,7 @@ def result_folder(
         writer.remove_stale()
 
 
-def _to_write(base: Path, command: str, solving: bool) -> Iterator[Path]:
+def _writable_paths(base: Path, command: str, solving: bool) -> Iterator[Path]:
     """Yield the paths in a folder that a command may write; a study's own may write any result.
 
     A folder within that has a record of its own belongs to another run.
@@ -361,7 +359,7 @@ def single_file(path: Path, command: str) -> Iterator[None]:
     @contextlib.contextmanager
     def writing(target: Path, temporary: Path) -> Iterator[None]:
         with _opened(notes, wait=True) as file:
-            writer = _Writer(whole.parent, _own(file, notes) or new, "file", file)
+            writer = _Writer(whole.parent, _read_or_refuse(file, notes) or new, "file", file)
             with writer(target, temporary):
                 yield
 
@@ -560,7 +558,7 @@ def _record_at(path: Path) -> Record | None:
         return None
 
 
-def _own(file: BinaryIO, path: Path) -> Record | None:
+def _read_or_refuse(file: BinaryIO, path: Path) -> Record | None:
     """Return the record in a file, None if it is new or damaged; refuse JSON of other programs."""
     record = _read(file)
     if record is None:

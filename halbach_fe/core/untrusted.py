@@ -23,19 +23,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-ALWAYS_ALLOWED_BYTES = 1 << 26
-"""Size of the uncompressed data that an HDF5 file of any size may declare."""
-
-MAX_COMPRESSION_RATIO = 100
-"""Largest ratio of declared data to the file's size, if it is more than `ALWAYS_ALLOWED_BYTES`.
-Files that halbach-fe writes are not compressed at all."""
-
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""
-
-MAX_OBJECTS = 10_000
-"""Largest number of groups and datasets of an HDF5 file: groups can contain one another in an
-endless cycle."""
 
 
 def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
@@ -81,9 +70,14 @@ def open_hdf5(file: BinaryIO) -> Iterator[Any]:
     with _refusing():
         size = _check_heaps(file)
         opened = h5py.File(file, "r")
+    # size of the uncompressed data that an HDF5 file of any size may declare
+    always_allowed_bytes = 1 << 26
+    # largest ratio of declared data to the file's size, if it is more than that.
+    # Files that halbach-fe writes are not compressed at all.
+    max_compression_ratio = 100
     with opened, np.errstate(all="ignore"):
         with _refusing():
-            _check(opened, max(ALWAYS_ALLOWED_BYTES, MAX_COMPRESSION_RATIO * size))
+            _check(opened, max(always_allowed_bytes, max_compression_ratio * size))
         yield opened
 
 
@@ -174,6 +168,9 @@ def _check(file: Any, limit: int) -> None:
     if file.id.get_create_plist().get_sizes() != (8, 8):
         raise ValueError("its addresses are not of eight bytes")
     waiting, found, promised = [file], 0, 0
+    # largest number of groups and datasets of an HDF5 file: groups can contain one another in an
+    # endless cycle
+    max_objects = 10_000
     while waiting:
         group = waiting.pop()
         for name in group:
@@ -184,8 +181,8 @@ def _check(file: Any, limit: int) -> None:
                 raise ValueError(f"`{name}` is in another file")
             node = group[name]
             found += 1
-            if found > MAX_OBJECTS:
-                raise ValueError(f"it holds more than {MAX_OBJECTS} objects")
+            if found > max_objects:
+                raise ValueError(f"it holds more than {max_objects} objects")
             if isinstance(node, h5py.Group):
                 waiting.append(node)
             elif isinstance(node, h5py.Dataset):

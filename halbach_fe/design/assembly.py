@@ -14,8 +14,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
-from halbach_fe.geometry.block_export import blocks_of_table, blocks_table
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
+from halbach_fe.geometry.free_blocks import blocks_of_table, blocks_table
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.prism import Prism, upright
@@ -24,12 +24,6 @@ from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.array import block_name
 from halbach_fe.study.free_blocks import SIZES
 from halbach_fe.study.holder import Holder
-
-MOST_BLOCKS = 20_000
-"""Largest number of blocks: their STEP file has 15 MB."""
-
-SAME_DEG = 0.05
-"""Directions that differ by less than about this belong to blocks of one kind."""
 
 TURNED_ALIKE = ("cuboid", "sector", "trapezoid", "cylinder")
 """Shapes that are the same after half a turn about their x axis."""
@@ -66,7 +60,9 @@ class Kind:
     @property
     def identity(self) -> tuple[object, ...]:
         """Sizes, grade and magnetization, rounded to what a supplier can make."""
-        steps = np.round(self.direction / np.radians(SAME_DEG)) + 0.0
+        # directions that differ by less than about this belong to blocks of one kind
+        same_deg = 0.05
+        steps = np.round(self.direction / np.radians(same_deg)) + 0.0
         return (tuple((column, _rounded(value)) for column, value in self.sizes.items()),
                 self.material, tuple(steps.tolist()), round(self.remanence_T, 6))
 
@@ -268,8 +264,9 @@ def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}", "3 for solids", "2",
                                  "Use dimension = 3, and give array.ring_length_m."))
     there = [number for number, block in enumerate(magnet.blocks) if block.remanence]
-    if len(there) > MOST_BLOCKS:
-        raise StudyError(must_be("`array`", f"study {magnet.name}", f"of at most {MOST_BLOCKS} "
+    most_blocks = 20_000  # largest number of blocks: their STEP file has 15 MB
+    if len(there) > most_blocks:
+        raise StudyError(must_be("`array`", f"study {magnet.name}", f"of at most {most_blocks} "
                                  "blocks for solids", str(len(there))))
     serials = _serials(magnet, blocks)
     table = blocks_table(magnet)

@@ -26,10 +26,13 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Edge, places_in
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL
-from halbach_fe.solver.magnetostatics import solve_sources, solve_tangent
+from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.magnetostatics import (
+    CROSS_SECTION,
+    SCALAR_POTENTIAL,
+    solve_sources,
+    solve_tangent,
+)
 from halbach_fe.solver.separate_blocks import applies, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import BlockException

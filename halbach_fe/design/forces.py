@@ -8,7 +8,7 @@ charge,
 with n the outward normal and m the middle of the block (J. D. Jackson, Classical Electrodynamics,
 3rd ed., problem 5.20). B is the exact field of the others' surface charge, and the integrals are
 sums over Gauss points of the faces, of high order where the other block is near. The order grows
-until the forces of two successive orders differ by at most `TOLERANCE`; that difference is the
+until the forces of two successive orders differ by at most 1 %; that difference is the
 error bar.
 
 Blocks of another permeability than vacuum, or with irreversible losses, have the polarization that
@@ -33,45 +33,21 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.separate_blocks import present_blocks, solve_separate
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0
-
-TOLERANCE = 0.01
-"""Largest difference of forces of successive orders, relative to the force on the block."""
 
 SMALL = 0.1
 """Forces smaller than this share of the largest one have the error that it would have: symmetry
 makes some of them zero."""
-
-LEAST_N = 1e-9
-"""Error in N that matters to nobody: symmetry, or a uniform field, makes all forces zero."""
 
 NEAR_ORDERS = (6, 9, 14, 21, 32)
 """Gauss points along a side of a face, for the field of near blocks."""
 
 FAR_ORDERS = (1, 2, 3, 4, 5)
 """The same for the field of other blocks."""
-
-NEAR = 2.5
-"""Distance of the middles of two blocks, relative to the sum of the radii of the spheres around
-them, up to which they are near."""
-
-INWARDS = 1e-6
-"""Distance of the points from the face, relative to the size of the block: the field of blocks that
-touch is that just outside of them."""
-
-LONGEST = 1.5
-"""Largest side of a part of a face, relative to the cube root of the block's volume."""
-
-MOST_TURN = 0.5
-"""Largest angle in rad of a part of a curved face."""
-
-ROUNDING = 1e-9
-"""Charge of a face relative to that of one across the polarization, below which it has none."""
 
 Field = Callable[[Floats], Floats]
 """Takes points (n, 3) in m and returns B (n, 3) in T."""
@@ -152,7 +128,7 @@ class Forces(ShownInNotebook):
 
 @alone
 def forces(
-    magnet: Magnet, session: Session, order: Sequence[str] | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, order: Sequence[str] | None = None,
     density_kg_per_m3: float | None = None, price_per_kg: float | None = None,
 ) -> Forces:
     """Compute forces and torques on every block, in place and as it is inserted.
@@ -160,7 +136,7 @@ def forces(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the runs of GetDP, if the magnet has iron.
     order : sequence of str, optional
         Names of all blocks in the order in which they are inserted; by default ring by ring, slot
@@ -277,6 +253,10 @@ def _converged(
     todo = np.arange(len(blocks))
     loads = np.zeros((len(blocks), 3, 6))  # mutual, in place, inserted; force and torque
     errors = np.zeros((len(blocks), 3, 2))
+    # largest difference of forces of successive orders, relative to the force on the block
+    tolerance = 0.01
+    # error in N that matters to nobody: symmetry, or a uniform field, makes all forces zero
+    least_n = 1e-9
     for level, orders in enumerate(zip(NEAR_ORDERS, FAR_ORDERS, strict=True)):
         now = _loads(blocks, rank, todo, *orders, external, iron)
         change = (now - loads[todo]).reshape(-1, 3, 2, 3)
@@ -284,14 +264,14 @@ def _converged(
         if not level:
             continue
         size = np.linalg.norm(loads[:, 1:, :3], axis=2)
-        least = np.maximum(TOLERANCE * np.maximum(size, SMALL * size.max(axis=0)), LEAST_N)
+        least = np.maximum(tolerance * np.maximum(size, SMALL * size.max(axis=0)), least_n)
         todo = np.flatnonzero((errors[:, 1:, 0] > least).any(axis=1))
         if not len(todo):
             break
     if len(todo):
         warnings.warn(
             f"The forces on {len(todo)} of {len(blocks)} blocks, {blocks[todo[0]].name} among "
-            f"them, are less certain than {100 * TOLERANCE:g} %: see their error bars.",
+            f"them, are less certain than {100 * tolerance:g} %: see their error bars.",
             HalbachWarning, stacklevel=3)
     in_place, inserted = (
         Loads(loads[:, case, :3], loads[:, case, 3:], errors[:, case, 0], errors[:, case, 1])
@@ -314,12 +294,15 @@ def _loads(
     reach = np.array([_reach(block) for block in blocks])
     tree = KDTree(middles[targets])
     near_field, far_field = (np.zeros((2, len(each.points), 3)) for each in (near, far))
+    # distance of the middles of two blocks, relative to the sum of the radii of the spheres around
+    # them, up to which they are near
+    near_ratio = 2.5
     for number, block in enumerate(blocks):
         around = np.array(tree.query_ball_point(
-            middles[number], NEAR * (reach[number] + reach[targets].max())), int)
+            middles[number], near_ratio * (reach[number] + reach[targets].max())), int)
         distance = np.linalg.norm(middles[targets[around]] - middles[number], axis=1)
         is_near = np.zeros(len(targets), bool)
-        is_near[around[distance <= NEAR * (reach[number] + reach[targets[around]])]] = True
+        is_near[around[distance <= near_ratio * (reach[number] + reach[targets[around]])]] = True
         later = rank[targets] > rank[number]
         for charges, field, chosen in ((near, near_field, is_near), (far, far_field, ~is_near)):
             here = np.flatnonzero((chosen & (targets != number))[charges.owner])
@@ -389,6 +372,11 @@ class Charges:
     def of(cls, blocks: Sequence[MagnetBlock], order: int) -> Charges:
         """Put ``order`` points along every side of a face; faces without charge have none."""
         parts: list[tuple[Floats, Floats, Floats, Ints]] = []
+        # distance of the points from the face, relative to the size of the block: the field of
+        # blocks that touch is that just outside of them
+        inwards = 1e-6
+        # charge of a face relative to that of one across the polarization, below which it has none
+        rounding = 1e-9
         for number, block in enumerate(blocks):
             size = block.volume ** (1 / 3)
             polarization = np.array(block.easy_axis) * block.remanence
@@ -398,8 +386,8 @@ class Charges:
                 areas = np.linalg.norm(vectors, axis=1)
                 normals = vectors / areas[:, None] @ block.axes.T
                 charge = factor / MU_0 * areas * (normals @ polarization)
-                kept = np.abs(charge) > ROUNDING * areas * abs(block.remanence) / MU_0
-                points = block.from_frame(points) - INWARDS * size * normals
+                kept = np.abs(charge) > rounding * areas * abs(block.remanence) / MU_0
+                points = block.from_frame(points) - inwards * size * normals
                 parts.append((points[kept], normals[kept], charge[kept],
                               np.full(int(kept.sum()), number)))
         points, normals, charge, owner = (np.concatenate(each)
@@ -426,9 +414,10 @@ def _faces(block: MagnetBlock, order: int, size: float) -> Iterator[tuple[Floats
     z, z_weight = block.z_min + height * z, height * z_weight
     corners = np.array([edge.start for edge in block.outline])
     four = len(corners) == 4 and not any(block.outline[k].arc for k in (0, 2))
+    most_turn = 0.5  # largest angle in rad of a part of a curved face
     for edge in block.outline:
         s, s_weight = _panels(t, weight, edge.length, min(
-            size, MOST_TURN * edge.radius if edge.arc else np.inf))
+            size, most_turn * edge.radius if edge.arc else np.inf))
         place, normal = edge.at(s)
         area = np.column_stack([normal * s_weight[:, None], np.zeros(len(s))])
         yield (np.column_stack([np.repeat(place, len(z), axis=0), np.tile(z, len(s))]),
@@ -474,6 +463,8 @@ def _graded(order: int) -> tuple[Floats, Floats]:
 
 def _panels(t: Floats, weight: Floats, length: float, size: float) -> tuple[Floats, Floats]:
     """Repeat a quadrature from 0 to 1 on equal parts of a length that are not longer than size."""
-    count = max(1, int(np.ceil(length / size * (1 - 1e-9) / LONGEST)))
+    # largest side of a part of a face, relative to the cube root of the block's volume
+    longest = 1.5
+    count = max(1, int(np.ceil(length / size * (1 - 1e-9) / longest)))
     starts = np.arange(count)[:, None]
     return ((starts + t) / count).ravel(), np.tile(weight / count, count)

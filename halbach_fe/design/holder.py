@@ -14,21 +14,52 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.design.engraving import digits
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.prism import Prism, circle, widened, with_notch
-from halbach_fe.geometry.walls import distance_from_origin, thinnest_wall
+from halbach_fe.geometry.outline import Outline, distance_from_origin, thinnest_wall
+from halbach_fe.geometry.prism import Prism, circle, rectangle, widened, with_notch
 from halbach_fe.study.holder import Holder, Rods
+
+SEGMENTS = {"0": "abcdef", "1": "bc", "2": "abged", "3": "abgcd", "4": "fgbc", "5": "afgcd",
+            "6": "afgedc", "7": "abc", "8": "abcdefg", "9": "abcdfg"}
+"""Which of seven bars a digit consists of, from the upper one clockwise; the last is the middle."""
+
+BARS = {"a": (0.25, 0.94, False), "b": (0.5, 0.72, True), "c": (0.5, 0.28, True),
+        "d": (0.25, 0.06, False), "e": (0.0, 0.28, True), "f": (0.0, 0.72, True),
+        "g": (0.25, 0.5, False)}
+"""Middle of each bar, relative to the height of a digit, and whether it is upright."""
+
+
+def digits(
+    text: str, height: float, radius: float, angle: float, bottom: float, top: float
+) -> tuple[Prism, ...]:
+    """Return the bars of a number whose upper side is away from the z axis.
+
+    Parameters
+    ----------
+    text : str
+    height : float, in m
+    radius, angle : float, in m and rad
+        Its middle.
+    bottom, top : float, in m
+        Limits of z.
+    """
+    out = np.array([np.cos(angle), np.sin(angle)])
+    axes = np.column_stack([[out[1], -out[0]], out])
+    # size of a bar, and distance of two digits, relative to their height
+    length, width, pitch = 0.3, 0.12, 0.8
+    lying = rectangle(length * height, width * height)
+    standing = rectangle(width * height, length * height)
+    found = []
+    for place, digit in enumerate(text):
+        left = pitch * (place - (len(text) - 1) / 2) - 0.25
+        for x, y, upright in (BARS[bar] for bar in SEGMENTS[digit]):
+            middle = radius * out + height * (axes @ [left + x, y - 0.5])
+            found.append(Prism(standing if upright else lying, bottom, top, axes, middle))
+    return tuple(found)
+
 
 LEVEL_M = 1e-5
 """Blocks that overlap by less than this in z are above one another."""
-
-USUAL_FLOOR_M, LEAST_FLOOR_M = 2e-3, 5e-4
-"""Thickness of the floor where there is room for it, and the thinnest one that is made unasked."""
-
-DIGIT_M = 4e-3
-"""Largest height of the engraved number of a plate."""
 
 FLAT = 0.1
 """Part of the magnetization in the plane of a plate below which it is not marked there."""
@@ -227,9 +258,11 @@ def _frame(
               for group in groups]
     gap = min((above[0] - below[1] for below, above in pairwise(limits)), default=np.inf)
     floor = holder.floor_m
+    # thickness of the floor where there is room for it, and the thinnest one that is made unasked
+    usual_floor_m, least_floor_m = 2e-3, 5e-4
     if floor is None:
-        floor = min(USUAL_FLOOR_M, max(gap, 0.0))
-        floor = floor if floor >= LEAST_FLOOR_M else 0.0
+        floor = min(usual_floor_m, max(gap, 0.0))
+        floor = floor if floor >= least_floor_m else 0.0
     for below, above in pairwise(limits):
         top = below[1] if holder.thickness_m is None else below[0] - floor + holder.thickness_m
         if above[0] - floor < top - LEVEL_M:
@@ -318,7 +351,7 @@ def _plate(
         raise CannotBeMadeError(
             f"no wall between blocks {group[first].name} and {group[second].name}, which touch or "
             "lie one above the other", "Leave gaps between the blocks.", whatever=True)
-    wall = _checked_walls(openings, holder, frame)
+    wall = _thinnest_wall(openings, holder, frame)
     _check_iron(low, low + thickness, frame, iron)
     if frame.inner:
         openings.append(("bore", through(Prism(circle(frame.inner), 0.0, 0.0))))
@@ -328,7 +361,7 @@ def _plate(
                  frame.inner, frame.outer)
 
 
-def _checked_walls(
+def _thinnest_wall(
     openings: Sequence[tuple[str, Prism]], holder: Holder, frame: _Frame
 ) -> float:
     """Return the thinnest wall in m; raise CannotBeMadeError if it is too thin."""
@@ -382,8 +415,9 @@ def _shape(plate: Plate) -> object:
 def _numbered(plate: Plate, number: int, holder: Holder, frame: _Frame) -> Plate:
     """Return a plate with its number, engraved outside of the pockets where there is room."""
     room = frame.outer - 2 * holder.mark_m - frame.pockets - 2 * holder.least_wall_m
-    height, depth = min(DIGIT_M, room), min(holder.engraving_m, plate.thickness_m / 2)
-    if depth and height >= DIGIT_M / 2:
+    digit_m = 4e-3  # largest height of the engraved number of a plate
+    height, depth = min(digit_m, room), min(holder.engraving_m, plate.thickness_m / 2)
+    if depth and height >= digit_m / 2:
         rods = [rod.polygon for rod in frame.rods]
         for angle in np.radians(np.arange(0.0, 360.0, 3.0)):
             bars = digits(str(number), height, frame.pockets + holder.least_wall_m + room / 2,

@@ -3,6 +3,17 @@
 That are the magnetizations (D-optimal design), or, if the study has a table ``homogeneity``, the
 deviations of |B| in its region: the sum of their variances is made small (A-optimal design).
 Positions are chosen one after another, and compared with the study's own positions.
+
+The information gain of a linear-Gaussian measurement is the mutual information between parameters
+and readings, ``1/2 log det(I + G G^T)`` nats, where G = Sigma^-1/2 H L is the whitened response of
+the readings to the whitened parameters (D-optimality; K. Chaloner, I. Verdinelli, Statist. Sci. 10
+(1995) 273). The gain does not depend on the values of the readings, so that it is known before the
+measurement. The gain is submodular; a greedy choice, position by position, therefore reaches at
+least 1 - 1/e of the largest possible gain (A. Krause et al., J. Mach. Learn. Res. 9 (2008) 235).
+
+For values of interest, with the roots V of their covariance and C of that of the parameters given
+the positions chosen so far, a position with the response G takes ``tr(V C G^T (I + G C G^T)^-1 G C
+V^T)`` off the sum of their variances.
 """
 
 from __future__ import annotations
@@ -25,7 +36,6 @@ from halbach_fe.response.homogeneity import Region, default_region, homogeneity_
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.d_optimal import greedy, information, variance_left
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import posterior
 from halbach_fe.stats.noise import NoiseCovariance
@@ -50,10 +60,6 @@ class UnknownDeviation:
     prior: float
     planned: Floats
     baseline: Floats
-
-
-CURVE_POINTS = 100
-"""Number of subsets, of increasing size, of the study's positions whose information is computed."""
 
 
 @dataclass(frozen=True)
@@ -146,31 +152,8 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
         If there are fewer candidates than positions to choose, a position is outside of the region
         where the field is computed, or the study does not observe flux densities.
     """
-    if magnet.study.observation.quantity != "flux_density":
-        raise StudyError(
-            f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
-            f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
-            "flux densities.")
     baseline = points_from(magnet.study.observation.positions)
-    sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
-    places: list[Floats] = [points_from(positions) for positions in sets]
-    candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
-    wanted = count or magnet.study.plan.points or len(baseline)
-    if wanted > len(candidates):
-        raise StudyError(
-            f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
-            f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
-            "fewer, or add `plan.candidates`.")
-    farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
-    if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
-        raise StudyError(must_be(
-            "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
-            "the magnet, where there is some field", f"one at {farthest:.4g} m",
-            "Are they in metres?"))
-    check_points(magnet, baseline)
-    check_points(magnet, candidates, "plan.candidates")
-    if magnet.study.homogeneity is not None:
-        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
+    candidates, wanted = _candidates(magnet, baseline, count)
     points = np.vstack([baseline, candidates])
     # the order in which they would be measured is not known yet
     steady = magnet.study.instrument.with_(lag_m=0.0)
@@ -186,7 +169,9 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
     choice = greedy(whitened[len(baseline):], wanted, None if values is None else values.root)
     chosen = choice.chosen
     same = min(wanted, len(baseline))
-    counts = np.unique(np.append(np.linspace(1, len(baseline), CURVE_POINTS).astype(int), same))
+    # number of subsets, of increasing size, of the study's positions whose information is computed
+    curve_points = 100
+    counts = np.unique(np.append(np.linspace(1, len(baseline), curve_points).astype(int), same))
     subsets = [whitened[spread(len(baseline), number)].reshape(-1, whitened.shape[2])
                for number in counts]
     rows = np.arange(len(observation)).reshape(len(points), size)
@@ -209,6 +194,41 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
         sd_after(chosen + len(baseline)), sd_after(spread(len(baseline), same)), deviation)
 
 
+def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:
+    """Return the candidate positions (n, 3) in m and the number of positions to choose.
+
+    Raises
+    ------
+    StudyError
+        See `plan_measurement`.
+    """
+    if magnet.study.observation.quantity != "flux_density":
+        raise StudyError(
+            f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
+            f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
+            "flux densities.")
+    sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
+    places: list[Floats] = [points_from(positions) for positions in sets]
+    candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)
+    wanted = count or magnet.study.plan.points or len(baseline)
+    if wanted > len(candidates):
+        raise StudyError(
+            f"Input {'--points' if count else '`plan.points`'} of study {magnet.name} must be at "
+            f"most the number of candidates, {len(candidates)}; instead it is {wanted}. Ask for "
+            "fewer, or add `plan.candidates`.")
+    farthest, reach = float(np.linalg.norm(candidates, axis=1).max()), magnet.field_reach
+    if magnet.study.plan.candidates and farthest > reach:  # never in 2D, where it is infinite
+        raise StudyError(must_be(
+            "`plan.candidates`", f"study {magnet.name}", f"within {reach:.3g} m of the middle of "
+            "the magnet, where there is some field", f"one at {farthest:.4g} m",
+            "Are they in metres?"))
+    check_points(magnet, baseline)
+    check_points(magnet, candidates, "plan.candidates")
+    if magnet.study.homogeneity is not None:
+        region_points(magnet, default_region(magnet))  # refuses a region that reaches into material
+    return candidates, wanted
+
+
 def _values(magnet: Magnet, prior: Gaussian, session: Session) -> Deviations | None:
     """Return the deviations of |B| that the prior allows, if the study asks for them."""
     if magnet.study.homogeneity is None:
@@ -227,3 +247,81 @@ def _posterior(matrix: Floats, noise: NoiseCovariance, prior: Gaussian) -> Gauss
     Its covariance is that for any readings, because the model is linear.
     """
     return posterior(matrix, matrix @ prior.mean, noise, prior)
+
+
+def information(design: Floats) -> float:
+    """Return the information gain in nats of readings with whitened response (n, m)."""
+    small = design @ design.T if len(design) < design.shape[1] else design.T @ design
+    return float(np.linalg.slogdet(np.eye(len(small)) + small)[1]) / 2
+
+
+def variance_left(design: Floats, values: Floats) -> float:
+    """Return the sum of the variances of values after readings with whitened response (n, m).
+
+    ``values`` (v, m) is the root of their covariance before the readings, in terms of the same
+    whitened parameters.
+    """
+    if len(design) < design.shape[1]:
+        cross = values @ design.T
+        fall = np.linalg.solve(np.eye(len(design)) + design @ design.T, cross.T)
+        return float(np.sum(values**2) - np.sum(cross * fall.T))
+    inner = np.eye(design.shape[1]) + design.T @ design
+    return float(np.sum(values * np.linalg.solve(inner, values.T).T))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Positions in the order of their choice, and what they tell.
+
+    Attributes
+    ----------
+    chosen : ndarray of int, shape (count,)
+        Indices of the positions.
+    gain : ndarray, shape (count,)
+        Information gain in nats of the positions chosen up to and including each.
+    fall : ndarray, shape (count,)
+        What they take off the sum of the variances of the values of interest; 0 without such.
+    """
+
+    chosen: Ints
+    gain: Floats
+    fall: Floats
+
+
+def greedy(design: Floats, count: int, values: Floats | None = None) -> Choice:
+    """Choose positions one by one, each for the largest gain of information or fall of variance.
+
+    Parameters
+    ----------
+    design : ndarray, shape (positions, k, m)
+        Whitened response of the k readings that are taken at each position.
+    count : int
+        Number of positions to choose; each is chosen at most once.
+    values : ndarray, shape (v, m), optional
+        Root of the covariance of the values whose variances are to fall, in terms of the same
+        whitened parameters. Without it, the information about all parameters counts.
+    """
+    size = design.shape[1]
+    covariance = np.eye(design.shape[2])
+    # covariance of the noise-free readings at each position, given the positions chosen so far
+    predicted = np.einsum("pkm,plm->pkl", design, design)
+    root = np.zeros((0, design.shape[2])) if values is None else values
+    cross = np.einsum("vm,pkm->pvk", root, design)
+    chosen: list[int] = []
+    gains, falls = np.zeros(count), np.zeros(count)
+    for number in range(count):
+        spread = np.eye(size) + predicted
+        gain = np.linalg.slogdet(spread)[1] / 2
+        fall = np.einsum("pvk,pkv->p", cross, np.linalg.solve(spread, cross.swapaxes(1, 2)))
+        score = gain.copy() if values is None else fall.copy()
+        score[chosen] = -np.inf
+        best = int(np.argmax(score))
+        gains[number], falls[number] = gain[best], fall[best]
+        chosen.append(best)
+        reduction = np.linalg.solve(  # (m, k)
+            np.linalg.cholesky(spread[best]), design[best] @ covariance).T
+        covariance -= reduction @ reduction.T
+        reduction_at = design @ reduction
+        predicted -= reduction_at @ reduction_at.transpose(0, 2, 1)
+        cross -= np.einsum("vj,pkj->pvk", root @ reduction, reduction_at)
+    return Choice(np.array(chosen), np.cumsum(gains), np.cumsum(falls))

@@ -27,15 +27,6 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 
-LEAST_MAIN = 0.01
-"""Least main multipole, relative to what all blocks could make together, of which units make sense:
-usual arrays have 0.5 and more. Of less, tolerances of the blocks of some per cent are most of it.
-"""
-
-LEAST_MEAN = 0.1
-"""Least mean of B over a region, relative to that of |B|, of which ppm make sense: below, B turns
-round within the region, where its size is no linear function of the blocks."""
-
 
 class Known(Protocol):
     """The values of a magnet with their uncertainty, see `Multipoles` and `Deviations`."""
@@ -149,23 +140,30 @@ def objective_of(
     StudyError
         If the nominal magnet has no main multipole or mean field, to which the others are relative.
     """
+    # least main multipole, relative to what all blocks could make together, of which units make
+    # sense: usual arrays have 0.5 and more. Of less, tolerances of the blocks of some per cent are
+    # most of it.
+    least_main = 0.01
     if magnet.study.homogeneity is None:
         model = multipole_model(magnet, reference or MultipoleReference(), session)
         blocks = float(np.abs(model.matrix[0] * model.nominal).sum())  # if none cancelled another
-        if model.nominal_main < LEAST_MAIN * blocks:
+        if model.nominal_main < least_main * blocks:
             raise StudyError(must_be(
                 f"the multipole of order {model.main}", f"study {magnet.name}",
-                f"above {LEAST_MAIN:g} of what the blocks could make together, as others are in "
+                f"above {least_main:g} of what the blocks could make together, as others are in "
                 "units of 1e-4 of it", f"{model.nominal_main / blocks:.2g}",
                 "Check multipole_order; of an undulator, ask on a circle at a pole: --at-z-m Z."))
         return model
     region = homogeneity_model(magnet, default_region(magnet), session)
     field = region.field(region.response.nominal[:, None])[..., 0]
     mean, size = region.nominal_mean, float(region.weights @ np.linalg.norm(field, axis=1))
-    if np.linalg.norm(mean) < LEAST_MEAN * size:
+    # least mean of B over a region, relative to that of |B|, of which ppm make sense: below, B
+    # turns round within the region, where its size is no linear function of the blocks
+    least_mean = 0.1
+    if np.linalg.norm(mean) < least_mean * size:
         raise StudyError(must_be(
             "`homogeneity`", f"study {magnet.name}", "a region in which the mean of B is above "
-            f"{LEAST_MEAN:g} of that of |B|, as deviations are in ppm of it",
+            f"{least_mean:g} of that of |B|, as deviations are in ppm of it",
             f"{region.region.text}, with {np.linalg.norm(mean) / size:.2g}",
             "B cancels there, as in a quadrupole or between poles: leave the table out to ask for "
             "multipoles, or choose another region."))

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.study.array import BlockException
 
 LARGEST_ANGLE = np.radians(2.0)
@@ -34,12 +33,6 @@ is."""
 
 SAME_SIZE = 1e-6
 """Relative difference up to which two sides of a cuboid count as equal."""
-
-CUBE = (1.0, 1.0, 1.0)
-"""Sides of a cube, which all other blocks' turns leave unchanged as well."""
-
-EXACT = 1e-9
-"""Tolerance for matrices and properties that must be equal; rounding errors are 1e-15."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +106,8 @@ def mounts_of(magnet: Magnet) -> Mounts:
     shapes, own_turns = _shapes(meant)
     kinds = _kinds(meant, shapes)
     sources = np.array([source for source, _ in mountings(magnet)])
-    every = shape_turns(CUBE)
+    cube = (1.0, 1.0, 1.0)  # sides of a cube, which all other blocks' turns leave unchanged as well
+    every = shape_turns(cube)
     found = np.array([[any(np.array_equal(turn, own) for own in turns) for turns in own_turns]
                       for turn in every])
     some = found.any(axis=1)
@@ -239,10 +233,12 @@ def remounted(magnet: Magnet, moved: Iterable[tuple[int, int, Floats]]) -> Magne
         expected[to] = source, meant, total
     changed = magnet.with_(array__exceptions=array.exceptions + tuple(exceptions))
     after, new = mountings(changed), changed.blocks
+    # tolerance for matrices and properties that must be equal; rounding errors are 1e-15
+    exact = 1e-9
     for to, (source, meant, total) in expected.items():
-        same = after[to][0] == meant and np.allclose(after[to][1], total, 0, EXACT)
+        same = after[to][0] == meant and np.allclose(after[to][1], total, 0, exact)
         if not same or new[to].displacement_m != old[to].displacement_m or not np.allclose(
-                _properties(new[to]), _properties(old[source]), EXACT, 0):
+                _properties(new[to]), _properties(old[source]), exact, 0):
             return None
     return changed
 

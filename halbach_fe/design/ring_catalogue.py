@@ -21,17 +21,6 @@ from halbach_fe.study.array import Array, Ring
 from halbach_fe.study.design import Design, DesignLayer
 from halbach_fe.study.model import Study
 
-MOST_OPTIONS = 2000
-"""Largest number of combinations of rings at a place, which limits memory and time."""
-
-ANGLES = 48
-"""Number of points of a circle about the axis, or through the poles. It is divisible by 4, so that
-points which are alike by symmetry count once, and those on the axes of symmetry, where extremes
-often are, are among them."""
-
-ALIKE = 1e-7
-"""Difference of fields, relative to the largest, up to which two points are alike."""
-
 DECIMALS = 9
 """Decimals of lengths in m, so that a study shows what was meant."""
 
@@ -101,7 +90,9 @@ class Sample:
         direction = mean / np.linalg.norm(mean)
         along = field @ direction
         size = np.linalg.norm(field, axis=2)  # of each ring two numbers: one may agree by chance
-        alike = np.vstack([along / size.max(), size / size.max(), weights > 0]) / ALIKE
+        # difference of fields, relative to the largest, up to which two points are alike
+        alike_fields = 1e-7
+        alike = np.vstack([along / size.max(), size / size.max(), weights > 0]) / alike_fields
         _, first, group = np.unique(alike.round(), axis=1, return_index=True, return_inverse=True)
         summed: Floats = np.asarray(np.bincount(group.ravel(), weights), float)
         return cls(points[first], summed, weights[first] == 0, direction)
@@ -274,6 +265,8 @@ def _options(study: Study, design: Design) -> Iterator[Option]:
     layers = [list(_rings(study, layer)) for layer in design.layer]
     ranges = {ring: reach(study, ring) for layer in layers for ring in layer}
     every: Iterable[Option]
+    # largest number of combinations of rings at a place, which limits memory and time
+    most_options = 2000
     if design.layers_together:
         every = zip(*layers, strict=True)
         if any(layer.may_be_empty for layer in design.layer):
@@ -281,9 +274,9 @@ def _options(study: Study, design: Design) -> Iterator[Option]:
     else:
         size = int(np.prod([len(layer) + one.may_be_empty for layer, one in zip(
             layers, design.layer, strict=True)]))
-        if size > MOST_OPTIONS:
+        if size > most_options:
             raise StudyError(must_be(
-                "`design.layer`", f"study {study.name}", f"at most {MOST_OPTIONS} combinations of "
+                "`design.layer`", f"study {study.name}", f"at most {most_options} combinations of "
                 "rings at a place", str(size), "Leave out radii or sizes, or set layers_together."))
         every = product(*([*layer, None] if one.may_be_empty else layer for layer, one in zip(
             layers, design.layer, strict=True)))
@@ -348,11 +341,15 @@ def fields_with_images(study: Study, ring: RingOfBlocks, z: Floats, points: Floa
 
 def _points(region: Region) -> tuple[Floats, Floats]:
     """Return points (n, 3) in m and weights (n,) of means over the volume, 0 on the surface."""
-    points, weights = region.points(ANGLES - 1)
+    # number of points of a circle about the axis, or through the poles. It is divisible by 4, so
+    # that points which are alike by symmetry count once, and those on the axes of symmetry, where
+    # extremes often are, are among them.
+    angles = 48
+    points, weights = region.points(angles - 1)
     if region.shape == "cylinder":
         return points, weights
-    theta, phi = np.meshgrid(np.linspace(0, np.pi, ANGLES // 2 + 1),
-                             2 * np.pi * np.arange(ANGLES) / ANGLES)
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, angles // 2 + 1),
+                             2 * np.pi * np.arange(angles) / angles)
     surface = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)],
                        axis=-1).reshape(-1, 3) * region.half_axes_m + region.centre_m
     inside = weights > 0

@@ -21,7 +21,6 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import check_number
 from halbach_fe.design.forces import DENSITY_KG_PER_M3
-from halbach_fe.design.radius_programs import moved_radii
 from halbach_fe.design.ring_catalogue import (
     Catalogue,
     Option,
@@ -30,7 +29,7 @@ from halbach_fe.design.ring_catalogue import (
     fields_with_images,
     tables_of,
 )
-from halbach_fe.design.ring_search import MISSES, Found, Task, search
+from halbach_fe.design.ring_search import MISSES, Found, Task, moved_radii, search
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.response.homogeneity import (
     PPM,
@@ -41,25 +40,9 @@ from halbach_fe.response.homogeneity import (
     slices_of,
 )
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.model import Study
-
-RESTARTS, STARTS = 300, 4
-"""Number of random changes from each of several first designs."""
-
-LEVELS = 6
-"""Number of steps from the most homogeneous to the strongest design, which grow with the field:
-near the strongest one there is nothing left to choose."""
-
-RESTARTS_OF_FRONT = 60
-"""Number of random changes for each design of larger field: it begins near a good one."""
-
-ROUNDING = 1e-9
-"""Part of a least field by which rounding may miss it."""
-
-ROUNDS = 3
-"""Largest number of searches with the reaction of permeable blocks."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +107,7 @@ class Designed(ShownInNotebook):
 
 @alone
 def design_rings(
-    study: Study, session: Session, region: Region | None = None, seed: int = 0
+    study: Study, session: Session = NOT_KEPT, region: Region | None = None, seed: int = 0
 ) -> Designed:
     """Choose the rings of a magnet so that its field in a region is homogeneous.
 
@@ -132,7 +115,7 @@ def design_rings(
     ----------
     study : Study
         Its ``design`` lists the rings to choose from and says what is asked.
-    session : Session
+    session : Session, optional
         Its folder receives what is solved for permeable blocks.
     region : Region, optional
         By default the sphere about the origin of half the radius of the study's bore.
@@ -168,21 +151,23 @@ def design_rings(
     reaction = np.zeros_like(catalogue.sample.points)
     task = task_of(catalogue, reaction @ direction)
     places, options = task.table.shape[:2]
-    starts = np.linspace(0, options - 1, STARTS).round().astype(int)
-    found = min((search(task, np.full(places, start), RESTARTS, generator)
+    restarts, start_count = 300, 4  # number of random changes from each of several first designs
+    starts = np.linspace(0, options - 1, start_count).round().astype(int)
+    found = min((search(task, np.full(places, start), restarts, generator)
                  for start in dict.fromkeys(starts.tolist())), key=lambda one: one.ppm)
     if not any(ring for option in catalogue.rings(found.chosen) for ring in option):
         raise StudyError(must_be(
             "`design`", f"study {study.name}", "with limits that some rings can keep",
             "least_field_T and most_mass_kg that no ring comes nearer to than an empty bore",
             "Are they in tesla and kilograms? Raise most_mass_kg."))
-    for _ in range(ROUNDS):
+    rounds = 3  # largest number of searches with the reaction of permeable blocks
+    for _ in range(rounds):
         chosen = found.chosen
         reaction = _reaction(catalogue, chosen, session)
         if not reaction.any():
             break
         task = task_of(catalogue, reaction @ direction)
-        found = search(task, chosen, RESTARTS, generator)
+        found = search(task, chosen, restarts, generator)
         if np.array_equal(chosen, found.chosen):
             break
     every = [found, *_front(task, found, generator)]
@@ -239,10 +224,16 @@ def _front(task: Task, best: Found, generator: np.random.Generator) -> list[Foun
     strongest = task.table[..., -2].argmax(axis=1)
     end = float(task.total(strongest)[-2])
     found, last = [], best
-    for step in range(1, LEVELS):
-        level = max(start + (end - start) * (step / LEVELS)**2, task.least_field_T)
-        harder = replace(task, least_field_T=level * (1 - ROUNDING))
-        last = min((search(harder, one, RESTARTS_OF_FRONT, generator)
+    # number of steps from the most homogeneous to the strongest design, which grow with the field:
+    # near the strongest one there is nothing left to choose
+    levels = 6
+    # number of random changes for each design of larger field: it begins near a good one
+    restarts = 60
+    rounding = 1e-9  # part of a least field by which rounding may miss it
+    for step in range(1, levels):
+        level = max(start + (end - start) * (step / levels)**2, task.least_field_T)
+        harder = replace(task, least_field_T=level * (1 - rounding))
+        last = min((search(harder, one, restarts, generator)
                     for one in (last.chosen, strongest)), key=lambda one: one.ppm)
         if last.ppm < MISSES:
             found.append(last)

@@ -45,26 +45,7 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.grades import grade
 from halbach_fe.study.shim_tray import ShimMagnet, ShimTray
 
-MOST_CHOICES = 6000
-"""Largest number of places times magnets times angles, which limits memory to a gigabyte."""
-
-PATIENCE = 500
-"""Number of disturbances in a row without a gain after which the search ends."""
-
-DISTURBED = (2, 3, 4)
-"""Numbers of places that are filled at random before single places are changed again."""
-
-LEAST_GAIN = 1e-9
-"""Smallest decrease of the mean square for which a place is changed, relative to that of the empty
-tray: of smaller ones, rounding decides."""
-
 EMPTY = -1
-
-LATTICE = 9
-"""Points along each side of a magnet that must be outside of the region."""
-
-ROUNDED = 12
-"""Decimals of the places in m, so that those on an axis are."""
 
 
 @dataclass(frozen=True)
@@ -225,12 +206,15 @@ class _Choices:
                   for ring in tray.rings for z in ring.z_m
                   for phi in np.radians(ring.first_angle_deg) + 2 * np.pi * np.arange(
                       ring.count) / ring.count]
-        every = np.array([*places, *map(np.array, tray.places_m)]).round(ROUNDED) + 0.0
+        decimals = 12  # decimals of the places in m, so that those on an axis are
+        every = np.array([*places, *map(np.array, tray.places_m)]).round(decimals) + 0.0
         options = [(number, angle) for number, each in enumerate(tray.magnets)
                    for angle in each.angles_deg]
-        if len(every) * len(options) > MOST_CHOICES:
+        # largest number of places times magnets times angles, which limits memory to a gigabyte
+        most_choices = 6000
+        if len(every) * len(options) > most_choices:
             raise StudyError(must_be(
-                "`shim_tray`", f"study {study}", f"at most {MOST_CHOICES} choices",
+                "`shim_tray`", f"study {study}", f"at most {most_choices} choices",
                 f"{len(every)} places times {len(options)} magnets and angles",
                 "Leave out places, kinds of magnets or angles."))
         azimuth = np.arctan2(every[:, 1], every[:, 0])
@@ -326,7 +310,9 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
             "the middle along z, where there is some field", f"{along.max():.4g} m",
             "Is it in metres?"))
     points, _ = region.points(12)
-    lattice = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, LATTICE)]), axis=-1).reshape(-1, 3)
+    # points along each side of a magnet that must be outside of the region
+    along_side = np.linspace(-0.5, 0.5, 9)
+    lattice = np.stack(np.meshgrid(*3 * [along_side]), axis=-1).reshape(-1, 3)
     for number, block in enumerate(blocks):
         own = block.from_frame(lattice * sizes)
         if block.contains(points).any() or region.contains(own).any():
@@ -380,13 +366,17 @@ class _Search:
         self.options = len(kinds) // places
         self.place = np.repeat(np.arange(places), self.options)
         self.chosen = np.full(places, EMPTY)
-        self.square, self.least = constant, LEAST_GAIN * constant
+        # smallest decrease of the mean square for which a place is changed, relative to that of the
+        # empty tray: of smaller ones, rounding decides
+        least_gain = 1e-9
+        self.square, self.least = constant, least_gain * constant
 
     def run(self) -> Ints:
         """Return the choice for every place, (places,)."""
         self._descend()
         generator, idle = np.random.default_rng(0), 0
-        while idle < PATIENCE:
+        patience = 500  # number of disturbances in a row without a gain after which the search ends
+        while idle < patience:
             idle += 1
             before = self.chosen.copy(), self.gradient.copy(), self.left.copy(), self.square
             self._disturb(generator)
@@ -399,7 +389,9 @@ class _Search:
 
     def _disturb(self, generator: np.random.Generator) -> None:
         """Fill a few places with random choices."""
-        count = min(self.places, int(generator.choice(DISTURBED)))
+        # numbers of places that are filled at random before single places are changed again
+        counts = (2, 3, 4)
+        count = min(self.places, int(generator.choice(counts)))
         for place in generator.choice(self.places, count, replace=False).tolist():
             allowed = np.flatnonzero(self._allowed() & (self.place == place))
             self._put(place, int(generator.choice(np.append(allowed, EMPTY))))

@@ -52,26 +52,11 @@ GAIN_SDS = 1.0
 """Smallest ratio of the expected gain of a move to the standard deviation of that gain, for which
 the move is made."""
 
-SURE = 0.95
-"""Probability that the limit is met, at which the search ends."""
-
-DRAWS = 4000
-"""Number of samples from which that probability is estimated, with a standard error of 0.3 %."""
-
-SHORTLIST = 24
-"""Number of moves of each kind, the best by an approximate gain, whose exact gain is computed."""
-
-FIRST_OF_CYCLES = 200
-"""Number of placements, the best by themselves, from which exchanges of three blocks are formed."""
-
 AT_ONCE = 100_000
 """Number of moves that are evaluated at a time, which limits the memory."""
 
 MOST_NUMBERS = 3e8
 """Largest number of values of all placements together, and of possible swaps: 2.4 GB."""
-
-BETTER = 1e-6
-"""Smallest relative decrease of the sum for which a move is replaced by another."""
 
 STOPS = {"target": "the limit is met", "uncertainty": "further moves would gain less than the "
          "uncertainty of what they gain", "budget": "the allowed number of moves is reached",
@@ -242,7 +227,8 @@ class _Goal:
 
     def met(self, known: Known) -> bool:
         """Return whether the values are within the limit with sufficient probability."""
-        return self.within(known) >= SURE
+        sure = 0.95  # probability that the limit is met, at which the search ends
+        return self.within(known) >= sure
 
 
 @dataclass(frozen=True)
@@ -434,7 +420,9 @@ def shim(
     candidates = [moves for moves in _candidate_moves(placements, len(mounts.places))
                   if budget.get(moves.kind)]
     before = model.of(result.posterior)
-    goal = _Goal(limit, generator.standard_normal((DRAWS, len(before.mean))))
+    # number of samples from which that probability is estimated, with a standard error of 0.3 %
+    draws = 4000
+    goal = _Goal(limit, generator.standard_normal((draws, len(before.mean))))
     chosen, stop = _search(move_model, placements, candidates, budget, goal)
     steps = _steps_by_gain(move_model, chosen, goal)
     within = None
@@ -698,6 +686,8 @@ def _add_moves(
     budget: Mapping[Kind, int], goal: _Goal, chosen: list[Move],
 ) -> tuple[list[Move], str]:
     """Add the moves of largest expected gain one by one; return them and why no more are added."""
+    # number of moves of each kind, the best by an approximate gain, whose exact gain is computed
+    shortlist_size = 24
     while True:
         now = move_model.after(chosen)
         if goal.met(now):
@@ -707,7 +697,7 @@ def _add_moves(
         if (candidates and not left) or not any(budget.values()):
             return chosen, "budget"
         shortlist = [move for moves in left
-                     for move in _best_moves(move_model, placements, moves, chosen, SHORTLIST)]
+                     for move in _best_moves(move_model, placements, moves, chosen, shortlist_size)]
         if not shortlist:
             return chosen, "nothing"
         gains = move_model.gains(chosen, shortlist)
@@ -723,6 +713,8 @@ def _exchange_moves(
 ) -> list[Move]:
     """Replace each move by the best of its kind, given the others, until no move improves."""
     better = True
+    # smallest relative decrease of the sum for which a move is replaced by another
+    least_gain = 1e-6
     while better:
         better = False
         for move in list(chosen):
@@ -731,7 +723,7 @@ def _exchange_moves(
             found = _best_moves(move_model, placements, kind, others, 1)
             now = move_model.after(chosen).expected_square
             if found and move_model.after([*others, found[0]]).expected_square < (
-                    1 - BETTER) * now:
+                    1 - least_gain) * now:
                 chosen, better = [*others, found[0]], True
     return chosen
 
@@ -772,7 +764,7 @@ def _cycles(
 ) -> Iterator[Ints]:
     """Yield cyclic exchanges of three blocks (n, 3) as numbers of placements.
 
-    All possible ones are too many. They begin with the `FIRST_OF_CYCLES` best placements by
+    All possible ones are too many. They begin with the 200 best placements by
     themselves, i into j; each goes on with every j into m, and every m into i. Those of one
     beginning come at a time, which limits the memory: of a magnet of 500 blocks with 24 turns they
     are 300 000, and all together 60 million.
@@ -781,7 +773,9 @@ def _cycles(
                            & (placements.block != placements.to))
     after = now + placements.change[moved]
     score = np.einsum("ij,ij->i", after, after) + placements.noise[moved]
-    for first in moved[np.argsort(score, kind="stable")[:FIRST_OF_CYCLES]]:
+    # number of placements, the best by themselves, from which exchanges of three blocks are formed
+    first_of_cycles = 200
+    for first in moved[np.argsort(score, kind="stable")[:first_of_cycles]]:
         i, j = placements.block[first], placements.to[first]
         second = moved[(placements.block[moved] == j) & (placements.to[moved] != i)]
         third = moved[(placements.to[moved] == i) & (placements.block[moved] != j)]

@@ -3,18 +3,29 @@
 The values that the study asks to be small (see `halbach_fe.design.objective`) are sums over the
 slots of the contributions of the blocks in them. The search starts from a random assignment and
 makes exchanges of two or three blocks of the same type, exchanges with blocks left over and, if
-allowed, turns of blocks in their slots, until none lowers the sum of squares (see
-`halbach_fe.design.exchange_search`). The best of several random starts is the result. The slot of a
-missing block stays empty.
+allowed, turns of blocks in their slots, until none lowers the sum of squares. The best of several
+random starts is the result. The slot of a missing block stays empty.
 
 An "order" is an assignment: an array (slots,) with the row of the table of the block in each slot.
+
+Values ``x = x_0 + sum_s T_s p_s`` are linear in the magnetizations p_s of the blocks in the slots,
+in own axes. A block b that is turned by R in slot s has ``p_s = R m_b``. Taking it there changes x
+by ``T_s d`` with ``d = R m_b - p_s``, and so changes ``|x|^2`` by ``2 g_s d + d K_s d``, with ``g_s
+= T_s' x`` and ``K_s = T_s' T_s``. Two blocks that change places add ``2 d_s T_s' T_u d_u`` to the
+sum of their own changes. So all exchanges of a slot, with all turns of both blocks, are evaluated
+at once from small matrices, without the values themselves. A cycle of three is an exchange of two
+after a block was put into its slot, with the block from there in hand.
+
+If mounting turns a block by small random angles, of covariance C_b in its own axes, the expected
+sum of squares has ``tr(K_s R C_b R')`` in addition.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +34,6 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.design.exchange_search import Assignment, Slots, descend
 from halbach_fe.design.objective import Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
 from halbach_fe.geometry.magnet import Magnet
@@ -47,20 +57,6 @@ from halbach_fe.study.model import Study
 STARTS, STARTED_SLOTS = 20, 2000
 """Largest number of random assignments from which the search starts, and the slots of all of them
 together: local optima of large magnets differ less, and take longer to find."""
-
-RANDOM_ORDERS = 2000
-"""Number of random assignments with which the result is compared."""
-
-SHOWN_SLOTS = 6
-"""Largest number of slots of a type that are listed one by one."""
-
-WORTHWHILE = 1e-3
-"""Smallest decrease of the sum of squares for which blocks are exchanged, relative to what the
-measurement's uncertainty contributes to that sum, which no assignment changes."""
-
-
-SAME = 1e-4
-"""Part of their mean by which random orders differ at most where the order does not matter."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +117,9 @@ class SortedBlocks(ShownInNotebook):
 
         Blocks that only change rings do not: the multipoles are those of the field along all of z.
         """
-        return bool(np.ptp(self.random) > SAME * np.mean(self.random))
+        # part of their mean by which random orders differ at most where the order does not matter
+        rounding = 1e-4
+        return bool(np.ptp(self.random) > rounding * np.mean(self.random))
 
     @property
     def turned(self) -> int:
@@ -184,7 +182,7 @@ def sort_blocks(
                       f"the same blocks{types_in_words(alike)}, or measure spare blocks.",
                       HalbachWarning, stacklevel=2)
     count = len(model.orders) if isinstance(model, MultipoleModel) else 1
-    numbered = _with_places(magnet, table, _table_order(blocks))
+    numbered = _name_places(magnet, table, _table_order(blocks))
     known = _assembled(magnet, numbered, model)
     as_numbered = model.of(known)
     floor = float(np.sum(as_numbered.root ** 2))
@@ -192,23 +190,27 @@ def sort_blocks(
     fitting = [np.flatnonzero(blocks.types == number) for number in blocks.slot_types]
     best = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset)
     starts = min(STARTS, max(1, STARTED_SLOTS // len(blocks.slot_types)))
+    # smallest decrease of the sum of squares for which blocks are exchanged, relative to what the
+    # measurement's uncertainty contributes to that sum, which no assignment changes
+    worthwhile = 1e-3
     for start in range(starts):
         found = Assignment.of(blocks.slots, _random_order(blocks, generator), blocks.offset)
-        descend(found, peers, fitting, WORTHWHILE * floor, floor)
+        descend(found, peers, fitting, worthwhile * floor, floor)
         if not start or found.square < best.square:
             best = found
         progress(start + 1, starts)
+    random_orders = 2000  # number of random assignments with which the result is compared
     random = np.array([Assignment.of(
         blocks.slots, _random_order(blocks, generator), blocks.offset).square
-        for _ in range(RANDOM_ORDERS)])
+        for _ in range(random_orders)])
     # assignments count in units of a main multipole that no order changes; results in their own
     in_these_units = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset).square / count
     unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
     if (placed := _placed_order(table, magnet)) is not None:
-        known = _assembled(magnet, _with_places(magnet, table, placed), model)
+        known = _assembled(magnet, _name_places(magnet, table, placed), model)
     turned = np.zeros((len(table), 3))
     turned[best.order] = np.array([rotation_deg(turn) for turn in mounts.turns])[best.turn]
-    result = _with_places(magnet, table, best.order, mounts.turns[best.turn])
+    result = _name_places(magnet, table, best.order, mounts.turns[best.turn])
     after = _assembled(magnet, result, model)
     return SortedBlocks(
         magnet.study, model, result, turned, model.of(after), model.of(known),
@@ -223,9 +225,10 @@ def types_in_words(alike: dict[str, tuple[int, ...]]) -> str:
     if all(len(slots) == 1 for slots in alike.values()):
         return ""
     found = []
+    shown_slots = 6  # largest number of slots of a type that are listed one by one
     for name, slots in alike.items():
         text = ", ".join(map(str, slots))
-        if len(slots) > SHOWN_SLOTS and slots == tuple(range(slots[0], slots[-1] + 1)):
+        if len(slots) > shown_slots and slots == tuple(range(slots[0], slots[-1] + 1)):
             text = f"{slots[0]}, {slots[0] + 1}, ..., {slots[-1]}"
         found.append(f"{name} = [{text}]")
     return f" ({'; '.join(found)})"
@@ -350,7 +353,7 @@ def _placed_order(table: BlockTable, magnet: Magnet) -> Ints | None:
     return np.array([row_of[place] for place in places])
 
 
-def _with_places(
+def _name_places(
     magnet: Magnet, table: BlockTable, order: Ints, turns: Floats | None = None
 ) -> BlockTable:
     """Return the table with ring and slot of each block, and moments in the axes of these slots.
@@ -369,3 +372,267 @@ def _with_places(
         block = magnet.blocks[number]
         ring[row], slot[row], places[row] = block.ring, block.slot, number
     return replace(table, ring=ring, slot=slot, moment=as_mounted(magnet, table, places, turned))
+
+
+Change = tuple[float, tuple[tuple[int, int, int], ...]]
+"""The change of the sum of squares by placements of blocks: slot, block and number of the turn."""
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Slots, and the blocks that may stand in them; S slots, B blocks, q values, dimension D.
+
+    Attributes
+    ----------
+    effect : ndarray, shape (q, S, D)
+        Change of the values by magnetizations in A/m in the own axes of each slot.
+    blocks : ndarray, shape (B, D), in A/m
+        Mean magnetizations of the blocks in own axes.
+    spread : ndarray, shape (B, D, D), in A^2/m^2
+        Covariances that mounting adds, in own axes.
+    turns : ndarray, shape (n, D, D)
+        Rotations of a block in its own axes; the first is the identity.
+    fits : ndarray of bool, shape (n, A, C)
+        Turns by which blocks of a class C fit into slots of a class A.
+    slot_class, block_class : ndarray of int, shape (S,) and (B,)
+    """
+
+    effect: Floats
+    blocks: Floats
+    spread: Floats
+    turns: Floats
+    fits: NDArray[np.bool_]
+    slot_class: Ints
+    block_class: Ints
+
+    @cached_property
+    def products(self) -> Floats:
+        """K of every slot, (S, D, D)."""
+        return np.einsum("qsi,qsj->sij", self.effect, self.effect)
+
+    @cached_property
+    def flat(self) -> Floats:
+        """The effects as a matrix (q, S D)."""
+        return np.ascontiguousarray(self.effect.reshape(len(self.effect), -1))
+
+    @cached_property
+    def choices(self) -> tuple[Ints, NDArray[np.bool_]]:
+        """Numbers of the turns of each pair of classes (A, C, k), and which of them there are."""
+        most = int(self.fits.sum(axis=0).max(initial=1))
+        order = np.argsort(~self.fits, axis=0, kind="stable")[:most]
+        return (np.moveaxis(order, 0, -1),
+                np.moveaxis(np.take_along_axis(self.fits, order, 0), 0, -1))
+
+    def gradient(self, values: Floats) -> Floats:
+        """Return g of every slot, (S, D), for values (q,)."""
+        return (values @ self.flat).reshape(self.effect.shape[1:])
+
+    def mixed(self, slot: int) -> Floats:
+        """Return the products (S, D, D) of the effects of a slot with those of all slots."""
+        found = self.effect[:, slot].T @ self.flat
+        return found.reshape(-1, *self.effect.shape[1:]).swapaxes(0, 1)
+
+    def placed(
+        self, slots: Ints, blocks: Ints, present: Floats, gradient: Floats
+    ) -> tuple[Floats, Floats, Ints]:
+        """Return what blocks change if they are put into slots, by all their turns.
+
+        Parameters
+        ----------
+        slots, blocks : ndarray of int, shape (P,)
+        present : ndarray, shape (S, D), in A/m
+            Magnetizations that are in the slots now.
+        gradient : ndarray, shape (S, D)
+
+        Returns
+        -------
+        delta : ndarray, shape (P, k, D), in A/m
+            Changes of the magnetizations in the slots.
+        cost : ndarray, shape (P, k)
+            Changes of the expected sum of squares; infinite for turns that do not fit.
+        turn : ndarray of int, shape (P, k)
+        """
+        numbers, there = self.choices
+        classes = self.slot_class[slots], self.block_class[blocks]
+        turn = numbers[classes]
+        turned = self.turns[turn]
+        delta = np.einsum("pkij,pj->pki", turned, self.blocks[blocks]) - present[slots, None]
+        products = self.products[slots]
+        cost = np.einsum("pki,pki->pk", delta, 2 * gradient[slots, None] + delta @ products)
+        if self.spread.any():
+            own = turned @ self.spread[blocks, None] @ turned.swapaxes(-1, -2)
+            cost = cost + np.einsum("pij,pkij->pk", products, own)
+        return delta, np.where(there[classes], cost, np.inf), turn
+
+    def exchanges(
+        self, slot: int, hand: int, others: Ints, order: Ints, present: Floats, gradient: Floats
+    ) -> tuple[Floats, Ints, Ints]:
+        """Return the changes by putting a block in hand into other slots, whose blocks come here.
+
+        Parameters
+        ----------
+        slot : int
+            Takes the block of each of the other slots.
+        hand : int
+            The block that goes to the other slot: that of ``slot`` in an exchange of two.
+        others : ndarray of int, shape (P,)
+        order : ndarray of int, shape (S,)
+            Block in each slot.
+        present, gradient : ndarray, shape (S, D)
+            See `placed`.
+
+        Returns
+        -------
+        cost : ndarray, shape (P,)
+            Least change of the sum of squares over all turns of both blocks.
+        here, there : ndarray of int, shape (P,)
+            Turns of the block that comes, and of the block in hand.
+        """
+        came, came_cost, came_turn = self.placed(
+            np.full(len(others), slot), order[others], present, gradient)
+        went, went_cost, went_turn = self.placed(
+            others, np.full(len(others), hand), present, gradient)
+        carried = came @ self.mixed(slot)[others]
+        cost = came_cost[:, :, None] + went_cost[:, None] + 2 * carried @ went.swapaxes(1, 2)
+        best = cost.reshape(len(others), -1).argmin(axis=1)
+        first, second = np.divmod(best, cost.shape[2])
+        every = np.arange(len(others))
+        return cost[every, first, second], came_turn[every, first], went_turn[every, second]
+
+
+@dataclass
+class Assignment:
+    """Which block stands in which slot by which turn, and the values that result.
+
+    Attributes
+    ----------
+    slots : Slots
+    order, turn : ndarray of int, shape (S,)
+    present : ndarray, shape (S, D), in A/m
+        Magnetizations in the slots, in own axes.
+    values : ndarray, shape (q,)
+    """
+
+    slots: Slots
+    order: Ints
+    turn: Ints
+    present: Floats
+    values: Floats
+
+    @classmethod
+    def of(cls, slots: Slots, order: Ints, start: Floats) -> Assignment:
+        """Return the assignment of blocks (S,) that are not turned; ``start`` (q,) is x_0."""
+        present = slots.blocks[order]
+        return cls(slots, order.copy(), np.zeros(len(order), int), present,
+                   start + slots.flat @ present.ravel())
+
+    @property
+    def square(self) -> float:
+        """The sum of squares of the values."""
+        return float(self.values @ self.values)
+
+    @cached_property
+    def gradient(self) -> Floats:
+        """See `Slots.gradient`."""
+        return self.slots.gradient(self.values)
+
+    def put(self, placements: Sequence[tuple[int, int, int]]) -> None:
+        """Put blocks into slots: slot, block and turn of each."""
+        for slot, block, turn in placements:
+            new = self.slots.turns[turn] @ self.slots.blocks[block]
+            self.values = self.values + self.slots.effect[:, slot] @ (new - self.present[slot])
+            self.present[slot], self.order[slot], self.turn[slot] = new, block, turn
+        self.__dict__.pop("gradient", None)
+
+    def best_placement(self, slot: int, blocks: Ints) -> Change:
+        """Return the best of some blocks for a slot, and its turn: the own block, or spare ones."""
+        _, cost, turn = self.slots.placed(
+            np.full(len(blocks), slot), blocks, self.present, self.gradient)
+        row, column = np.unravel_index(int(np.argmin(cost)), cost.shape)
+        return float(cost[row, column]), ((slot, int(blocks[row]), int(turn[row, column])),)
+
+    def best_exchange(self, slot: int, others: Ints) -> Change:
+        """Return the best exchange of the block in a slot with that of another slot."""
+        hand = int(self.order[slot])
+        cost, here, there = self.slots.exchanges(
+            slot, hand, others, self.order, self.present, self.gradient)
+        best = int(np.argmin(cost))
+        other = int(others[best])
+        return float(cost[best]), ((slot, int(self.order[other]), int(here[best])),
+                                   (other, hand, int(there[best])))
+
+    def best_cycle(self, slot: int, others: Ints, firsts: int) -> Change:
+        """Return the best cycle of three that begins with a block from another slot.
+
+        The blocks of ``firsts`` other slots are tried, those that alone would help here most.
+        """
+        alone, cost, turn = self.slots.placed(
+            np.full(len(others), slot), self.order[others], self.present, self.gradient)
+        hand = int(self.order[slot])
+        best: Change = (np.inf, ())
+        column = np.argmin(cost, axis=1)
+        least = cost[np.arange(len(others)), column]
+        for row in np.argsort(least, kind="stable")[:firsts].tolist():
+            if not np.isfinite(least[row]):
+                break
+            second, choice = int(others[row]), int(column[row])
+            after = self.values + self.slots.effect[:, slot] @ alone[row, choice]
+            third = np.delete(others, row)
+            more, here, there = self.slots.exchanges(
+                second, hand, third, self.order, self.present, self.slots.gradient(after))
+            end = int(np.argmin(more))
+            if least[row] + more[end] < best[0]:
+                last = int(third[end])
+                best = (float(least[row] + more[end]), (
+                    (slot, int(self.order[second]), int(turn[row, choice])),
+                    (second, int(self.order[last]), int(here[end])),
+                    (last, hand, int(there[end]))))
+        return best
+
+
+def descend(assignment: Assignment, peers: Sequence[Ints], block_peers: Sequence[Ints],
+            least: float, floor: float) -> None:
+    """Improve an assignment by exchanges and turns, and where these do not help by cycles.
+
+    Sweeps over all slots end when one gains less than 1 %. Magnets of more than 500
+    slots are left without cycles: pairs suffice there, and cycles take long.
+
+    Parameters
+    ----------
+    peers : sequence of ndarray of int
+        For each slot, the slots whose blocks fit into it, itself among them.
+    block_peers : sequence of ndarray of int
+        For each slot, the blocks that fit into it.
+    least : float
+        Smallest gain for which blocks are moved.
+    floor : float
+        Part of the expected sum of squares that no order changes.
+    """
+    firsts = 8  # number of blocks that are tried in a slot as the first of a cycle of three
+    def improve(slot: int, cycles: bool) -> float:
+        """Make the best change at a slot; return what it gains."""
+        others = peers[slot][peers[slot] != slot]
+        spare = np.setdiff1d(block_peers[slot], assignment.order[peers[slot]])
+        found = [assignment.best_placement(slot, np.append(spare, assignment.order[slot]))]
+        if cycles and len(others) > 1:
+            found.append(assignment.best_cycle(slot, others, firsts))
+        elif len(others):
+            found.append(assignment.best_exchange(slot, others))
+        change, placements = min(found, key=lambda each: each[0])
+        if change >= -least:
+            return 0.0
+        assignment.put(placements)
+        return -change
+
+    count, cycles = len(assignment.order), False
+    most_cycles = 500  # largest number of slots for which cycles of three are tried
+    # gain of a sweep over all slots, relative to the sum of squares, below which the search ends
+    enough = 0.01
+    while True:
+        gained = sum(improve(slot, cycles) for slot in range(count))
+        if gained > enough * (assignment.square + floor):
+            cycles = False
+        elif cycles or count > most_cycles:
+            return
+        else:
+            cycles = True

@@ -31,9 +31,6 @@ from halbach_fe.study.model import Study
 QUANTILES = (0.05, 0.5, 0.95, 0.99)
 """Probabilities of the quantiles that are reported."""
 
-AT_ONCE = 200
-"""Number of magnets whose fields are computed at a time, which limits the memory."""
-
 
 @dataclass(frozen=True)
 class Tolerance(ShownInNotebook):
@@ -204,7 +201,8 @@ def predict_homogeneity(
     limit : float, optional
         Limit of the rms deviation in ppm.
     """
+    at_once = 200  # number of magnets whose fields are computed at a time, which limits the memory
     parts = [model.deviations(model.field(prior.sample(
-        min(AT_ONCE, draws - first), generator).T)) for first in range(0, draws, AT_ONCE)]
+        min(at_once, draws - first), generator).T)) for first in range(0, draws, at_once)]
     mean, rms, whole = (np.concatenate(each) for each in zip(*parts, strict=True))
     return HomogeneityTolerance(magnet.study, model, model.of(prior), mean, rms, whole, limit)

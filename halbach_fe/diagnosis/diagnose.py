@@ -68,6 +68,7 @@ from halbach_fe.diagnosis.search import (
     identify_effects,
     possible,
     score_hypotheses,
+    with_rivals,
     with_short_steps,
 )
 from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
@@ -340,14 +341,19 @@ def _diagnose(
             suspected = suspicions(judgement, corrected, search)
     if unknown is not None and unknown.alone and not start and not position_noise:
         update, search = first
+    identified = with_rivals(search, identified)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     in_model = [column for number in numbers for column in search.candidates[number].columns]
     limits = detection_limits(update, campaign, search.columns[:, in_model])
     return Diagnosis(
         corrected_study=corrected, before=first[0], after=update,
-        study=with_position_noise(with_uncertain_effects(corrected, identified), position_noise),
+        study=with_position_noise(with_uncertain_effects(
+            corrected, identified, [each for one in suspected for each in one.fitted]),
+            position_noise),
         identified=identified, unknown=unknown,
-        probabilities=probabilities(first[1].evidence, first[1].candidates),
+        probabilities=probabilities(
+            first[1].evidence, first[1].candidates,
+            judgement.best.log_odds if unknown is not None and unknown.alone else -np.inf),
         evidence=first[1].evidence, candidates=first[1].candidates,
         groups_before=_groups(first[0], first[1].marginal, first[1].training),
         groups_after=_groups(update, search.marginal, search.training),

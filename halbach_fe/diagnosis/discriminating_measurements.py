@@ -30,21 +30,19 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Effect
+from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, keys_of
-from halbach_fe.geometry.blocks import rotation_matrix
+from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.domain import boundary_half_length
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
-from halbach_fe.inference.result import HELD_OUT_MAP
+from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
 from halbach_fe.measurement.campaign import Data
 from halbach_fe.measurement.scan_lines import motion
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
@@ -198,7 +196,7 @@ def separations(
     """Compute what every candidate measurement would gain for each pair of effect and rival.
 
     Of several maps, the one whose instrument may be in error is measured again, or else the one
-    with the most readings. There are none if terms of instruments are open.
+    with the most readings. What is open of its instrument remains so.
 
     Parameters
     ----------
@@ -214,7 +212,7 @@ def separations(
     campaign = Campaign.of(study, data)
     pairs = [(effect, rival) for effect in diagnosis.identified
              for rival in _rivals(effect, study, catalogued, campaign)]
-    if not pairs or diagnosis.before.terms is not None:
+    if not pairs:
         return []
     names: list[str | None] = [None] if isinstance(data, xr.Dataset) else list(data)
     present = [present_scan(diagnosis, data, name) for name in names]
@@ -418,8 +416,22 @@ class _Readings:
             nominal, part, scan.magnet_rotation, np.eye(3),
             way=np.zeros_like(scan.points) if scan.way is None else scan.way)
         self.sensors = replace(self.mapper, probe_rotation=scan.probe_rotation)
-        self.blocks = self._whitened(
-            magnet.response[:, part] @ scan.magnet_rotation.T) @ diagnosis.before.prior.root
+        self.blocks = np.hstack([self._whitened(
+            magnet.response[:, part] @ scan.magnet_rotation.T) @ diagnosis.before.prior.root,
+            self._open_terms(diagnosis.before.terms)])
+
+    def _open_terms(self, terms: InstrumentTerms | None) -> Floats:
+        """Return whitened readings (n, terms) per standard deviation of what the study leaves open
+        of the instruments, which are integrated out like the blocks.
+        """
+        found, effects = [], {effect.name: effect for effect in catalogue()}
+        for name, sd in zip(terms.names, terms.prior_sd, strict=True) if terms else ():
+            owner, _, term = name.rpartition(".")
+            effect, number = _effect_of(term)
+            maps = tuple(one.name for one in self.magnet.nominal.study.maps
+                         if owner in (one.name, one.probe, one.stage))
+            found.append(sd * self.of(Hypothesis(effects[effect], Place(maps=maps)))[:, number])
+        return np.array(found).T.reshape(self.scan.analysis.shape[0], len(found))
 
     def of(self, hypothesis: Hypothesis) -> Floats:
         """Return whitened readings (n, k) per unit of each parameter of an effect."""
@@ -443,6 +455,19 @@ class _Readings:
         """Return the whitened readings (readings, k) of fields (k, n, 3) in T."""
         readings = self.scan.analysis @ fields.reshape(len(fields), -1).T
         return self.scan.noise.whiten(np.asarray(readings))
+
+
+def _effect_of(term: str) -> tuple[str, int]:
+    """Return the effect, and the number of its parameter, that a term of an instrument is."""
+    kind, *axes = term.removesuffix("_m").removesuffix("_rad").removesuffix("_T").split("_")
+    kind, axes = ("translation", axes[1:]) if kind == "stage" else (kind, axes)
+    number = COMPONENTS.index(axes[-1]) if axes and axes[-1] in COMPONENTS else 0
+    if not axes:  # of a probe of |B|
+        return f"{kind}_of_magnitude", 0
+    return {"translation": ("mapper_translation", number), "drift": ("drift", number),
+            "rotation": (("mapper_tilt_x", "mapper_tilt_y", "mapper_roll")[number], 0),
+            "crosstalk": (f"misalignment_{axes[0]}", 0),
+            "sensor": (f"sensor_position_{axes[0]}", number)}.get(kind, (f"{kind}_{axes[0]}", 0))
 
 
 def _distance(

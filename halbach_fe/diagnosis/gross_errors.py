@@ -40,15 +40,13 @@ from halbach_fe.diagnosis.map_conventions import (
     compose_axes,
     rank,
 )
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix, to_magnet_axes
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

@@ -18,6 +18,7 @@ from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import axes_of_map, odds, register
 from halbach_fe.measurement.campaign import Data, maps_of
 from halbach_fe.solver.session import Session
+from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
@@ -46,7 +47,9 @@ class FoundPose:
     best : Registration
         The most probable pose.
     instrument : Instrument
-        The instrument of the study with that pose and its probe.
+        The instrument of the study with that pose.
+    open : InstrumentSd
+        How far that pose, and the probe, are open from then on.
     others : tuple of float
         Probabilities of the other poses that the map hardly tells from the best one.
     misfit_before, misfit_after : float
@@ -58,6 +61,7 @@ class FoundPose:
 
     best: Registration
     instrument: Instrument
+    open: InstrumentSd
     others: tuple[float, ...]
     misfit_before: float
     misfit_after: float
@@ -76,9 +80,10 @@ class FoundPose:
 
     def apply(self, study: Study) -> Study:
         """Return the study with the map in this pose."""
+        tables = {"instrument": self.instrument, "instrument_sd": self.open}
         if self.map is None:
-            return study.with_(instrument=self.instrument)
-        return study.with_tables({self.map: {"instrument": self.instrument}})
+            return study.with_(**tables)
+        return study.with_tables({self.map: tables})
 
 
 def misfits_of(study: Study, data: Data) -> dict[str, float]:
@@ -137,7 +142,7 @@ def find_poses(
         say("no pose explains the map")
         return (), study
     poses = [FoundPose(
-        found[one.name][0], one.study.instrument,
+        found[one.name][0], one.study.instrument, one.study.instrument_sd,
         tuple(float(each) for each in odds(found[one.name])[1:] if each > POSSIBLE),
         before[one.name], after[one.name], one.name if several else None)
         for one in maps_of(registered, data)]

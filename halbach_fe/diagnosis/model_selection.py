@@ -343,18 +343,23 @@ def selected_effect(
         (candidates[k], float(factors[k])) for k in alternatives))
 
 
-def probabilities(evidence: Evidence, candidates: Sequence[Candidate]) -> dict[str, float]:
-    """Return the posterior probability of each effect, and of ``none``.
+def probabilities(
+    evidence: Evidence, candidates: Sequence[Candidate], unknown: float = -np.inf
+) -> dict[str, float]:
+    """Return the posterior probability of each effect, of ``none``, and of ``unknown``.
 
-    The probabilities hold on the assumption that at most one effect is missing.
+    The probabilities hold on the assumption that at most one effect is missing. The log odds of an
+    unlisted cause over nothing are given if one was found in place of all effects.
     """
-    log_odds = log_bayes_factors(evidence, candidates) + prior_log_odds(candidates)
-    top = max(0.0, float(log_odds.max(initial=0.0)))
-    weights = np.exp(log_odds - top)
-    total = float(np.exp(-top) + weights.sum())
-    found = {"none": float(np.exp(-top)) / total}
-    for candidate, weight in zip(candidates, weights, strict=True):
-        found[candidate.effect] = found.get(candidate.effect, 0.0) + float(weight) / total
+    log_odds = np.concatenate([
+        [0.0, unknown], log_bayes_factors(evidence, candidates) + prior_log_odds(candidates)])
+    weights = np.exp(log_odds - log_odds.max())
+    found: dict[str, float] = {}
+    for name, weight in zip(("none", "unknown", *(each.effect for each in candidates)),
+                            (weights / weights.sum()).tolist(), strict=True):
+        found[name] = found.get(name, 0.0) + weight
+    if unknown == -np.inf:
+        del found["unknown"]
     return found
 
 

@@ -25,8 +25,7 @@ from halbach_fe.measurement.instrument import (
     sensor_positions,
     with_memory,
 )
-from halbach_fe.solver.exact_block_field import block_gradients, unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import block_gradients, external_field, unit_fields
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

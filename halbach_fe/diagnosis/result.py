@@ -41,12 +41,15 @@ class IdentifiedEffect:
     selection : SelectedEffect
         Log Bayes factor, posterior odds, and the alternatives that the readings cannot distinguish
         from this effect.
+    rivals : tuple of IdentifiedEffect
+        These alternatives, each with the amplitudes that it would have in place of this effect.
     """
 
     hypothesis: Hypothesis
     values: Floats
     sd: Floats
     selection: SelectedEffect
+    rivals: tuple[IdentifiedEffect, ...] = ()
 
     @property
     def place(self) -> Place:
@@ -91,6 +94,8 @@ class Suspicion:
         Why it is not named: ``odds`` that are too small; the readings do not tell ``which`` of
         several it is; its amplitude would be ``impossible``; its signature was computed only
         ``roughly``; or the search ``dropped`` it again.
+    fitted : tuple of IdentifiedEffect
+        Each of the effects at its likeliest place, with the amplitudes that it would have.
     """
 
     effects: tuple[str, ...]
@@ -99,6 +104,7 @@ class Suspicion:
     shares: tuple[float, ...]
     log_bayes_factor: float
     reason: Literal["odds", "which", "impossible", "roughly", "dropped"] = "odds"
+    fitted: tuple[IdentifiedEffect, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -251,7 +257,8 @@ class Diagnosis(ShownInNotebook):
         Posterior probability of each effect by name, and of ``none``, on the assumption that at
         most one effect is missing from the corrected study. Effects that explain too little to be
         solved for have that of their rough signature, see
-        `halbach_fe.diagnosis.effects.base.Effect.rough_signature`.
+        `halbach_fe.diagnosis.effects.base.Effect.rough_signature`. An unlisted cause that was found
+        in place of all effects is among them as ``unknown``.
     evidence : Evidence
         Evidence of all signatures for the corrected study.
     candidates : tuple of Candidate

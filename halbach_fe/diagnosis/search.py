@@ -21,6 +21,7 @@ from halbach_fe.diagnosis.model_selection import (
     PINNED_SD,
     Candidate,
     SelectedEffect,
+    prior_log_odds,
     select_effects,
     with_wide_priors,
 )
@@ -575,6 +576,40 @@ def amplitudes(search: Search, selected: Sequence[SelectedEffect]) -> tuple[Iden
             np.concatenate([np.zeros(fixed), scale * deviation[part]]), selection))
         first += free
     return tuple(identified)
+
+
+def with_rivals(
+    search: Search, identified: Sequence[IdentifiedEffect]
+) -> tuple[IdentifiedEffect, ...]:
+    """Return identified effects with their alternatives, each fitted in place of its effect.
+
+    The error bars of all other amplitudes are those of not knowing which of both it is.
+    Alternatives that this search does not compare are left out.
+    """
+    own = [search.hypotheses.index(effect.hypothesis) for effect in identified]
+    prior = prior_log_odds(search.candidates)
+    numbers = {(one.effect, one.place): k for k, one in enumerate(search.candidates)}
+    variances = [effect.sd**2 for effect in identified]
+    every = []
+    for number, effect in enumerate(identified):
+        others = [k for k in range(len(own)) if k != number]
+        beside = [replace(identified[k].selection, candidate=search.candidates[own[k]])
+                  for k in others]
+        fits = [amplitudes(search, [*beside, SelectedEffect(
+            search.candidates[k], factor, float(factor + prior[k]), ())])
+            for one, factor in effect.selection.alternatives
+            if (k := numbers.get((one.effect, one.place))) is not None]
+        every.append(tuple(fit[-1] for fit in fits))
+        odds = np.exp([each.selection.log_odds - effect.selection.log_odds for each in every[-1]])
+        for place, k in enumerate(others):
+            known = identified[k]
+            more = [fit[place].sd**2 + (fit[place].values - known.values)**2 for fit in fits
+                    if len(fit[place].values) == len(known.values)]
+            if len(more) == len(odds) and more:
+                variances[k] = np.maximum(variances[k], (
+                    known.sd**2 + odds @ np.array(more)) / (1 + odds.sum()))
+    return tuple(replace(effect, sd=np.sqrt(variance), rivals=rivals)
+                 for effect, variance, rivals in zip(identified, variances, every, strict=True))
 
 
 def with_short_steps(

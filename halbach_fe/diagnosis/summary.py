@@ -200,8 +200,9 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     for effect in diagnosis.identified:
         study = effect.hypothesis.apply(study, effect.values.tolist())
         yield study, note(effect)
-    yield (with_uncertain_effects(diagnosis.corrected_study, diagnosis.identified),
-           "estimated with the blocks")
+    yield (with_uncertain_effects(
+        diagnosis.corrected_study, diagnosis.identified,
+        [each for one in diagnosis.suspected for each in one.fitted]), "estimated with the blocks")
     yield diagnosis.study, "; ".join(
         f"vibration: {_in_map(one.map)}{1e3 * one.sd_m:.2g} mm, log Bayes factor "
         f"{one.log_bayes_factor:.1f}" for one in diagnosis.position_noise)

@@ -2,11 +2,13 @@
 
 The standard deviation in such a table is the prior one of the effect, about the amplitude that was
 found. The posterior one would count the readings twice: `infer` uses the same map again, and finds
-the amplitude anew, with its correlations with all blocks and other amplitudes.
+the amplitude anew, with its correlations with all blocks and other amplitudes. What the readings do
+not tell from an effect is in the study beside it.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -17,6 +19,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects.base import Parameter
 from halbach_fe.diagnosis.model_selection import WIDE_PRIOR_FROM, WIDE_PRIOR_SD
 from halbach_fe.diagnosis.result import IdentifiedEffect
+from halbach_fe.diagnosis.search import apply_effects
 from halbach_fe.study.model import Study
 from halbach_fe.study.uncertain import Uncertain, number_changes
 
@@ -28,26 +31,81 @@ DIGITS = 9
 """Digits of a derivative that differences have, of which rounding leaves no more."""
 
 
-def with_uncertain_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study:
+def with_uncertain_effects(
+    study: Study, identified: Sequence[IdentifiedEffect],
+    suspected: Sequence[IdentifiedEffect] = ()
+) -> Study:
     """Return a study without some effects, with these at their amplitudes, which stay uncertain.
 
-    Amplitudes that were not fitted (a block is missing or it is not) are exact, but for those of
-    refinements: the place of an object is uncertain too if it was taken from a search.
+    What explains the readings as well as one of them, or is suspected beside them, is in it with
+    an amplitude of 0, which is uncertain too: readings that do not tell them apart determine a
+    combination of them. Amplitudes that were not fitted (a block is missing or it is not) are
+    exact, but for those of refinements: the place of an object is uncertain too if it was taken
+    from a search.
     """
-    found, tables = study, list(study.uncertain)
-    identified = [_with_refinements(effect) for effect in identified]
-    for number, effect in enumerate(identified):
-        found = effect.hypothesis.apply(found, effect.values.tolist())
-        before, after = identified[:number], identified[number + 1:]
-        for which, parameter in enumerate(effect.parameters):
-            is_switch = which == 0 and effect.hypothesis.effect.applied_in_full
-            if effect.sd[which] > 0 and not is_switch:
-                change = _change(study, (before, effect, after), which, parameter)
-                if change:
-                    tables.append(Uncertain(
-                        name=_name(effect, parameter, {one.name for one in tables}),
-                        sd=_prior_sd(effect, which, parameter), change=change))
+    effects = [_with_refinements(effect) for effect in identified]
+    widths = [_prior_sds(effect) for effect in effects]
+    for rival in _rivals(effects, suspected):
+        nothing = replace(rival, values=0.0 * rival.values)
+        if _is_neutral(apply_effects(study, effects), nothing):
+            effects.append(nothing)
+            widths.append(_prior_sds(rival))
+    found, tables = apply_effects(study, effects), list(study.uncertain)
+    for number, (effect, sds) in enumerate(zip(effects, widths, strict=True)):
+        for which, sd in enumerate(sds):
+            change = _change(study, effects, (number, which)) if sd else {}
+            if change:
+                tables.append(Uncertain(
+                    name=_name(effect, effect.parameters[which], {one.name for one in tables}),
+                    sd=sd, change=change))
     return found.with_(uncertain=tuple(tables))
+
+
+def is_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
+    """Tell whether a study has amplitudes of an effect as uncertain numbers.
+
+    Of an effect that is there or not, as a missing block, it has none.
+    """
+    return any(re.fullmatch(rf"(\d+\. )?{re.escape(effect.name)}\..*", one.name)
+               for one in study.uncertain)
+
+
+def _rivals(
+    effects: Sequence[IdentifiedEffect], suspected: Sequence[IdentifiedEffect] = ()
+) -> list[IdentifiedEffect]:
+    """Return all rivals of some effects, and what is suspected, that are none of these.
+
+    An effect whose place is fitted is one rival, at its likeliest place, and none of itself.
+    """
+    found = {effect.hypothesis: effect for effect in effects}
+    placed = {one.effect for one in found if one.effect.refinements}
+    for rival in (*(each for effect in effects for each in effect.rivals), *suspected):
+        own = rival.hypothesis.effect
+        if own not in placed:
+            found.setdefault(rival.hypothesis, rival)
+            placed |= {own} if own.refinements else set()
+    return list(found.values())[len(effects):]
+
+
+def _is_neutral(study: Study, nothing: IdentifiedEffect) -> bool:
+    """Tell whether an effect with amplitudes of 0 changes nothing but the shape of a study.
+
+    It may add an exception of a block.
+    """
+    if _switches(nothing):
+        return False
+    try:
+        return not number_changes(study, apply_effects(study, [nothing]))
+    except (StudyError, ValidationError):
+        return False
+    except ValueError:  # the shape
+        return True
+
+
+def _switches(effect: IdentifiedEffect) -> int:
+    """Return how many of the first amplitudes only say whether an effect is present: 0 or 1."""
+    own = effect.hypothesis.effect
+    return int(own.is_binary or own.applied_in_full)
 
 
 def _with_refinements(identified: IdentifiedEffect) -> IdentifiedEffect:
@@ -59,35 +117,37 @@ def _with_refinements(identified: IdentifiedEffect) -> IdentifiedEffect:
                    sd=np.append(identified.sd, missing))
 
 
-def _prior_sd(effect: IdentifiedEffect, which: int, parameter: Parameter) -> float:
-    """Return the prior standard deviation with which an amplitude was fitted."""
-    wide = abs(effect.values[which]) > WIDE_PRIOR_FROM * parameter.sd
-    return parameter.sd * (WIDE_PRIOR_SD if wide else 1.0)
+def _prior_sds(effect: IdentifiedEffect) -> list[float]:
+    """Return the prior standard deviations with which amplitudes are fitted; 0 of switches.
+
+    Those that are 0 in the likeliest part of an effect may be free as well.
+    """
+    return [0.0 if which < _switches(effect) else parameter.sd * (
+        WIDE_PRIOR_SD if abs(value) > WIDE_PRIOR_FROM * parameter.sd else 1.0)
+        for which, (parameter, value) in enumerate(zip(
+            effect.parameters, effect.values.tolist(), strict=True))]
 
 
 def _change(
-    study: Study,
-    identified: tuple[Sequence[IdentifiedEffect], IdentifiedEffect, Sequence[IdentifiedEffect]],
-    which: int, parameter: Parameter
+    study: Study, effects: Sequence[IdentifiedEffect], amplitude: tuple[int, int]
 ) -> dict[str, float]:
     """Return the change of the numbers of a study per unit of an amplitude of an effect.
 
-    It is empty if the amplitude is no number of the study. ``identified`` are the effects before,
-    that one, and those after it.
+    It is empty if the amplitude is no number of the study. ``amplitude`` has the numbers of the
+    effect and of its parameter.
     """
-    before, effect, after = identified
-    sides, between = [], 0.0
+    number, which = amplitude
+    effect = effects[number]
+    step = STEP * effect.parameters[which].sd
+    sides = []
     for sign in (1, 0, -1):
-        values = effect.values + sign * STEP * parameter.sd * np.eye(len(effect.values))[which]
-        changed = replace(effect, values=values)
+        values = effect.values + sign * step * np.eye(len(effect.values))[which]
         try:
-            other = study
-            for each in (*before, changed, *after):
-                other = each.hypothesis.apply(other, each.values.tolist())
+            sides.append((sign, apply_effects(study, [
+                *effects[:number], replace(effect, values=values), *effects[number + 1:]])))
         except (StudyError, ValidationError):  # beyond the limit of a key
             continue
-        sides.append((sign, other))
-    between = (sides[0][0] - sides[-1][0]) * STEP * parameter.sd
+    between = (sides[0][0] - sides[-1][0]) * step
     if not between:
         return {}
     try:

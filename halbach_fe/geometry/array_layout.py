@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix, vector
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
 from halbach_fe.geometry.free_blocks import nominal_free_blocks
-from halbach_fe.geometry.outline import Outline, closed_outline, plane_rotation
+from halbach_fe.geometry.outline import Outline, closed_outline
 from halbach_fe.study.array import Array, BlockException
 from halbach_fe.study.materials import MU_0
 
@@ -252,10 +252,10 @@ def outline_of_slot(array: Array, slot: int) -> Outline:
             )
         local = np.array([(inner, -widths[0]), (outer, -widths[1]),
                           (outer, widths[1]), (inner, widths[0])])
-        return closed_outline(local @ plane_rotation(middle).T)
+        return closed_outline(local @ rotation_about_z(middle)[:2, :2].T)
     half_width, half_depth = block.width_m / 2, (outer - inner) / 2
     local = np.array([(-half_depth, -half_width), (half_depth, -half_width),
                       (half_depth, half_width), (-half_depth, half_width)])
     facing = np.radians(facing_angle_deg(array, slot))
     centre = (inner + outer) / 2 * np.array([np.cos(middle), np.sin(middle)])
-    return closed_outline(local @ plane_rotation(facing).T + centre)
+    return closed_outline(local @ rotation_about_z(facing)[:2, :2].T + centre)

@@ -21,9 +21,6 @@ from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outl
 from halbach_fe.geometry.surface import Contact, contact_of_prism
 from halbach_fe.study.materials import MU_0
 
-CORNER = 1 / 6
-"""Extent of a corner (see ``inner_corner_loss``) as a fraction of a block's width and thickness."""
-
 
 @dataclass(frozen=True)
 class MagnetBlock:
@@ -160,9 +157,12 @@ class MagnetBlock:
         if self.gradient:
             found += [(-self.gradient / 2, part(0.0, 0.5, 0.0, 1.0)),
                       (self.gradient / 2, part(0.5, 1.0, 0.0, 1.0))]
+        # extent of a corner (see ``inner_corner_loss``) as a fraction of a block's width and
+        # thickness
+        lost_share = 1 / 6
         if self.corner_loss:
-            found += [(-self.corner_loss, part(0.0, CORNER, 0.0, CORNER)),
-                      (-self.corner_loss, part(0.0, CORNER, 1 - CORNER, 1.0))]
+            found += [(-self.corner_loss, part(0.0, lost_share, 0.0, lost_share)),
+                      (-self.corner_loss, part(0.0, lost_share, 1 - lost_share, 1.0))]
         return tuple(found)
 
     @property
@@ -236,6 +236,12 @@ def rotation_matrix(vector: tuple[float, float, float]) -> Floats:
     if not any(vector):  # most blocks of most magnets, which may have thousands
         return np.eye(3)
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def rotation_about_z(angle: float) -> Floats:
+    """Return the matrix (3, 3) of a rotation about z by ``angle`` rad."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
 
 
 def frames_of(blocks: Sequence[MagnetBlock]) -> tuple[Floats, Floats]:

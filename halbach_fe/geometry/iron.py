@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.free_blocks import counter_clockwise
-from halbach_fe.geometry.outline import Outline, closed_outline, plane_rotation
+from halbach_fe.geometry.outline import Outline, closed_outline
 from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
 from halbach_fe.study.iron import Iron, IronRing
 
@@ -79,7 +80,7 @@ def iron_solids(
         corners = counter_clockwise(np.array(body.outline_m))
         for number in range(body.copies):
             outline = closed_outline(
-                corners @ plane_rotation(2 * np.pi * number / body.copies).T)
+                corners @ rotation_about_z(2 * np.pi * number / body.copies)[:2, :2].T)
             t = np.linspace(0.0, 1.0, 17)
             radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
             solids.append(IronSolid(float(radii.min()), float(radii.max()), *ends, outline))

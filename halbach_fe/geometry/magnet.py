@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
@@ -30,20 +31,8 @@ from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, iron_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
-CONTACT, CONTACT_IN_TABLES = 1e-6, 2e-4
-"""Overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
-blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm."""
-
-BEYOND_ENDS = 4.5
-"""Distance by which the field is summed beyond the ends, relative to the magnet's outer radius. The
-field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1 of a block lies
-beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles. Higher orders fall
-faster: for two rings of 80 mm with errors of 2 %, 0.01 units are missing. The distance is half of
-that to the boundary of 3D meshes."""
-
-BESIDE_RAD = 1e-6
-"""Angle in rad beyond half a turn without blocks about the axis, from which blocks are on one side.
-Two opposite poles leave half a turn, but for the rounding of their tables to micrometres."""
+SOLVED_BY = "halbach_fe.solver.formulation_choice"
+"""The module that solves for the field of a magnet."""
 
 SQUEEZED = 0.1
 """The same for blocks that exceptions displace or rotate. In a ring without gaps any displacement
@@ -233,7 +222,13 @@ class Magnet(ShownInNotebook):
     @property
     def field_reach(self) -> float:
         """Distance in m from the middle up to which there is some field; of a 3D magnet."""
-        return self.half_length + BEYOND_ENDS * self.radius
+        # distance by which the field is summed beyond the ends, relative to the magnet's outer
+        # radius. The field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1
+        # of a block lies beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles.
+        # Higher orders fall faster: for two rings of 80 mm with errors of 2 %, 0.01 units are
+        # missing. The distance is half of that to the boundary of 3D meshes.
+        reach_per_radius = 4.5
+        return self.half_length + reach_per_radius * self.radius
 
     @cached_property
     def bore_radius(self) -> float:
@@ -257,7 +252,11 @@ class Magnet(ShownInNotebook):
         reach = 0.0 if self.dimension == 2 else self.half_length
         z = np.linspace(-reach, reach, 33)
         axis = np.column_stack([0 * z, 0 * z, z])
-        return bool(widest < np.pi + BESIDE_RAD and not self.contains(axis).any())
+        # angle in rad beyond half a turn without blocks about the axis, from which blocks are on
+        # one side. Two opposite poles leave half a turn, but for the rounding of their tables to
+        # micrometres.
+        rounding_rad = 1e-6
+        return bool(widest < np.pi + rounding_rad and not self.contains(axis).any())
 
     @property
     def iron_half_length(self) -> float:
@@ -307,6 +306,32 @@ class Magnet(ShownInNotebook):
             1.02 * np.linalg.norm((points - block.middle)[:, :self.dimension], axis=1).max()
             for block, points in zip(self.blocks, self._corners, strict=True)])
 
+    def __repr__(self) -> str:
+        """Return the name and the size."""
+        return f"Magnet({self.name}: {len(self.blocks)} blocks in {self.dimension}D)"
+
+    def field_T(self, points_m: ArrayLike) -> Floats:  # noqa: N802 - T is the unit
+        """Return B in T of the nominal magnet at points in air.
+
+        Finite elements are solved where the magnet needs any. `halbach_fe.solve` keeps their files,
+        and has error bars.
+
+        Parameters
+        ----------
+        points_m : array_like, shape (..., 3), in m
+
+        Returns
+        -------
+        ndarray, shape (..., 3), in T
+
+        Raises
+        ------
+        StudyError
+            If a point is not in air.
+        """
+        # the way to the solver, which is a later room: what a magnet is used for most is a method
+        return np.asarray(import_module(SOLVED_BY).field_at(self, points_m))
+
     def with_(self, **changes: Any) -> Magnet:
         """Return the magnet of the same study with other values of some keys, see `Study.with_`."""
         return self.with_study(self.study.with_(**changes))
@@ -315,10 +340,6 @@ class Magnet(ShownInNotebook):
         """Return the magnet of another study; blocks are built again only if they may differ."""
         same = all(getattr(study, key) == getattr(self.study, key) for key in MAGNET_KEYS)
         return Magnet(study, self.blocks) if same else build_magnet(study)
-
-
-WEAKEST_T = 1e-6
-"""Smallest remanence in T of a magnet's strongest block; results are relative to it."""
 
 
 @typed
@@ -347,7 +368,9 @@ def build_magnet(study: Study) -> Magnet:
     """
     magnet = Magnet(study, blocks_of_array(study.array, study.dimension))
     strongest = max(abs(block.remanence) for block in magnet.blocks)
-    if strongest < WEAKEST_T:
+    # smallest remanence in T of a magnet's strongest block; results are relative to it
+    weakest_T = 1e-6
+    if strongest < weakest_T:
         raise StudyError(must_be(
             "`array`", f"study {study.name}", "a magnet with at least one magnetized block",
             f"{len(magnet.blocks)} blocks that are missing" if not strongest
@@ -407,7 +430,10 @@ def _check_overlaps(
     ------
     StudyError
     """
-    contact = CONTACT_IN_TABLES if array.free_blocks else CONTACT
+    # overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
+    # blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm.
+    rounding_overlap, table_overlap = 1e-6, 2e-4
+    contact = table_overlap if array.free_blocks else rounding_overlap
     cases = [(nominal_blocks(array, dimension), contact, "")]
     blocks = blocks_of_array(array, dimension)
     if dimension == 2:  # where a small tilt turns magnetizations, and moves nothing in the plane

@@ -1,11 +1,24 @@
-"""The places that blocks were mounted at, and the rotation of their magnetizations with them."""
+"""Where blocks are mounted: their places, and the turns and moves after which they fit a slot.
+
+Turns and moves are found by the shapes of the blocks, so that they exist for rings and free blocks
+alike.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
-from halbach_fe.geometry.blocks import rotation_matrix
+from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, nominal_blocks
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import points_on
+from halbach_fe.study.array import Array
 
 
 def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
@@ -34,3 +47,184 @@ def as_meant(magnet: Magnet) -> Magnet:
              "twist_deg": 0.0}
     return magnet.with_(array__exceptions=tuple(
         exception.with_(**meant) for exception in magnet.array.exceptions))
+
+
+Turn = tuple[tuple[float, float, float], ...]
+"""A rotation matrix, row by row."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """A move of many blocks from slot to slot.
+
+    Attributes
+    ----------
+    words : str
+        What is moved, and how.
+    pairs : tuple of (int, int)
+        Number from 0 of a block's slot, and of the slot from which the block that is there comes.
+    turn : tuple
+        Rotation of these blocks.
+    """
+
+    words: str
+    pairs: tuple[tuple[int, int], ...]
+    turn: Turn
+
+
+@lru_cache(maxsize=4096)
+def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
+    """Return the turns of a block about its middle after which it fits its slot.
+
+    Of those that turn its magnetization into the same direction the smallest is returned, and none
+    that leaves it as it is. Turns by right angles about the axes of the shape are tried, and those
+    from edge to edge.
+    """
+    axes = block.shape_axes
+    tried = list(Rotation.create_group("O"))
+    edges = len(block.outline)
+    most_edges = 12  # number of edges of an outline up to which turns from edge to edge are tried
+    if edges <= most_edges:
+        tried += [Rotation.from_euler("z", 2 * np.pi * k / edges) for k in range(1, edges)]
+    found: list[tuple[Turn, Floats]] = []
+    corners = _corners(block)
+    same_direction = 1e-3  # difference of directions up to which two turns of a block are one
+    for turn in sorted(tried, key=lambda each: float(each.magnitude())):
+        matrix = axes @ turn.as_matrix() @ axes.T
+        direction = matrix @ np.array(block.easy_axis)
+        known = [np.array(block.easy_axis), *(each for _, each in found)]
+        nearest = min(np.linalg.norm(direction - each) for each in known)
+        if nearest > same_direction and block.contains(
+                _shrink(corners) @ matrix.T + corners.mean(axis=0)).all():
+            found.append((_matrix_rows(matrix), direction))
+    return tuple(turn for turn, _ in found)
+
+
+def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
+    """Return the moves of rings, and of half of them, after which every block fits its slot.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    kind : str
+        ``exchanged``, ``turned`` (from slot to slot about z) or ``upside down``.
+    """
+    return _moves(_drop_exceptions(magnet.array), magnet.dimension, kind)
+
+
+def _drop_exceptions(array: Array) -> Array:
+    """Return an array without its exceptions, whose blocks are all in their slots."""
+    return array.with_(exceptions=()) if array.exceptions else array
+
+
+@lru_cache(maxsize=32)
+def _moves(array: Array, dimension: int, kind: str) -> dict[str, Move]:
+    blocks = nominal_blocks(array, dimension)
+    rings: dict[int, list[int]] = {}
+    for number, block in enumerate(blocks):
+        rings.setdefault(block.ring, []).append(number)
+    groups = {f"ring {ring}": numbers for ring, numbers in rings.items() if len(numbers) > 2}
+    # numbers of blocks in a ring, and of rings, up to which moves of rings are tried
+    most_in_ring, most_rings = 64, 40
+    if dimension == 2 or not 1 <= len(groups) <= most_rings or max(
+            map(len, groups.values())) > most_in_ring:
+        return {}
+    several = len(groups) > 1  # a whole magnet that is turned is an error of another kind
+    if len(groups) > 3:
+        names = list(groups)
+        for name, part in (("the lower half", names[:len(names) // 2]),
+                           ("the upper half", names[-(len(names) // 2):])):
+            groups[name] = [number for each in part for number in groups[each]]
+    tried = (_exchanges(blocks, groups) if kind == "exchanged"
+             else _turns(blocks, groups, kind) if several else iter(()))
+    return {move.words: move for move in tried}
+
+
+def _exchanges(
+    blocks: Sequence[MagnetBlock], groups: dict[str, list[int]]
+) -> Iterator[Move]:
+    """Yield the exchanges of two rings, or of the halves, each of which moves along z."""
+    names, still = list(groups), np.eye(3)
+    for number, one in enumerate(names):
+        for other in names[:number]:
+            if ("half" in one) != ("half" in other):
+                continue
+            way = _middle(blocks, groups[one]) - _middle(blocks, groups[other])
+            up = _pairs(blocks, (groups[other], groups[one]), still, way)
+            down = _pairs(blocks, (groups[one], groups[other]), still, -way)
+            if up is not None and down is not None and not {*groups[one]} & {*groups[other]}:
+                yield Move(f"{other} and {one}", (*up, *down), _matrix_rows(still))
+
+
+def _turns(
+    blocks: Sequence[MagnetBlock], groups: dict[str, list[int]], kind: str
+) -> Iterator[Move]:
+    """Yield the turns of a ring, or of a half, about z, or by half a turn about an axis across."""
+    for name, numbers in groups.items():
+        middle = _middle(blocks, numbers)
+        rings = {blocks[number].ring for number in numbers}
+        count = len(numbers) // len(rings)
+        for k in range(0 if kind == "upside down" else 1, count):
+            if kind == "turned":
+                turn = Rotation.from_euler("z", 2 * np.pi * k / count)
+                signed = k if k <= count // 2 else k - count
+                words = f"{name} by {signed:+d} slot{'s' if abs(signed) > 1 else ''}"
+            else:
+                angle = np.pi * k / count + np.radians(blocks[numbers[0]].angle_deg)
+                turn = Rotation.from_rotvec(np.pi * np.array([np.cos(angle), np.sin(angle), 0.0]))
+                words = f"{name} about {np.degrees(angle) % 180:.4g}° from x"
+            pairs = _pairs(blocks, (numbers, numbers), turn.as_matrix(),
+                           middle - turn.apply(middle))
+            if pairs is not None:
+                yield Move(words, pairs, _matrix_rows(turn.as_matrix()))
+
+
+def _pairs(
+    blocks: Sequence[MagnetBlock], groups: tuple[list[int], list[int]], turn: Floats, shift: Floats
+) -> tuple[tuple[int, int], ...] | None:
+    """Return slot and source of the blocks of a group that is moved to the slots of another one.
+
+    None if a block does not fit there.
+    """
+    source, to = groups
+    if len(source) != len(to):
+        return None
+    places = np.array([blocks[number].middle for number in to])
+    found = []
+    for number in source:
+        corners = _corners(blocks[number])
+        there = turn @ blocks[number].middle + shift
+        slot = to[int(np.linalg.norm(places - there, axis=1).argmin())]
+        moved = (_shrink(corners) + corners.mean(axis=0)) @ turn.T + shift
+        if not blocks[slot].contains(moved).all():
+            return None
+        found.append((slot, number))
+    return tuple(found) if len({slot for slot, _ in found}) == len(to) else None
+
+
+def _corners(block: MagnetBlock) -> Floats:
+    """Return points (n, 3) in m on the edges of a block; of an infinite one, at |z| of 1 m."""
+    ends = [-1.0, 1.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
+    outline = points_on(block.outline)
+    return block.from_frame(np.vstack([
+        np.column_stack([outline, np.full(len(outline), z)]) for z in ends]))
+
+
+def _shrink(corners: Floats) -> Floats:
+    """Return corners (n, 3) about their middle, of a body that is slightly smaller."""
+    # A body whose size is reduced by this factor lies within its slot wherever it fits: slots are
+    # wider than blocks by about a hundredth, and edges of a block may differ by as much
+    reduction = 0.99
+    return np.asarray(reduction * (corners - corners.mean(axis=0)))
+
+
+def _middle(blocks: Sequence[MagnetBlock], numbers: Sequence[int]) -> Floats:
+    """Return the point (3,) in m on the axis in the middle of some blocks."""
+    heights = [blocks[number].middle[2] for number in numbers]
+    return np.array([0.0, 0.0, (min(heights) + max(heights)) / 2])
+
+
+def _matrix_rows(matrix: Floats) -> Turn:
+    """Return a matrix as a tuple."""
+    rows = matrix.round(12) + 0.0
+    return tuple((float(a), float(b), float(c)) for a, b, c in rows)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from halbach_fe.core.arrays import Floats
 
@@ -69,14 +71,11 @@ class Edge:
 Outline = tuple[Edge, ...]
 
 
-PARTS_OF_AN_ARC = 8
-"""Number of equal parts of an arc at whose ends `points_on` has points."""
-
-
 @lru_cache(maxsize=4096)  # the same magnet is built with many instruments and effects
 def points_on(outline: Outline) -> Floats:
     """Return points (n, 2) in m on an outline: its corners, and some on its arcs."""
-    t = np.linspace(0.0, 1.0, PARTS_OF_AN_ARC + 1)[:-1]
+    parts_of_arc = 8  # number of equal parts of an arc at whose ends `points_on` has points
+    t = np.linspace(0.0, 1.0, parts_of_arc + 1)[:-1]
     points = np.vstack([edge.at(t if edge.arc else t[:1])[0] for edge in outline])
     points.flags.writeable = False
     return points
@@ -127,11 +126,6 @@ def outline_area(outline: Outline) -> float:
     return total
 
 
-def plane_rotation(angle: float) -> Floats:
-    """Return the matrix (2, 2) of a rotation by ``angle`` rad in the plane."""
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-
-
 def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
     """Return points inside an outline, on a grid of fractions of its thickness and width.
 
@@ -175,3 +169,80 @@ def closed_outline(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
     points = [(float(x), float(y)) for x, y in corners]
     return tuple(Edge(points[i], points[(i + 1) % len(points)], arc=i in arcs)
                  for i in range(len(points)))
+
+
+def thinnest_wall(polygons: Sequence[Floats], owners: Sequence[object]) -> tuple[float, int, int]:
+    """Return the smallest distance in m of two polygons, and their numbers.
+
+    Parameters
+    ----------
+    polygons : sequence of ndarray, shape (n, 2), in m
+        Corners, counter-clockwise or clockwise.
+    owners : sequence
+        Polygons of one owner may touch and overlap; they are not compared.
+
+    Returns
+    -------
+    distance : float, in m
+        0 if two polygons overlap; infinite if there is nothing to compare.
+    first, second : int
+    """
+    centres = np.array([(polygon.max(axis=0) + polygon.min(axis=0)) / 2 for polygon in polygons])
+    reach = np.array([np.hypot(*(polygon - centre).T).max()
+                      for polygon, centre in zip(polygons, centres, strict=True)])
+    nearest = (np.inf, 0, 0)
+    tree = cKDTree(centres)
+    for first, centre in enumerate(centres):
+        # all whose circles are nearer than the nearest pair so far
+        limit = min(nearest[0], 4 * reach.max()) + reach[first] + reach.max()
+        for second in tree.query_ball_point(centre, limit):
+            if second <= first or owners[first] == owners[second]:
+                continue
+            apart = np.hypot(*(centres[second] - centre)) - reach[first] - reach[second]
+            if apart < nearest[0]:
+                distance = _polygon_distance(polygons[first], polygons[second])
+                nearest = min(nearest, (distance, first, second))
+    return nearest
+
+
+def distance_from_origin(polygon: Floats) -> float:
+    """Return the distance in m of a polygon (n, 2) from the origin; 0 if it is inside."""
+    if _contains(polygon, np.zeros(2)):
+        return 0.0
+    return float(_edge_distances(np.zeros((1, 2)), polygon).min())
+
+
+def _polygon_distance(first: Floats, second: Floats) -> float:
+    """Return the distance of two polygons, 0 if they overlap."""
+    if (_contains(first, second[0]) or _contains(second, first[0]) or _edges_cross(first, second)):
+        return 0.0
+    return float(min(_edge_distances(first, second).min(), _edge_distances(second, first).min()))
+
+
+def _edge_distances(points: Floats, polygon: Floats) -> Floats:
+    """Return the distances (points, edges) of points from the edges of a polygon."""
+    along = np.roll(polygon, -1, axis=0) - polygon
+    apart = points[:, None] - polygon
+    share = np.clip(np.sum(apart * along, axis=2) / np.sum(along**2, axis=1), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(apart - share[:, :, None] * along, axis=2))
+
+
+def _contains(polygon: Floats, point: Floats) -> bool:
+    """Tell whether a point is inside a polygon, by the even-odd rule."""
+    (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, axis=0).T
+    crosses = np.flatnonzero((y0 > point[1]) != (y1 > point[1]))
+    x = x0[crosses] + (point[1] - y0[crosses]) / (y1[crosses] - y0[crosses]) * (
+        x1[crosses] - x0[crosses])
+    return bool(np.sum(x > point[0]) % 2)
+
+
+def _edges_cross(first: Floats, second: Floats) -> bool:
+    """Tell whether any edges of two polygons cross."""
+    a, b = first[:, None], np.roll(first, -1, axis=0)[:, None]
+    c, d = second[None], np.roll(second, -1, axis=0)[None]
+
+    def side(start: Floats, end: Floats, point: Floats) -> Floats:
+        along, to = end - start, point - start
+        return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+    return bool(((side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)).any())

@@ -19,29 +19,17 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.convex_pieces import Shape, annulus
+from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import Outline
-from halbach_fe.geometry.separating_axes import PARALLEL, Prisms
 
-TOLERANCE = 1e-6
+ALLOWED_PENETRATION = 1e-6
 """Allowed penetration, as a fraction of the smaller body's size. Positions with nine significant
 digits, and the rounding of rotations (1e-15), stay below it."""
 
-CHORD_ERROR = 4e-5
-"""Largest distance between an arc and its chords or tangents, as a fraction of the shape's width.
-Two such arcs hide an overlap of 8e-5 of the width; larger ones are found."""
-
-COARSE = (1e-3, 3e-2)
-"""Larger values of it, for the depth of an overlap that is already found: fewer and larger pieces
-measure deep overlaps better, since a penetration cannot exceed the width of a piece."""
-
-_PAIRS = 20_000
-"""Number of pairs of pieces that are compared at once."""
-
 
 def overlapping_blocks(
-    blocks: Sequence[MagnetBlock], tolerance: float = TOLERANCE
+    blocks: Sequence[MagnetBlock], tolerance: float = ALLOWED_PENETRATION
 ) -> tuple[int, int, float] | None:
     """Return the first two blocks, by number, that overlap.
 
@@ -65,20 +53,21 @@ def overlapping_blocks(
     ValueError
         If an infinite block is tilted.
     """
-    return _first_overlap(_of_blocks(blocks), None, tolerance) if blocks else None
+    return _first_overlap(_block_bodies(blocks), None, tolerance) if blocks else None
 
 
 def block_in_others(
-    blocks: Sequence[MagnetBlock], others: Sequence[MagnetBlock], tolerance: float = TOLERANCE
+    blocks: Sequence[MagnetBlock], others: Sequence[MagnetBlock],
+    tolerance: float = ALLOWED_PENETRATION,
 ) -> tuple[int, int, float] | None:
     """Return the first of some blocks that overlaps one of others, as `block_in_iron` does."""
     if not (blocks and others):
         return None
-    return _first_overlap(_of_blocks(blocks), _of_blocks(others), tolerance)
+    return _first_overlap(_block_bodies(blocks), _block_bodies(others), tolerance)
 
 
 def block_in_iron(
-    blocks: Sequence[MagnetBlock], iron: Sequence[IronSolid], tolerance: float = TOLERANCE
+    blocks: Sequence[MagnetBlock], iron: Sequence[IronSolid], tolerance: float = ALLOWED_PENETRATION
 ) -> tuple[int, int, float] | None:
     """Return the first block, by number, that overlaps a body of iron.
 
@@ -106,7 +95,7 @@ def block_in_iron(
     bodies = _Bodies(shapes, np.arange(len(iron)),
                      np.array([[body.z_min, body.z_max] for body in iron]),
                      np.broadcast_to(np.eye(3), (len(iron), 3, 3)), np.zeros((len(iron), 3)))
-    return _first_overlap(_of_blocks(blocks), bodies, tolerance)
+    return _first_overlap(_block_bodies(blocks), bodies, tolerance)
 
 
 @dataclass(frozen=True)
@@ -192,7 +181,7 @@ class _Bodies:
         return found
 
 
-def _of_blocks(blocks: Sequence[MagnetBlock]) -> _Bodies:
+def _block_bodies(blocks: Sequence[MagnetBlock]) -> _Bodies:
     """Return the bodies of blocks.
 
     Poses are those of `MagnetBlock.axes` and `MagnetBlock.position`. They are computed for all
@@ -240,9 +229,16 @@ def _first_overlap(
         return (_Pieces(first, np.unique(first.shape[i[pairs]]), chords, smallest),
                 _Pieces(second, np.unique(second.shape[j[pairs]]), chords, smallest))
 
-    mine, others = pieces(CHORD_ERROR, np.flatnonzero(~exact))
+    # largest distance between an arc and its chords or tangents, as a fraction of the shape's
+    # width. Two such arcs hide an overlap of 8e-5 of the width; larger ones are found.
+    chord_error = 4e-5
+    mine, others = pieces(chord_error, np.flatnonzero(~exact))
     cost = np.where(exact, 1, mine.effort[first.shape[i]] * others.effort[other.shape[j]])
-    lump = np.cumsum(cost) // _PAIRS
+    pairs_at_once = 20_000  # number of pairs of pieces that are compared at once
+    lump = np.cumsum(cost) // pairs_at_once
+    # larger values of it, for the depth of an overlap that is already found: fewer and larger
+    # pieces measure deep overlaps better, since a penetration cannot exceed the width of a piece
+    coarse_errors = (1e-3, 3e-2)
     for pairs in np.split(np.arange(len(i)), np.flatnonzero(np.diff(lump)) + 1):
         depth = np.zeros(len(pairs))
         flat = exact[pairs]
@@ -254,7 +250,7 @@ def _first_overlap(
             continue
         pair, deepest = pairs[found[:1]], float(depth[found[0]])
         if not exact[pair[0]]:
-            for chords in COARSE:
+            for chords in coarse_errors:
                 a, b = pieces(chords, pair)
                 deepest = max(deepest, float(_depth(a, i[pair], b, j[pair], allowed[pair])[0]))
         return int(i[pair[0]]), int(j[pair[0]]), deepest
@@ -365,7 +361,7 @@ def _depth(first: _Pieces, i: Ints, second: _Pieces, j: Ints, allowed: Floats) -
     """
     mine, others = first.bodies, second.bodies
     depth = np.zeros(len(i))
-    start, counts = _within_reach(mine, i, others, j, second.count[others.shape[j]])
+    start, counts = _reachable_pieces(mine, i, others, j, second.count[others.shape[j]])
     total = first.count[mine.shape[i]] * counts
     pair = np.repeat(np.arange(len(i)), total)
     local = np.arange(len(pair)) - np.repeat(np.cumsum(total) - total, total)
@@ -396,7 +392,7 @@ def _depth(first: _Pieces, i: Ints, second: _Pieces, j: Ints, allowed: Floats) -
     return depth
 
 
-def _within_reach(first: _Bodies, i: Ints, second: _Bodies, j: Ints,
+def _reachable_pieces(first: _Bodies, i: Ints, second: _Bodies, j: Ints,
                   count: Ints) -> tuple[Ints, Ints]:
     """Return the first piece, and how many, of second bodies that first bodies can touch, (m,).
 

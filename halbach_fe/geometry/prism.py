@@ -11,14 +11,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import Edge, Outline, closed_outline, outline_area
 
-UPRIGHT_RAD = 1e-4
-"""Tilt up to which a block counts as upright: it moves the top of a block of 20 mm by 2 µm."""
-
 ARC_STEP_RAD = np.radians(1.0)
 """Longest part of an arc that a chord replaces. At 150 mm from the centre it is 6 µm off."""
-
-SHORTEST_M = 1e-8
-"""Edges up to this length are rounding, and left out."""
 
 Curve = tuple[tuple[float, float], tuple[float, float], tuple[float, float] | None]
 """Start, end and, of an arc of less than half a turn, centre in m."""
@@ -92,7 +86,9 @@ def upright(block: MagnetBlock) -> Prism | None:
     """
     axes, half = block.axes, (block.z_max - block.z_min) / 2
     centre = block.position + (block.z_max + block.z_min) / 2 * axes[:, 2]
-    standing = np.abs(axes[2]) > np.cos(UPRIGHT_RAD)
+    # tilt up to which a block counts as upright: it moves the top of a block of 20 mm by 2 µm
+    tilt_rad = 1e-4
+    standing = np.abs(axes[2]) > np.cos(tilt_rad)
     if standing[2]:
         return Prism(block.outline, centre[2] - half, centre[2] + half, axes[:2, :2], centre[:2])
     corners = np.array([edge.start for edge in block.outline])
@@ -114,7 +110,7 @@ def widened(outline: Outline, distance: float) -> Outline | None:
 
     Corners stay sharp. It is None if an edge would vanish, so that there is no such outline.
     """
-    corners = [_moved_corner(outline[number - 1], edge, distance)
+    corners = [_offset_corner(outline[number - 1], edge, distance)
                for number, edge in enumerate(outline)]
     found = tuple(Edge(start, end, edge.arc) for start, end, edge in zip(
         corners, corners[1:] + corners[:1], outline, strict=True))
@@ -125,9 +121,9 @@ def widened(outline: Outline, distance: float) -> Outline | None:
     return found
 
 
-def _moved_corner(first: Edge, second: Edge, distance: float) -> tuple[float, float]:
+def _offset_corner(first: Edge, second: Edge, distance: float) -> tuple[float, float]:
     """Return the corner of two edges that are moved outwards."""
-    (point, one), (other, two) = (_moved(edge, at, distance) for edge, at in (
+    (point, one), (other, two) = (_offset_edge(edge, at, distance) for edge, at in (
         (first, 1.0), (second, 0.0)))
     if first.arc and second.arc:
         found = point  # of arcs about the same centre, with the same radius
@@ -149,7 +145,7 @@ def _moved_corner(first: Edge, second: Edge, distance: float) -> tuple[float, fl
     return float(found[0]), float(found[1])
 
 
-def _moved(edge: Edge, at: float, distance: float) -> tuple[Floats, Floats]:
+def _offset_edge(edge: Edge, at: float, distance: float) -> tuple[Floats, Floats]:
     """Return a point of an edge that is moved outwards, and the edge's direction there."""
     points, normals = edge.at(np.array([at]))
     normal = normals[0] / np.linalg.norm(normals[0])
@@ -198,7 +194,8 @@ def with_notch(
     kept = (Edge(after, outline[last[0]].end, outline[last[0]].arc), *between,
             Edge(outline[first[0]].start, before, outline[first[0]].arc),
             Edge(before, tip), Edge(tip, after))
-    return tuple(edge for edge in kept if edge.length > SHORTEST_M)
+    shortest_m = 1e-8  # edges up to this length are rounding, and left out
+    return tuple(edge for edge in kept if edge.length > shortest_m)
 
 
 def _crossings(edge: Edge, centre: Floats, ray: Floats) -> list[float]:

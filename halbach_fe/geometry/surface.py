@@ -26,20 +26,6 @@ for a block of 20 mm. Rounding errors are 1e-16 of a coordinate, which is less e
 a million times its size from the origin. Across this distance the field changes by about 1e-8 of
 the remanence."""
 
-BESIDE_FLAT, BESIDE_CURVED = 1e-11, 1e-8
-"""Distance, relative to the size of the body, at which the limit from outside is evaluated. Closed
-forms of flat faces tell it from the face by 1e-12; the quadrature on arcs has parts of 1e-8 of the
-arc, see `halbach_fe.solver.prism_kernel`."""
-
-EDGE_OF_CURVED = 1e-5
-"""Distance from an edge, relative to the size of the body, up to which a point on a curved face
-counts as on the edge: nearer, `BESIDE_CURVED` changes the field by more than 1e-4 of the remanence.
-"""
-
-SMOOTH = 1e-9
-"""Largest angle in rad between neighbouring parts of an outline that meet smoothly, as the arcs of
-a cylinder do. The field's singularity is proportional to it."""
-
 
 @dataclass(frozen=True)
 class Contact:
@@ -138,10 +124,18 @@ def _contact(section: _Section, z_min: float, z_max: float, size: float, points:
     side = (np.abs(section.distance) <= small) & (beyond <= small)
     end = (np.abs(beyond) <= small) & (section.distance <= small)
     edge = (side & end) | ((section.corner <= small) & (beyond <= small))
+    # distance from an edge, relative to the size of the body, up to which a point on a curved face
+    # counts as on the edge: nearer, `beside_curved` changes the field by more than 1e-4 of the
+    # remanence
+    edge_of_curved = 1e-5
     edge |= side & section.curved & (
-        np.minimum(section.corner, np.abs(beyond)) <= EDGE_OF_CURVED * size)
+        np.minimum(section.corner, np.abs(beyond)) <= edge_of_curved * size)
     face = (side | end) & ~edge
-    beside = size * np.where(side & section.curved, BESIDE_CURVED, BESIDE_FLAT)
+    # distance, relative to the size of the body, at which the limit from outside is evaluated.
+    # Closed forms of flat faces tell it from the face by 1e-12; the quadrature on arcs has parts of
+    # 1e-8 of the arc, see `halbach_fe.solver.prism_kernel`.
+    beside_flat, beside_curved = 1e-11, 1e-8
+    beside = size * np.where(side & section.curved, beside_curved, beside_flat)
     distance = np.where(side, section.distance, np.where(end, beyond, 0.0))
     normal = np.zeros((len(near), 3))
     normal[side, :2] = section.normal[side]
@@ -176,7 +170,10 @@ def _sharp_corners(outline: Outline) -> Floats:
     ends = np.array([edge.at(np.array([0.0, 1.0]))[1] for edge in outline])
     ends = ends / np.linalg.norm(ends, axis=2, keepdims=True)
     before, after = np.roll(ends[:, 1], 1, axis=0), ends[:, 0]
-    sharp = np.linalg.norm(before - after, axis=1) > SMOOTH
+    # largest angle in rad between neighbouring parts of an outline that meet smoothly, as the arcs
+    # of a cylinder do. The field's singularity is proportional to it.
+    smooth = 1e-9
+    sharp = np.linalg.norm(before - after, axis=1) > smooth
     return np.array([edge.start for edge in outline])[sharp]
 
 

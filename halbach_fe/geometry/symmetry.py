@@ -1,24 +1,28 @@
-"""Symmetry of the array: blocks that are rotated or reflected copies of a source block.
+"""Symmetry of the array: blocks that are images of a source block, and turns of equal blocks.
 
-The field of a source block, solved once, serves all its copies. F(x) is the matrix
-that maps the magnetization of a block to B at x. Magnetization and B are axial vectors. The field
-matrix of a block rotated by R is therefore ``F'(x) = R F(R^-1 x) R^T``, and of a block reflected
-by S in a plane ``F'(x) = S F(S x) S``: the sign of axial vectors under reflection cancels.
+The field of a source block, solved once, serves all its copies. F(x) is the matrix that maps the
+magnetization of a block to B at x. Magnetization and B are axial vectors. The field matrix of a
+block rotated by R is therefore ``F'(x) = R F(R^-1 x) R^T``, and of a block reflected by S in a
+plane ``F'(x) = S F(S x) S``: the sign of axial vectors under reflection cancels.
+
+`symmetry_images` returns the turns by which a magnet is turned onto itself, so that no field map
+tells its blocks apart.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
-
-_ROUNDING = 1e-12
-"""Grid in m that coordinates are rounded to before points are compared."""
+from halbach_fe.study.magnet import External
 
 _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers with well-mixed bits, which combine three rounded coordinates to a hash."""
@@ -63,22 +67,17 @@ class SymmetryImage:
         return np.asarray(turn @ field @ turn[:size, :size].T)
 
 
-def rotation_about_z(angle: float) -> Floats:
-    """Return the matrix (3, 3) of a rotation about z by ``angle`` rad."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
-
-
 def unique_points(points: Floats) -> tuple[Floats, Ints]:
     """Return the distinct points (u, 3), and the index (n,) among them of each point (n, 3)."""
-    grid = np.round(points / _ROUNDING).astype(np.int64)
+    grid_m = 1e-12  # grid in m that coordinates are rounded to before points are compared
+    grid = np.round(points / grid_m).astype(np.int64)
     with np.errstate(over="ignore"):  # sorting one hash is faster than sorting three coordinates
         key = (grid.astype(np.uint64) * _HASH_FACTORS).sum(axis=1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     found = points[first]
-    if np.abs(found[inverse] - points).max(initial=0) > 2 * _ROUNDING:  # two points share a hash
+    if np.abs(found[inverse] - points).max(initial=0) > 2 * grid_m:  # two points share a hash
         found, inverse = np.unique(grid, axis=0, return_inverse=True)
-        return found * _ROUNDING, inverse.reshape(-1)
+        return found * grid_m, inverse.reshape(-1)
     return found, inverse.reshape(-1)
 
 
@@ -175,3 +174,61 @@ def _same_shape(corners: Floats, others: Floats) -> bool:
     """Tell whether two sets of corners (n, 2) in m are the same in any order."""
     distance = np.linalg.norm(corners[:, None] - others[None], axis=2)
     return bool((distance.min(axis=0) < 1e-9).all() and (distance.min(axis=1) < 1e-9).all())
+
+
+def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
+    """Return the number from 0 of the equal block onto which each block is turned.
+
+    ``turn`` (3, 3) is a rotation about the origin of the magnet. None if a block has no equal one
+    there. Magnets with iron or fields from outside, cross-sections and blocks of uneven
+    magnetization are never said to be equal to themselves after a turn.
+    """
+    blocks = magnet.blocks
+    if (magnet.iron or magnet.dimension == 2 or magnet.external != External() or any(
+            block.gradient or block.corner_loss for block in blocks)):
+        return None
+    corners = [_block_corners(block) for block in blocks]
+    moments = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
+    middles = np.array([each.mean(axis=0) for each in corners])
+    found = []
+    # distance of corners in m, and difference of remanences in T, up to which blocks are equal:
+    # more than the rounding of any study, and less than any deviation that is given
+    same_m, same_T = 1e-7, 1e-7
+    for number, block in enumerate(blocks):
+        there = int(np.linalg.norm(middles - turn @ middles[number], axis=1).argmin())
+        apart = np.linalg.norm((corners[number] @ turn.T)[:, None] - corners[there], axis=2)
+        if (max(apart.min(axis=0).max(), apart.min(axis=1).max()) > same_m
+                or np.abs(turn @ moments[number] - moments[there]).max() > same_T
+                or _permeabilities(block) != _permeabilities(blocks[there])):
+            return None
+        found.append(there)
+    return tuple(found)
+
+
+def symmetry_images(magnet: Magnet) -> list[tuple[int, ...]]:
+    """Return what `block_images` says of every turn that brings the magnet onto itself.
+
+    Turns by right angles are tried, and those that bring a ring of blocks onto itself, alone and
+    with half a turn about x.
+    """
+    turns = [each for each in Rotation.create_group("O").as_matrix() if np.trace(each) < 2.9]
+    count = max(Counter(block.ring for block in magnet.blocks).values(), default=0)
+    most_in_ring = 64  # number of blocks of a ring up to which turns from block to block are tried
+    if count <= most_in_ring:
+        for number in range(count):
+            about_z = Rotation.from_euler("z", 2 * np.pi * number / count)
+            turns += [about_z.as_matrix(), (about_z * Rotation.from_euler(
+                "x", np.pi)).as_matrix()][not number:]
+    images = dict.fromkeys(image for turn in turns if (image := block_images(magnet, turn)))
+    return list(images)
+
+
+def _block_corners(block: MagnetBlock) -> Floats:
+    """Return the corners (n, 3) of a block in m."""
+    return np.asarray(block.from_frame(np.array([
+        (*edge.start, z) for edge in block.outline for z in (block.z_min, block.z_max)])))
+
+
+def _permeabilities(block: MagnetBlock) -> tuple[float, float]:
+    """Return the relative permeabilities of a block."""
+    return block.recoil_permeability, block.recoil_permeability_across

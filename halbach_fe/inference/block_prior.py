@@ -25,10 +25,9 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
-from halbach_fe.geometry.symmetry import rotation_about_z
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.stats.gaussian import Gaussian, remounted_root
@@ -159,6 +158,14 @@ def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
         If the prior is the distribution of the samples of a type that do not look normal, if the
         blocks were measured at another temperature than that of the study, or if their mean is many
         of the study's standard deviations from nominal.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> prior = hf.prior_from_blocks(magnet, hf.read_blocks("blocks.csv"))
+    >>> len(prior.gaussian.mean) == len(magnet.parameter_names)
+    True
     """
     size = magnet.dimension
     moves = mountings(magnet)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,9 +22,11 @@ from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.instrument import turn_of
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.maps import PROBE_KEYS
+from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS, InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
+
+Table = TypeVar("Table", Instrument, InstrumentSd)
 
 
 def register_maps(
@@ -61,7 +64,8 @@ def register_maps(
             study = OpenKey(key, 1.0).apply(study, value)
         known = probes.get(one.probe)
         if known is not None:
-            study = study.with_(instrument=_with_probe(study.instrument, known.instrument))
+            study = study.with_(instrument=_with_keys(
+                study.instrument, known.instrument, PROBE_KEYS))
         say(f"map {one.name}")
         first = stages.setdefault(one.pose, one)
         pose = None if first is one else PosePrior(
@@ -79,16 +83,19 @@ def registered_study(
     study: Study, maps: Sequence[Map], found: dict[str, list[Registration]]
 ) -> Study:
     """Return the study of a campaign with the most probable pose of each map."""
-    probes: dict[str, Instrument] = {}
-    stages: dict[str, tuple[Map, Instrument]] = {}
+    probes: dict[str, Study] = {}
+    stages: dict[str, tuple[Map, Study]] = {}
     listed = []
     for each, one in zip(study.maps, maps, strict=True):
-        instrument = found[one.name][0].instrument
-        instrument = _with_probe(instrument, probes.setdefault(one.probe, instrument))
-        first, of_first = stages.setdefault(one.pose, (one, instrument))
+        own = found[one.name][0].study
+        probe = probes.setdefault(one.probe, own)
+        instrument = _with_keys(own.instrument, probe.instrument, PROBE_KEYS)
+        first, of_first = stages.setdefault(one.pose, (one, own))
         if first is not one:
-            instrument = _moved_along(one, instrument, first, of_first)
-        listed.append(each.with_(instrument=instrument))
+            instrument = _moved_along(one, instrument, first, of_first.instrument)
+        listed.append(each.with_(instrument=instrument, instrument_sd=_with_keys(
+            _with_keys(own.instrument_sd, probe.instrument_sd, PROBE_KEYS),
+            of_first.instrument_sd, POSE_KEYS)))
     study = study.with_(maps=tuple(listed))
     for key, (value, _) in found[maps[0].name][0].open_keys.items():
         study = OpenKey(key, 1.0).apply(study, value)
@@ -136,6 +143,6 @@ def _relative(one: Map, first: Map) -> tuple[Rotation, Floats]:
     return back * turn_of(own), back.apply(np.subtract(own.translation_m, other.translation_m))
 
 
-def _with_probe(instrument: Instrument, probe: Instrument) -> Instrument:
-    """Return an instrument with the probe of another."""
-    return instrument.with_(**{key: getattr(probe, key) for key in PROBE_KEYS})
+def _with_keys(table: Table, other: Table, keys: Sequence[str]) -> Table:
+    """Return an instrument, or what is open of it, with some keys of another."""
+    return table.with_(**{key: getattr(other, key) for key in keys if hasattr(other, key)})

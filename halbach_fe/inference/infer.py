@@ -43,7 +43,7 @@ from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.formulation_choice import choose_route, field_function, solve_nominal
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import Rows, predict
@@ -74,7 +74,7 @@ may cause; a larger change causes a warning."""
 
 @alone
 def infer(
-    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session,
+    magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session = NOT_KEPT,
     blocks: BlockTable | None = None, prior: Gaussian | None = None,
     linearized_only: bool = False, validation_map: xr.Dataset | None = None,
     say: Callable[[str], None] = lambda text: None, similar: Magnet | None = None,
@@ -88,7 +88,7 @@ def infer(
         The measured map, see `halbach_fe.read_map`; or all maps that the study lists, see
         `halbach_fe.read_maps`. Terms of their instruments of which the study states a standard
         deviation are estimated with the magnetizations.
-    session : Session
+    session : Session, optional
         Its folder receives the mesh, the run folders and the response matrix.
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.

@@ -29,6 +29,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.readings import Readings, read_campaign, unit_vectors
@@ -196,9 +197,8 @@ def _fitted(
     points = (model.points[:len(model.weights)] - centre) / free_m
     told, main = _told(operator), model.nominal_mean
     fields, lacking = (_fields(points) @ every).reshape(len(points), 3, -1), _lacking(told)
-    remark = ""
+    remark, nominal = "", model.field(model.response.nominal[:, None])[..., 0]
     if observation.of_total_field[used].all():
-        nominal = model.field(model.response.nominal[:, None])[..., 0]
         along, lacking = unit_vectors(nominal), ""
         told = along[:, :, None] * along[:, None]
         differs = _differs(np.sum(along * fields[..., 0], axis=1),
@@ -208,9 +208,8 @@ def _fitted(
                 f"is of |B|, which differs by up to {100 * differs:.2g} % from the nominal one in "
                 "the region: the field may turn too much there for |B| to be harmonic. Measure "
                 "components.")
-        remark = (f"is of |B|, fitted as B along the nominal field. That is |B| but for some "
-                  f"{PPM * differs**2:.0f} ppm, if the field differs from the nominal one as much "
-                  "across it as along it; the direction of the mean of B is not told.")
+        remark = ("is of |B|, fitted as B along the nominal field. "
+                  f"{_to_first_order(np.array([np.sqrt(2) * differs]))}")
     fields = told @ fields
     if not remark and np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
         return None, noise, (f"has no {lacking}, along which much of the main field is: it does "
@@ -225,9 +224,18 @@ def _fitted(
     if not lacking:
         return known, noise, ""
     has = " and ".join(f"B{name}" for name in COMPONENTS if f"B{name}" not in lacking)
+    size, whole = (np.linalg.norm(each, axis=1) for each in (nominal @ told, nominal))
+    differs = _differs(np.linalg.norm(fields[..., 0], axis=1), size, model.weights)
     return replace(known, components=has), noise, (
-        f"has no {lacking}. What is said of it is the size of {has} alone, which is |B| to first "
-        "order, as the main field is along it; the direction of the mean of B is not told.")
+        f"has no {lacking}. What is said of it is the size of {has} alone, as the main field is "
+        f"along it. {_to_first_order(np.sqrt(whole**2 / size**2 - 1) + np.sqrt(2) * differs)}")
+
+
+def _to_first_order(across: Floats) -> str:
+    """Say by how much a part of B is less than |B|, by what is across it (n,) relative to it."""
+    return (f"That is |B| but for some {decimals(PPM * float(np.max(across**2)) / 2)} ppm, if the "
+            "field differs from the nominal one as much across it as along it: error bars are "
+            "those of this part of B, and the direction of the mean of B is not told.")
 
 
 def _told(operator: sparse.csr_array) -> Floats:

@@ -33,12 +33,17 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.convergence import (
+from halbach_fe.stats.pcn import (
+    Chain,
     ConvergenceDiagnostics,
+    Posterior,
+    Proposal,
     assess_convergence,
+    laplace,
+    prior_reference,
     require_convergence,
+    sample,
 )
-from halbach_fe.stats.pcn import Chain, Posterior, Proposal, laplace, prior_reference, sample
 
 CHUNK = 250
 """Number of draws of every chain between two stored states."""

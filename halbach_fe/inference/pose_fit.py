@@ -308,9 +308,14 @@ class PoseFit:
         place = pose[:3] - [0.0, 0.0, start[2]]
         return np.concatenate([np.append(place, turned) / self.pose_sd, values / self.prior_sd()])
 
-    def study_of(self, pose: Floats, values: Floats) -> Study:
-        """Return the study of a pose and of the other parameters."""
-        return self._magnet(values).study.with_(instrument=self.instrument(pose, values))
+    def _study_to_update(self, pose: Floats, values: Floats, pose_sd: Floats) -> Study:
+        """Return the study of a pose, open keys and the probe before, see `Registration.study`."""
+        study, found = self._magnet(values).study, self.instrument(pose, values)
+        return study.with_(
+            instrument=self._base(values).with_(
+                translation_m=found.translation_m, rotation_rad=found.rotation_rad),
+            instrument_sd=self.probe.opened(
+                study.instrument_sd, pose_sd, self.pose_sd, self.total))
 
     def refined(self, pose: Floats, pace: Pace | None = None) -> Registration:
         """Return the registration to which least squares leads from a pose (6,)."""
@@ -373,7 +378,8 @@ class PoseFit:
         updated, log_evidence, mean, covariance = state.updated(rows, scaled)
         blocks = self._blocks(columns.directions, mean, covariance)
         return Registration(
-            self.study_of(pose, values), pose[:3], sd[:3], sd[3:6], self.pose_sd,
+            self._study_to_update(pose, values, sd[:6]), self.instrument(pose, values),
+            pose[:3], sd[:3], sd[3:6], self.pose_sd,
             {each.key: (value, error) for each, value, error in zip(
                 self.open, each_value(self, values), sd[6 + PROBE:], strict=True)},
             _mean_square(updated / state.sigma, self.training),

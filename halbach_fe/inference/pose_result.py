@@ -55,9 +55,38 @@ class ProbePrior:
         return cls(max(cls.crosstalk, known.crosstalk), max(cls.gain, known.gain),
                    max(cls.offset_T, known.offset_T), max(cls.sensor_m, known.sensor_position_m))
 
+    def opened(self, known: InstrumentSd, pose_sd: Floats, pose_prior_sd: Floats,
+               total: bool) -> InstrumentSd:
+        """Return what is open of an instrument in the update after its registration.
+
+        Parameters
+        ----------
+        known : InstrumentSd
+            What the study states. A pose that it leaves open remains as open as that.
+        pose_sd, pose_prior_sd : ndarray, shape (6,)
+            Standard deviations of the pose after the registration and before it, in m and rad.
+            What the map does not determine is opened like what it does.
+        total : bool
+            Whether the map is of |B|, whose probe has neither axes nor several sensors.
+        """
+        sd = np.where(pose_sd < UNDETERMINED * pose_prior_sd, pose_sd, 0.0).reshape(2, 3)
+        shift, turn = np.clip(WIDER * sd.max(axis=1), NARROWEST_POSE, WIDEST_POSE).tolist()
+        return known.with_(
+            translation_m=known.translation_m or shift, rotation_rad=known.rotation_rad or turn,
+            gain=self.gain, offset_T=self.offset_T,
+            **({} if total else {"crosstalk": self.crosstalk, "sensor_position_m": self.sensor_m}))
+
 
 SEARCHED_M = 1e-3
 """Standard deviation of a shift along a stage from which the shift is found from nothing."""
+
+NARROWEST_POSE, WIDEST_POSE = np.array([SEARCHED_M, 0.01]), np.array([0.01, 0.1])
+"""Limits in m and rad of a pose's prior standard deviations in the update after its registration:
+those of a pose that is roughly known, and of `InstrumentSd`."""
+
+WIDER = 10.0
+"""How many times as wide these are at least as the error bars of the registration: the readings,
+which then count twice, narrow an error bar by no more than 1 in 200."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +204,12 @@ class Registration:
     Attributes
     ----------
     study : Study
-        The study with the pose, axes, gains, offsets and sensors of its instrument, and with the
-        open keys.
+        The study for an update by the same map, with the open keys. Its instrument has the pose
+        that was found, and the probe that was known before; its ``instrument_sd`` says how far both
+        were open. The update finds the probe again, together with the blocks, so that no reading
+        counts twice.
+    instrument : Instrument
+        The pose, axes, gains, offsets and sensors that were found.
     middle_m : ndarray, shape (3,)
         Where the middle of the map lies in the magnet, see `middle_of`.
     translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
@@ -220,6 +253,7 @@ class Registration:
     """
 
     study: Study
+    instrument: Instrument
     middle_m: Floats
     translation_sd_m: Floats
     rotation_sd_rad: Floats
@@ -240,11 +274,6 @@ class Registration:
     likeness: float = 1.0
     component: str = ""
     total: bool = False
-
-    @property
-    def instrument(self) -> Instrument:
-        """The registered instrument."""
-        return self.study.instrument
 
     @property
     def undetermined(self) -> tuple[str, ...]:

@@ -37,8 +37,7 @@ from halbach_fe.measurement.observation import (
 )
 from halbach_fe.measurement.reading_noise import noise_regions, reading_noise
 from halbach_fe.response.matrix import Response, StoredMatrix
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.stats.linear_gaussian import row_slices
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study

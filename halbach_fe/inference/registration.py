@@ -32,7 +32,7 @@ from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Reg
 from halbach_fe.inference.pose_search import coarse_poses
 from halbach_fe.inference.pose_space import right_angles
 from halbach_fe.measurement.field_map import checked_map, directed, is_undirected
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS
@@ -49,10 +49,11 @@ UNDECIDED_LOG_EVIDENCE = 3.0
 symmetric magnet makes equal end up to 1 apart, since they end when chi-squared hardly falls."""
 
 
+@alone
 def register(
-    magnet: Magnet, data: xr.Dataset, session: Session, probe: ProbePrior | None = None,
-    open_keys: Sequence[OpenKey] = (), say: Callable[[str], None] = lambda _: None,
-    blocks: Gaussian | None = None,
+    magnet: Magnet, data: xr.Dataset, session: Session = NOT_KEPT,
+    probe: ProbePrior | None = None, open_keys: Sequence[OpenKey] = (),
+    say: Callable[[str], None] = lambda _: None, blocks: Gaussian | None = None,
     pose: PosePrior | None = None, alternatives: Sequence[Sequence[OpenKey]] = (),
     most: int | None = None,
 ) -> list[Registration]:
@@ -68,7 +69,7 @@ def register(
         `halbach_fe.check_map`. A line of readings, or a single component, determines a part of the
         pose only; the prior holds the others, as the standard deviations say. A component of which
         nobody has said which it is is taken for Bx, By and Bz, and the evidence compares them.
-    session : Session
+    session : Session, optional
     probe : ProbePrior, optional
         By default that of the study's ``instrument_sd``, where it is wider than the usual one.
     open_keys : sequence of OpenKey, optional
@@ -97,6 +98,17 @@ def register(
         turned as it is known to be; or if the map holds what none does.
     StudyError
         If the study is a cross-section, or an open key is no number that it gives.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> axis = 0.01 * np.arange(-2, 3)
+    >>> points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    >>> displaced = hf.field_map(points - [0, 0, 0.001], magnet.field_T(points), 1e-5)
+    >>> best = hf.register(magnet, displaced)[0]
+    >>> np.round(best.instrument.translation_m, 4) + 0.0
+    array([0.   , 0.   , 0.001])
     """
     data = checked_map(data, "`data`")
     prior = pose or PosePrior()

@@ -30,7 +30,9 @@ from halbach_fe.measurement.doubted_terms import (
     doubts_in_words,
     factor_in_words,
     factor_of,
+    held_back,
     likeness_of,
+    shared_doubts,
     words_of,
 )
 from halbach_fe.measurement.observation import Observation
@@ -538,6 +540,23 @@ class InferenceResult(ShownInNotebook):
         blocks = block_doubts(magnet, self.posterior.mean, self.prior.mean, self.prior.sd)
         return doubts(terms, magnet.dimension * len(magnet.blocks)) + tuple(
             one for one in blocks if one.name == ALL_BLOCKS)
+
+    @cached_property
+    def shared_doubts(self) -> tuple[Term, ...]:
+        """What all blocks together are farther off than their prior allows, though no block is.
+
+        An error of the instrument does the same, which a good chi-squared does not tell apart.
+        """
+        training = ~self.held_out
+        error, size = (np.linalg.norm(values[training]) for values in (
+            self.response.error, self.prediction_posterior.mean))
+        return () if self.doubts else shared_doubts(
+            self.magnet, self.posterior.mean, self.prior, float(error / size) if size else 0.0)
+
+    @cached_property
+    def held_back(self) -> tuple[Term, ...]:
+        """Blocks so far off that their prior is refuted, which holds them back nevertheless."""
+        return held_back(self.magnet, self.posterior.mean, self.posterior.sd, self.prior)
 
     @property
     def _doubted(self) -> str:

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.special as special
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.stats.gaussian import Gaussian
 
 CHANCE = 2e-3
 """Probability that of all terms of a fit, if they are as their priors say, one is doubted. The
@@ -42,7 +43,10 @@ FACTORS = {
 """Ratios of readings to fields that errors of a file make."""
 
 ALL_BLOCKS = "strength of all blocks together"
-"""Name of the median deviation of all blocks."""
+"""Name of the median deviation of all blocks, and of the mean one."""
+
+ALL_AXES = "turn of all magnetizations together"
+"""Name of the mean turn of all blocks, before its axis."""
 
 MOST_NAMED = 5
 """Largest number of doubted terms that a sentence names."""
@@ -168,25 +172,123 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
         the mean), compared with the standard deviation of one block; or the block that is farthest
         from its prior.
     """
-    count = len(magnet.blocks)
-    change, sd, nominal = (values[:magnet.dimension * count].reshape(count, -1) for values in (
-        mean - prior_mean, prior_sd, magnet.nominal_magnetization))
-    size = np.linalg.norm(nominal, axis=1)
-    there = (size > 0) & (sd > 0).any(axis=1)
-    if not there.any():
+    of = _Changes.of(magnet, mean - prior_mean, prior_sd)
+    if not len(of.numbers):
         return ()
-    change, sd = change[there] / size[there, None], sd[there] / size[there, None]
-    axes = nominal[there] / size[there, None]
-    along = np.sum(axes * change, axis=1)
-    own = float(np.sqrt(np.mean(np.sum(axes**2 * sd**2, axis=1))))
-    common = Term(ALL_BLOCKS, "", float(np.median(along)), own)
-    if found := doubts([common], sd.size):
+    own = float(np.sqrt(np.mean(np.sum(of.axes**2 * of.sd**2, axis=1))))
+    common = Term(ALL_BLOCKS, "", float(np.median(np.sum(of.axes * of.change, axis=1))), own)
+    if found := doubts([common], of.sd.size):
         return found
-    away = np.abs(change) / np.where(sd > 0, sd, np.inf)
-    block, axis = np.unravel_index(int(np.argmax(away)), away.shape)
-    label = magnet.blocks[np.flatnonzero(there)[block]].name
+    block, axis = np.unravel_index(int(np.argmax(of.away)), of.away.shape)
+    label = magnet.blocks[of.numbers[block]].name
     return doubts([Term(f"magnetization of block {label} along {'xyz'[axis]}", "",
-                        float(change[block, axis]), float(sd[block, axis]))], sd.size)
+                        float(of.change[block, axis]), float(of.sd[block, axis]))], of.sd.size)
+
+
+def held_back(magnet: Magnet, mean: Floats, sd: Floats, prior: Gaussian) -> tuple[Term, ...]:
+    """Return the blocks that an update takes far from their priors, which still hold them back.
+
+    Without its prior of standard deviation p, a block with the mean m and the standard deviation s
+    after the update would be at ``m / (1 - (s / p)**2)``. Where the readings alone determine a
+    block, that is m, however far m is. Where they do not, its error bar is not to be believed.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    mean, sd : ndarray, shape (m,), in A/m
+        After the update, of all parameters, of which the first are the magnetizations of blocks.
+    prior : Gaussian
+
+    Returns
+    -------
+    tuple of Term
+        Of each such block the direction that is farthest off, the farthest block first.
+    """
+    of = _Changes.of(magnet, mean - prior.mean, prior.sd)
+    after = _Changes.of(magnet, mean - prior.mean, sd).sd if len(of.numbers) else of.sd
+    ratio = np.minimum(after / np.where(of.sd > 0, of.sd, np.inf), np.sqrt(0.5))
+    held = (of.away > doubted_from(of.sd.size)) & (of.away * ratio / (1 - ratio**2) > 1)
+    found = []
+    for number in np.flatnonzero(held.any(axis=1)):
+        axis = int(np.argmax(np.where(held[number], of.away[number], 0.0)))
+        found.append(Term(f"block {magnet.blocks[of.numbers[number]].name}", "",
+                          float(of.change[number, axis]), float(of.sd[number, axis])))
+    return tuple(sorted(found, key=lambda one: -one.distance))
+
+
+def shared_doubts(magnet: Magnet, mean: Floats, prior: Gaussian, model_error: float = 0.0,
+                  ) -> tuple[Term, ...]:
+    """Return the doubts about what an update has done to all blocks alike, in strength and turn.
+
+    Of n independent blocks of 2 % the mean is known to 2 %/sqrt(n): all of them 2 % stronger is
+    nothing that chance does, though no single block is suspicious.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    mean : ndarray, shape (m,), in A/m
+        Parameters of the magnet, of which the first are the magnetizations of its blocks.
+    prior : Gaussian
+        Of the parameters, with all that blocks share.
+    model_error : float
+        Relative error of the model's field, which all blocks may share too.
+
+    Returns
+    -------
+    tuple of Term
+        The mean strength and the turns, of the blocks that are not suspicious by themselves (a
+        reversed block is no common deviation) unless most are.
+    """
+    of = _Changes.of(magnet, mean - prior.mean, prior.sd)
+    near = (of.away <= doubted_from(of.sd.size)).all(axis=1)
+    near = near if 2 * near.sum() > near.size else np.ones(near.size, bool)
+    axes, size = of.axes[near], magnet.dimension
+    moves = {ALL_BLOCKS: ("", axes)}
+    for axis in range(0 if size == 3 else 2, 3):
+        turned = np.cross(np.eye(3)[axis], np.pad(axes, ((0, 0), (0, 3 - size))))[:, :size]
+        moves[f"{ALL_AXES} about {'xyz'[axis]}"] = ("rad", turned)
+    found = []
+    for name, (unit, move) in moves.items():
+        if (power := float(np.sum(move**2))) < 1e-9 * len(move):
+            continue  # a turn about what all blocks are magnetized along
+        row = np.zeros((len(magnet.blocks), size))
+        row[of.numbers[near]] = move / power / of.size[near, None]
+        whole = np.pad(row.ravel(), (0, len(mean) - row.size))[None]
+        found.append(Term(name, unit, float(np.sum(move * of.change[near])) / power, float(
+            np.hypot(prior.sd_of(whole)[0], model_error))))
+    return doubts(found, of.sd.size)
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """What an update has done to the blocks that may change, relative to their nominal size.
+
+    ``numbers`` (n,) are those of the blocks, ``size`` (n,) their magnetizations in A/m, ``axes``
+    (n, d) their directions, ``change`` and ``sd`` (n, d) the changes and what the prior allows.
+    """
+
+    numbers: Ints
+    size: Floats
+    axes: Floats
+    change: Floats
+    sd: Floats
+
+    @classmethod
+    def of(cls, magnet: Magnet, change: Floats, prior_sd: Floats) -> _Changes:
+        """Return the changes of all parameters (m,), of which the first are those of blocks."""
+        count = len(magnet.blocks)
+        own, sd, nominal = (values[:magnet.dimension * count].reshape(count, -1) for values in (
+            change, prior_sd, magnet.nominal_magnetization))
+        size = np.linalg.norm(nominal, axis=1)
+        there = np.flatnonzero((size > 0) & (sd > 0).any(axis=1))
+        scale = size[there, None]
+        return cls(there, size[there], nominal[there] / scale, own[there] / scale,
+                   sd[there] / scale)
+
+    @property
+    def away(self) -> Floats:
+        """The changes (n, d) in standard deviations of the prior."""
+        return np.asarray(np.abs(self.change) / np.where(self.sd > 0, self.sd, np.inf))
 
 
 def factor_in_words(factor: float, likeness: float = 1.0) -> str:

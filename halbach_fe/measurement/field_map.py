@@ -20,13 +20,13 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import meshio
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arguments import typed
@@ -73,19 +73,63 @@ COPIES = 0.1
 
 
 def field_map(
-    points: Floats, flux_density: Floats, sigma: Floats | None = None,
-    attributes: Mapping[str, str] | None = None,
+    points_m: ArrayLike, B_T: ArrayLike, sigma_T: ArrayLike | None = None,
+    attributes: Mapping[str, str] | None = None, components: Sequence[str] = COMPONENTS,
 ) -> xr.Dataset:
-    """Return a map of points (n, 3) in m with B (n, 3) in T and optionally sigma (n, 3) in T."""
+    """Return readings as a map, which all functions take that read one from a file.
+
+    Parameters
+    ----------
+    points_m : array_like, shape (n, 3)
+    B_T : array_like, shape (n, components)
+        Readings; NaN where there is none.
+    sigma_T : array_like, optional
+        Standard deviation of the noise: one number, or of the shape of ``B_T``.
+    attributes : dict of str to str, optional
+    components : sequence of str
+        Which components the columns of ``B_T`` are.
+
+    Returns
+    -------
+    Dataset
+
+    Raises
+    ------
+    MeasurementError
+        If the shapes do not fit.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> data = hf.field_map([[0, 0, 0], [0, 0, 0.01]], [[1e-3, 0.4], [0, 0.39]], 5e-5,
+    ...                     components=["x", "y"])
+    >>> data["B_T"].sel(component="y").values
+    array([0.4 , 0.39])
+    """
+    points, given = np.array(points_m, float), np.array(B_T, float)
+    columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
+    if points.shape != (len(points), 3) or given.shape != (len(points), len(components)) or (
+            len(set(columns)) != len(components)):
+        raise MeasurementError(must_be(
+            "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
+            f"components out of {', '.join(COMPONENTS)}",
+            f"{points.shape} and {given.shape}, for {', '.join(map(str, components))}"))
+
+    def of_all(values: ArrayLike) -> Floats:
+        """Return values of the components that are given (n, 3), NaN of the others."""
+        found = np.full(points.shape, np.nan)
+        found[:, columns] = values
+        return found
+
     data = xr.Dataset(
-        {"B_T": (("point", "component"), np.array(flux_density, float))},
+        {"B_T": (("point", "component"), of_all(given))},
         coords={"component": list(COMPONENTS)} | {
-            name: ("point", np.array(points[:, i], float), {"units": "m"})
+            name: ("point", points[:, i], {"units": "m"})
             for i, name in enumerate(POSITION_COLUMNS)},
         attrs=dict(attributes or {}))
     data["B_T"].attrs["units"] = "T"
-    if sigma is not None:
-        data["sigma_T"] = (("point", "component"), np.array(sigma, float), {"units": "T"})
+    if sigma_T is not None:
+        data["sigma_T"] = (("point", "component"), of_all(sigma_T), {"units": "T"})
     return data
 
 
@@ -172,16 +216,33 @@ def points_of(data: xr.Dataset) -> Floats:
     return np.column_stack([data[name].values for name in POSITION_COLUMNS])
 
 
-def write_map(data: xr.Dataset, path: Path) -> None:
+def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 
     The file is written atomically: it is either complete, or not there.
+
+    Parameters
+    ----------
+    data : Dataset
+    path : str or Path
+
+    Returns
+    -------
+    None
 
     Raises
     ------
     OutputError
         If the suffix is unknown, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.write_map(hf.field_map([[0, 0, 0]], [[0.4, 0, 0]]), "point.csv")
+    >>> hf.read_map("point.csv").sizes["point"]
+    1
     """
+    path = Path(path)
     writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
         ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
     if path.suffix not in writers:

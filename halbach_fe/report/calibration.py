@@ -13,7 +13,7 @@ from halbach_fe.core.arrays import Ints
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, figure_of, own_style, save, write_page
 from halbach_fe.report.words import counted, fraction, p_value
-from halbach_fe.stats.sbc import BINS
+from halbach_fe.stats.calibration import BINS
 
 CONTROL = "control: "
 """Beginning of the name of a posterior that is wrong on purpose."""

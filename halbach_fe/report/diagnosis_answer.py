@@ -21,8 +21,9 @@ from halbach_fe.diagnosis.summary import (
     region_scores,
     rivals,
 )
-from halbach_fe.geometry.equal_blocks import own_turns
+from halbach_fe.diagnosis.uncertain_effects import is_uncertain
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.symmetry import symmetry_images
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.unknown_cause import (
@@ -38,6 +39,9 @@ UNUSUAL_AMPLITUDE = 10.0
 the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the errors of a magnet that
 is built with care."""
 
+
+OTHER_SOURCES = ("background", "ferromagnetic_object")
+"""Effects by which a neighbouring magnet's field can be corrected."""
 
 REMEDIES = {
     "block_flipped": "the block of {} is the wrong way round or wrongly magnetized: turn it, or "
@@ -109,6 +113,10 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.unknown is not None:
         return unknown_advice(diagnosis.unknown), again
     suspicions = " ".join(map(more_readings, diagnosis.suspected))
+    if any(is_uncertain(diagnosis.study, one)
+           for each in diagnosis.suspected for one in each.fitted):
+        suspicions += (f" Until then {STUDY_FILE} has its amplitude as uncertain about 0: an "
+                       "update with that study is right whether it is there or not.")
     if suspicions and not diagnosis.identified:
         return suspicions, again
     if _fails(diagnosis):
@@ -128,7 +136,8 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         changed = f"Update the magnet with {STUDY_FILE}, the study with what was found."
         if any(map(rivals, diagnosis.identified)):
             return ("Measure what tells apart the causes that explain the map equally well: the "
-                    f"page says what. Until then {STUDY_FILE} has the first of them.", infer)
+                    f"page says what. Until then {STUDY_FILE} has the first of them"
+                    f"{_beside(diagnosis)}.", infer)
         if remedies := _remedies(diagnosis):
             changed = (f"Look at the magnet: {in_a_row(remedies)}, and measure again. If it "
                        f"stays as it is, update it with {STUDY_FILE}, the study with what was "
@@ -136,6 +145,18 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
         return f"{changed} {suspicions}".strip(), infer
     these = "these maps" if diagnosis.after.is_campaign else "this map"
     return f"Update the magnet with {these}.", f"halbach-fe infer STUDY{maps} -o DIR"
+
+
+def _beside(diagnosis: Diagnosis) -> str:
+    """Say which of the causes that explain the map equally well the diagnosed study has, too."""
+    titles = catalogue_titles(diagnosis)
+    others = [one for effect in diagnosis.identified for one in effect.rivals]
+    exact = dict.fromkeys(title_of(one.hypothesis.effect.name, titles) for one in others
+                          if not is_uncertain(diagnosis.study, one))
+    inside = any(is_uncertain(diagnosis.study, one) for one in others)
+    return (", and beside it the others with uncertain amplitudes about 0, so that an update is "
+            "right whichever it is" if inside else "") + (
+        f"; without {joined_by_or(list(exact))}" if exact else "")
 
 
 def _remedies(diagnosis: Diagnosis) -> list[str]:
@@ -157,7 +178,7 @@ def _also_possible(diagnosis: Diagnosis) -> str:
             any(one.rotation_rad) or any(one.translation_m) for one in instruments):
         return ""
     magnet = build_magnet(study)
-    images = own_turns(magnet)
+    images = symmetry_images(magnet)
     numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
     said = []
     for effect in diagnosis.identified:
@@ -270,6 +291,12 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "The magnet is the same from several sides, so that the readings may be displaced by "
             f"{joined_by_or([position_in_words(each) for each in diagnosis.positions])}; the "
             "first is used here.")
+    names = [effect.hypothesis.effect.name for effect in diagnosis.identified]
+    sources = [title_of(name, titles) for name in names if name in OTHER_SOURCES]
+    if "neighbour_magnet" in names and sources:
+        sentences.append(
+            f"{in_a_row(sources).capitalize()} may be what the blocks of the neighbouring magnet "
+            "deviate from nominal, which its model does not have.")
     unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                for effect in diagnosis.identified
                if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]

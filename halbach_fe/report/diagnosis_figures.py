@@ -37,8 +37,8 @@ from halbach_fe.report.page import (
 from halbach_fe.report.point_maps import residual_figure, unit_for
 from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 
-NONE = "none"
-"""Name of the probability that nothing is missing."""
+NONE, UNKNOWN, OUTSIDE = "none", "unknown", "outside the catalogue"
+"""Names of the probabilities that nothing is missing, and an unlisted cause, and that in words."""
 
 LONGEST_NAME = 38
 """Number of characters in a line of an effect's name beside its bar."""
@@ -231,7 +231,7 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
 
     def in_words(name: str, place: str = "") -> str:
         """Return the description of an effect in short lines."""
-        said = "nothing is missing" if name == NONE else title_of(name, titles)
+        said = {NONE: "nothing is missing", UNKNOWN: OUTSIDE}.get(name) or title_of(name, titles)
         place = re.sub(r"\br(\d+)s(\d+)\b", lambda found: block_in_words(
             int(found[1]), int(found[2])), place)
         return textwrap.fill(", ".join(filter(None, (said, place))), LONGEST_NAME)
@@ -244,7 +244,7 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
         bars += [("or " + in_words(rival.effect, rival.place), factor, PUBLISHED)
                  for rival, factor in rivals(effect)]
     if diagnosis.unknown is not None:
-        bars.append(("outside the catalogue", diagnosis.unknown.log_bayes_factor, SECOND))
+        bars.append((OUTSIDE, diagnosis.unknown.log_bayes_factor, SECOND))
     bars = bars[:2 * MAX_BARS]
     names = [in_words(name) for name, _ in top]
     heights = [0.7 + (BAR_IN + LINE_IN * max(name.count("\n") for name in own)) * len(own)

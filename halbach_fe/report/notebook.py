@@ -42,7 +42,7 @@ from halbach_fe.report.sorting import order_table
 from halbach_fe.report.tolerance import quantile_table
 from halbach_fe.report.verification import answer as answer_of_verification
 from halbach_fe.report.verification import difference_table
-from halbach_fe.response.mesh_convergence import Verification
+from halbach_fe.response.discretization_error import Verification
 from halbach_fe.response.solution import Solution
 from halbach_fe.synthetic.simulate import SimulatedCampaign
 

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.core.numbers import EMPTY_CELL
-from halbach_fe.geometry.equal_blocks import turned_onto
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.symmetry import block_images
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
@@ -63,7 +63,7 @@ STUDY_FILE = "study.registered.toml"
 MAP_FILE = "registered_map.csv"
 """The map with the component that was found, where the map itself does not say which it is."""
 
-NOTE = "found by halbach-fe register"
+NOTE = "of halbach-fe register"
 
 EQUALLY_GOOD = 0.05
 """Odds from which a second pose is reported as a possible one."""
@@ -150,9 +150,8 @@ def answer(
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *(
-            ("Update the blocks with the map in this pose. The update takes pose and probe as "
-             "exact, so that error bars of the blocks are too narrow, unless [instrument_sd] says "
-             "how far they were open.",
+            ("Update the blocks with the map in this pose. The update finds pose and probe again, "
+             "together with the blocks.",
              f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR") if sound else
             _after_doubts(best, maps) if _is_of_the_file(best) else
             ("Do not update the blocks in this pose. Measure lines beside this one, or the "
@@ -347,7 +346,7 @@ def _fit_alike(one: Registration, other: Registration) -> bool:
 def is_symmetric_to(one: Registration, other: Registration) -> bool:
     """Tell whether the turn from one pose to another puts every nominal block onto an equal one.
 
-    Such poses predict the same readings, before and after an update. `turned_onto` says which
+    Such poses predict the same readings, before and after an update. `block_images` says which
     magnets are never symmetric.
     """
     first, second = (_axes(each) for each in (one, other))
@@ -360,7 +359,7 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
     if (off > wider * np.hypot(np.abs(turn) @ one.translation_sd_m,
                                other.translation_sd_m)).any():
         return False
-    return turned_onto(build_magnet(one.study), turn) is not None
+    return block_images(build_magnet(one.study), turn) is not None
 
 
 def _axes(one: Registration) -> np.ndarray:

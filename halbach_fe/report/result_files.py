@@ -42,7 +42,7 @@ from halbach_fe.report.solution import write_solution_report
 from halbach_fe.report.sorting import write_sorted
 from halbach_fe.report.tolerance import write_tolerance
 from halbach_fe.report.verification import write_verification
-from halbach_fe.response.mesh_convergence import Verification
+from halbach_fe.response.discretization_error import Verification
 from halbach_fe.response.solution import Solution, write_solution
 from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.model import Study

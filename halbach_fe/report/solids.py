@@ -11,8 +11,7 @@ from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.pace import Progress
 from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import Plate
-from halbach_fe.geo.solid import PER_M, solid
-from halbach_fe.geo.step_file import Group, Occurrence, Solid, step_text
+from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_text
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.prism import Prism, circle
 

@@ -42,11 +42,11 @@ from halbach_fe.report.words import (
     ppm,
     relative,
 )
-from halbach_fe.response.discretization_error import REFINEMENT
-from halbach_fe.response.mesh_convergence import (
+from halbach_fe.response.discretization_error import (
     BOUNDARY,
     EXACT,
     FLATTEST,
+    REFINEMENT,
     STEEPEST,
     STEPS,
     Verification,

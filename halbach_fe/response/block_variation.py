@@ -1,18 +1,23 @@
-"""Readings of magnetizations that vary inside blocks.
+"""Readings of what deviates besides uniform magnetizations: variations in blocks, and amplitudes.
 
 The magnetization along a block's easy axis deviates from a uniform one by a smooth random function
 of the place, see ``variation_sd`` of `halbach_fe.study.inference.Prior`. Most of what it can be
 makes no field where a probe can be. Each block therefore gets as many modes as change the field in
 the bore noticeably: the singular vectors of the field on a cylinder near the blocks, weighted by
-the prior. Amplitudes are in prior standard deviations.
+the prior. Amplitudes are in prior standard deviations. The field is that of small uniform parts of
+the block in vacuum. What permeable blocks answer to it is neglected, some 5 % of a variation that
+is small itself.
 
-The field is that of small uniform parts of the block in vacuum. What permeable blocks answer to it
-is neglected, some 5 % of a variation that is small itself.
+An uncertain amplitude (`halbach_fe.study.uncertain.Uncertain`) is a parameter of the magnet after
+its magnetizations, in units of its prior standard deviation. The magnetization is always that of
+the blocks: if an amplitude changes what blocks are expected to have (a temperature), it is a
+deviation that they share in the prior, and its own column has only what the amplitude changes at
+given magnetizations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -23,39 +28,17 @@ import scipy.sparse as sparse
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.uncertain_amplitudes import with_amplitudes
+from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
+from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
+from halbach_fe.study.model import Study
+from halbach_fe.study.uncertain import Uncertain, shifted
 
 if TYPE_CHECKING:
     from halbach_fe.solver.moments.cells import Cells
     from halbach_fe.solver.moments.interaction import Interaction
-
-PARTS_PER_LENGTH = 1.7
-"""Parts of a block per correlation length along each direction. With 1.1 of them, readings 8 mm off
-the blocks of a dipole of 1.7 T saw the parts: held-out residuals were 1.05 mT, and 0.72 mT with
-1.7."""
-
-MOST_CELLS = 6
-"""Largest number of cells, of two parts each, along the sides of a cube: the correlations between
-12^3 parts of a block take 24 MB."""
-
-NEAR_WALL = 0.8
-"""Radius of the cylinder on which modes are compared, relative to the distance of a block from the
-axis."""
-
-NOTICEABLE_T = 2e-5
-"""Rms field on the cylinder below which a mode is left out, at one prior standard deviation."""
-
-AROUND, ALONG = 9, 13
-"""Numbers of points of the cylinder about a block and along it."""
-
-AT_ONCE = 30_000_000
-"""Number of field components of parts at points that are in memory at a time, 240 MB."""
-
-JITTER = 1e-9
-"""Added to the diagonal of correlations, which are singular to rounding."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +68,16 @@ class Variations:
         if not prior.variation_sd or prior.variation_length_m is None:
             return None
         side = float(np.cbrt(np.median([block.volume for block in magnet.blocks])))
-        per_side = max(1, int(np.ceil(PARTS_PER_LENGTH * side / prior.variation_length_m / 2)))
-        if per_side > MOST_CELLS:
-            least = PARTS_PER_LENGTH * side / MOST_CELLS / 2
+        # parts of a block per correlation length along each direction. With 1.1 of them, readings 8
+        # mm off the blocks of a dipole of 1.7 T saw the parts: held-out residuals were 1.05 mT, and
+        # 0.72 mT with 1.7.
+        parts_per_length = 1.7
+        per_side = max(1, int(np.ceil(parts_per_length * side / prior.variation_length_m / 2)))
+        # largest number of cells, of two parts each, along the sides of a cube: the correlations
+        # between 12^3 parts of a block take 24 MB
+        most_cells = 6
+        if per_side > most_cells:
+            least = parts_per_length * side / most_cells / 2
             raise StudyError(must_be(
                 "`prior.variation_length_m`", f"study {magnet.name}",
                 f"at least {least:.2g} m for blocks of {side:.2g} m",
@@ -107,19 +97,22 @@ class Variations:
         cells = cells_of(blocks, per_side)
         starts = np.searchsorted(cells.block, np.arange(len(blocks) + 1))
         interaction, found, names = Interaction(cells), [], []
+        # rms field on the cylinder below which a mode is left out, at one prior standard deviation
+        noticeable_T = 2e-5
+        jitter = 1e-9  # added to the diagonal of correlations, which are singular to rounding
         for number, block in enumerate(blocks):
             mine = slice(starts[number], starts[number + 1])
             places = cells.nodes[mine]
             flat = places.reshape(-1, 3)
             easy = np.array(block.easy_axis) * block.remanence
-            own = Interaction(_some(cells, mine))
+            own = Interaction(_select_cells(cells, mine))
             effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)
             correlation = np.exp(-distance / (2 * length_m**2))
-            correlation[np.diag_indices(len(flat))] += JITTER
+            correlation[np.diag_indices(len(flat))] += jitter
             root = sd * np.linalg.cholesky(correlation)
             _, sizes, modes = np.linalg.svd(effect @ root, full_matrices=False)
-            kept = sizes / np.sqrt(len(effect) / 3) > NOTICEABLE_T
+            kept = sizes / np.sqrt(len(effect) / 3) > noticeable_T
             shapes = (root @ modes[kept].T).reshape(*places.shape[:2], 1, -1)
             found.append(shapes * easy[:, None])
             names += [f"{block.name}.v{1 + mode:02d}" for mode in range(int(kept.sum()))]
@@ -148,7 +141,9 @@ class Variations:
 
     def _shares(self, every: range) -> Iterator[range]:
         """Yield parts of a range for which the fields of all parts of cells fit into memory."""
-        step = max(1, AT_ONCE // (9 * self.interaction.cells.weights.size))
+        # number of field components of parts at points that are in memory at a time, 240 MB
+        numbers_at_once = 30_000_000
+        step = max(1, numbers_at_once // (9 * self.interaction.cells.weights.size))
         return (every[first:first + step] for first in range(0, len(every), step))
 
     def _of_amplitudes(self, by_part: Floats) -> Floats:
@@ -171,7 +166,7 @@ class Variations:
         return self.interaction.field_at(points, polarization)
 
 
-def _some(cells: Cells, chosen: slice) -> Cells:
+def _select_cells(cells: Cells, chosen: slice) -> Cells:
     """Return some of the cells."""
     return replace(cells, **{name: getattr(cells, name)[chosen] for name in (
         "block", "centre", "axes", "vertices", "half", "cuboid")})
@@ -183,9 +178,13 @@ def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
     angle = np.arctan2(*(places.mean(axis=0)[[1, 0]]))
     low, high = places[:, 2].min(), places[:, 2].max()
     reach = (high - low) / 2
-    phi, z = np.meshgrid(angle + np.linspace(-0.5, 0.5, AROUND) * np.pi,
-                         np.linspace(low - reach, high + reach, ALONG))
-    near = NEAR_WALL * radius.min()
+    n_around, n_along = 9, 13  # numbers of points of the cylinder about a block and along it
+    phi, z = np.meshgrid(angle + np.linspace(-0.5, 0.5, n_around) * np.pi,
+                         np.linspace(low - reach, high + reach, n_along))
+    # radius of the cylinder on which modes are compared, relative to the distance of a block from
+    # the axis
+    near_wall = 0.8
+    near = near_wall * radius.min()
     return np.column_stack([near * np.cos(phi).ravel(), near * np.sin(phi).ravel(), z.ravel()])
 
 
@@ -213,3 +212,94 @@ def with_variations(prior: Gaussian, count: int) -> Gaussian:
     joined = sparse.block_diag([sparse.csr_array(root_matrix(prior.root)),
                                 sparse.eye_array(count)])
     return Gaussian(np.concatenate([prior.mean, np.zeros(count)]), stacked_root(joined))
+
+
+STEP = 1e-3
+"""Step of the differences of exact fields and magnetizations, in standard deviations: geometry and
+materials are linear to 1e-6 over it, and rounding is 1e-12 of the field."""
+
+
+def amplitude_names(magnet: Magnet) -> tuple[str, ...]:
+    """Return the names of the uncertain amplitudes of a magnet."""
+    return tuple(one.name for one in magnet.study.uncertain_of_magnet)
+
+
+def shared_deviations(magnet: Magnet) -> Floats:
+    """Return the change (parameters, amplitudes) in A/m of the nominal magnetizations."""
+    return _changes(magnet, STEP, lambda other: other.nominal_magnetization)
+
+
+def vacuum_changes(magnet: Magnet, points: Floats) -> Floats:
+    """Return the change (amplitudes, n, 3) in T of the field of blocks in vacuum and of external
+    sources at points (n, 3) in m, magnetizations changed as in `shared_deviations`.
+    """
+    return _changes(magnet, STEP, lambda other: vacuum_part(other, points)).transpose(2, 0, 1)
+
+
+def field_changes(magnet: Magnet, points: Floats, session: Session) -> Floats:
+    """Return `vacuum_changes` with those of what permeability and iron add."""
+    def solved(other: Magnet) -> Floats:
+        return finite_element_part(other, points, session.within("uncertain"), columns=False,
+                                   estimate=False).nominal
+
+    changes = vacuum_changes(magnet, points)
+    # step of the differences of what permeability and iron add, in standard deviations: large
+    # enough for differences between meshes, which a small step would magnify
+    solved_step = 0.1
+    if magnet.is_vacuum and magnet.study.solver.method == "reaction" and all(
+            build_magnet(each).is_vacuum for one in magnet.study.uncertain_of_magnet
+            for each in _either_side(magnet.study, one, solved_step)[0]):
+        return changes
+    return changes + _changes(magnet, solved_step, solved).transpose(2, 0, 1)
+
+
+def with_amplitudes(prior: Gaussian, magnet: Magnet) -> Gaussian:
+    """Return a prior of a magnet's other parameters (m,), and its uncertain amplitudes after them.
+
+    They are 0 with a standard deviation of 1, and shared by the magnetizations.
+    """
+    count = len(magnet.study.uncertain_of_magnet)
+    if not count:
+        return prior
+    shared = np.zeros((len(prior.mean), count))
+    shared[:len(magnet.parameter_names)] = shared_deviations(magnet)
+    root = sparse.bmat([[sparse.csr_array(root_matrix(prior.root)), sparse.csr_array(shared)],
+                        [None, sparse.eye_array(count)]], format="csr")
+    return Gaussian(np.concatenate([prior.mean, np.zeros(count)]),
+                    stacked_root(sparse.csr_array(root)))
+
+
+def _changes(magnet: Magnet, step: float, of: Callable[[Magnet], Floats]) -> Floats:
+    """Return the derivatives (..., amplitudes), per standard deviation, of values of a magnet."""
+    found = []
+    for one in magnet.study.uncertain_of_magnet:
+        (more, less), between = _either_side(magnet.study, one, step)
+        found.append((of(build_magnet(more)) - of(build_magnet(less))) / between)
+    return np.stack(found, axis=-1)
+
+
+def _either_side(
+    study: Study, uncertain: Uncertain, step: float
+) -> tuple[tuple[Study, Study], float]:
+    """Return the study with a larger and with a smaller amplitude, and how far these are apart.
+
+    The step and that distance are in standard deviations. At the limit of a key, such as a
+    permeability of 1, one of both is the study itself.
+    """
+    sides, between = [], 0.0
+    for sign in (1, -1):
+        try:
+            sides.append(shifted(study, uncertain, sign * step * uncertain.sd))
+            between += step
+        except StudyError:
+            sides.append(study)
+    if not between:
+        try:
+            shifted(study, uncertain, step * uncertain.sd)
+        except StudyError as error:
+            raise StudyError(must_be(
+                f"`uncertain.sd` of '{uncertain.name}'", f"study {study.name}",
+                f"small enough that the study can be changed by {step:g} of it",
+                f"{uncertain.sd:g} (in the unit of the key, as m and T)",
+                f"Correct it. The change by that step: {error}")) from None
+    return (sides[0], sides[1]), between

@@ -16,8 +16,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock, vector
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.block_variation import Variations
-from halbach_fe.response.uncertain_amplitudes import shared_deviations, vacuum_changes
+from halbach_fe.response.block_variation import Variations, shared_deviations, vacuum_changes
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
 from halbach_fe.study.materials import MU_0
 

@@ -39,9 +39,6 @@ from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M
 
 PPM = 1e6
 
-INSIDE = 0.5
-"""Radius of the default sphere, relative to that of the bore."""
-
 INTEGRATION_DEGREE = 10
 """Degree of the functions of the radius, and of z in a panel, whose means are exact."""
 
@@ -49,13 +46,6 @@ ANGULAR_DEGREE = 32
 """Largest degree of the functions of the angles whose means are exact: squares of harmonics of half
 of it. Of a magnet that was designed to be homogeneous only harmonics of high degrees are left: with
 a degree of 10 the rms of one of 3 009 cubes was 15 % too small (26.8 instead of 31.4 ppm)."""
-
-SHELL_TAIL = 0.02
-"""Size, relative to that on the surface, up to which harmonics are left out on shells within a
-region: there a smaller angular degree suffices."""
-
-ELONGATED = 1.5
-"""Ratio of length and width from which an ellipsoid is integrated in panels along z."""
 
 SURFACE_DEGREE = 36
 """Least degree of the functions that the points of the surface resolve; they are 10° from each
@@ -65,27 +55,8 @@ STARTS = 2
 """Number of points from which each extreme is looked for, the best ones that are not near each
 other: of two peaks the higher one may have the lower points."""
 
-LOCAL_DEGREES = 7
-"""Degrees of the solid harmonics about a point that are fitted to the field at the points near."""
-
-NEAR, WEIGHED = 3.0, 1.5
-"""How far these points are from it, and the distance at which one counts less by a factor of e,
-in distances of points from each other."""
-
-TRIED, WIDTH = 7, 1.5
-"""Number of places along each coordinate about a point, up to a distance in distances of points,
-among which the extreme is looked for. A parabola along each coordinate through the best one and its
-neighbours gives the rest."""
-
-HIGHER_DEGREES = 1e-4
-"""Size up to which harmonics of a degree that the surface does not resolve are left out, relative
-to the field of a block at the wall of the bore: they fall as (R / r)^l from there inwards."""
-
 SLICE = 25
 """Number of points along the sides of the slices that are drawn."""
-
-MOST_DEGREES = 40
-"""Largest degree that the surface resolves, which limits memory and time."""
 
 SHOWN_DEGREES = 6
 """Degrees of the harmonics that are listed by default."""
@@ -240,7 +211,12 @@ class Region:
         size = INTEGRATION_DEGREE // 2 + 1
         panels = int(np.ceil(2 * self.half_axes_m[2] / panel_m))
         width = max(self.half_axes_m[:2])
-        if self.shape == "cylinder" or (panels > 1 and self.half_axes_m[2] > ELONGATED * width):
+        # size, relative to that on the surface, up to which harmonics are left out on shells within
+        # a region: there a smaller angular degree suffices
+        shell_tail = 0.02
+        # ratio of length and width from which an ellipsoid is integrated in panels along z
+        elongated = 1.5
+        if self.shape == "cylinder" or (panels > 1 and self.half_axes_m[2] > elongated * width):
             radii, radial = _on_radius(size, 1)
             angles = 2 * np.pi * np.arange(angular_degree + 1) / (angular_degree + 1)
             heights, along = _in_panels(size, max(panels, 1))
@@ -253,7 +229,7 @@ class Region:
         else:
             shells = []
             for radius, weight in zip(*_on_radius(size, 2), strict=True):
-                needed = 2 * int(np.ceil(np.log(SHELL_TAIL) / np.log(radius)))
+                needed = 2 * int(np.ceil(np.log(shell_tail) / np.log(radius)))
                 directions, angular = sphere_points(
                     int(np.clip(needed, INTEGRATION_DEGREE, angular_degree)))
                 shells.append((radius * directions, weight * angular))
@@ -304,10 +280,6 @@ def _cylinder_surface(degree: int) -> Floats:
     r, phi = (part.ravel() for part in np.meshgrid(np.linspace(0, 1, count)[:-1], angles))
     disc = np.column_stack([r * np.cos(phi), r * np.sin(phi), np.ones_like(r)])
     return np.vstack([wall, disc, disc * [1, 1, -1]])
-
-
-SMALLEST_M = 1e-6
-"""Smallest half axis of a region: in smaller ones the field differs by its rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -554,20 +526,29 @@ def _climbed(
     ``unit`` are the points relative to the half axes of the region.
     """
     distance = np.linalg.norm(unit - unit[start], axis=1)
-    unknowns = LOCAL_DEGREES * (LOCAL_DEGREES + 2)
-    near = distance <= max(NEAR * step, np.sort(distance)[min(unknowns, len(unit)) - 1])
+    # degrees of the solid harmonics about a point that are fitted to the field at the points near
+    local_degrees = 7
+    unknowns = local_degrees * (local_degrees + 2)
+    # how far these points are from it, and the distance at which one counts less by a factor of e,
+    # in distances of points from each other
+    near_distance, weighed_distance = 3.0, 1.5
+    near = distance <= max(near_distance * step, np.sort(distance)[min(unknowns, len(unit)) - 1])
     away = (unit[near] - unit[start]) * region.half_axes_m
     scale = float(np.linalg.norm(away, axis=1).max())
-    weight = np.exp(-(distance[near] / (WEIGHED * step))**2)[:, None, None]
-    design = solid_harmonic_fields(away / scale, LOCAL_DEGREES)
+    weight = np.exp(-(distance[near] / (weighed_distance * step))**2)[:, None, None]
+    design = solid_harmonic_fields(away / scale, local_degrees)
     amplitudes = np.linalg.lstsq((weight * design).reshape(-1, unknowns),
                                  (weight * fields[near]).reshape(-1, fields.shape[2]),
                                  rcond=None)[0]
     rest = np.linalg.norm(weight * (fields[near] - design @ amplitudes), axis=1).max(axis=0)
-    places = region.around(unit[start], WIDTH * step, TRIED).reshape(-1, 3) - unit[start]
+    # number of places along each coordinate about a point, up to a distance in distances of points,
+    # among which the extreme is looked for. A parabola along each coordinate through the best one
+    # and its neighbours gives the rest.
+    tried, width = 7, 1.5
+    places = region.around(unit[start], width * step, tried).reshape(-1, 3) - unit[start]
     found = sign * np.linalg.norm(solid_harmonic_fields(
-        places * region.half_axes_m / scale, LOCAL_DEGREES) @ amplitudes, axis=1)
-    value = _vertex(found.reshape(*3 * [TRIED], -1))
+        places * region.half_axes_m / scale, local_degrees) @ amplitudes, axis=1)
+    value = _vertex(found.reshape(*3 * [tried], -1))
     sampled = sign * np.linalg.norm(fields[start], axis=0)
     return np.where(value - sampled > rest, value, sampled)
 
@@ -627,9 +608,11 @@ def region_points(
     if magnet.dimension == 2:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}",
                                  "3, for the homogeneity in a volume", "2"))
-    if min(region.half_axes_m) < SMALLEST_M:
+    # smallest half axis of a region: in smaller ones the field differs by its rounding errors
+    smallest_m = 1e-6
+    if min(region.half_axes_m) < smallest_m:
         raise StudyError(must_be("the region", f"study {magnet.name}",
-                                 f"of at least {SMALLEST_M:g} m in all directions", region.text))
+                                 f"of at least {smallest_m:g} m in all directions", region.text))
     far = magnet.field_reach
     if np.abs(region.centre_m).max() + max(region.half_axes_m) > far:
         raise StudyError(must_be("the region", f"study {magnet.name}",
@@ -641,8 +624,13 @@ def region_points(
                                  f"{region.text}, which contains blocks",
                                  _advice(magnet, region)))
     reach = max(region.half_axes_m) / magnet.bore_radius
-    resolved = MOST_DEGREES if reach >= 1 else min(
-        MOST_DEGREES, int(np.ceil(np.log(HIGHER_DEGREES) / np.log(reach))))
+    # size up to which harmonics of a degree that the surface does not resolve are left out,
+    # relative to the field of a block at the wall of the bore: they fall as (R / r)^l from there
+    # inwards
+    higher_share = 1e-4
+    most_degrees = 40  # largest degree that the surface resolves, which limits memory and time
+    resolved = most_degrees if reach >= 1 else min(
+        most_degrees, int(np.ceil(np.log(higher_share) / np.log(reach))))
     surface_degree = max(resolved + degrees, SURFACE_DEGREE)
     points, weights = region.points(
         surface_degree, magnet.bore_radius,
@@ -712,7 +700,8 @@ def default_region(magnet: Magnet) -> Region:
     asked = magnet.study.homogeneity
     own = None if asked is None else Region.of(
         asked.sphere_m, asked.ellipsoid_m, asked.cylinder_m, asked.centre_m)
-    return own or Region.sphere(INSIDE * magnet.bore_radius)
+    inside = 0.5  # radius of the default sphere, relative to that of the bore
+    return own or Region.sphere(inside * magnet.bore_radius)
 
 
 def _quantiles(values: Floats) -> tuple[float, float, float]:

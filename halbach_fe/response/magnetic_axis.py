@@ -48,14 +48,6 @@ LENGTH = 0.5
 """Length along which they lie, relative to that of the magnet: the ends have fields of their own.
 """
 
-STEP = 1 / 4
-"""Distance of the points from which gradient and curvatures of a dipole's field follow, relative
-to the radius of the bore."""
-
-MOST_STEPS = 1
-"""Farthest stationary point of a dipole's field that counts, in steps from the middle. Farther away
-the field has other curvatures; that of a homogeneous magnet may be anywhere."""
-
 
 @dataclass(frozen=True)
 class MagneticAxis:
@@ -120,7 +112,10 @@ def magnetic_axis(
     angles = 2 * np.pi * np.arange(count) / count
     circle = radius * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
     around = (circle + heights[:, None, None] * [0, 0, 1.0]).reshape(-1, 3)
-    cross = np.vstack([np.zeros(3), *(sign * STEP * bore * unit for unit in _DIRECTIONS
+    # distance of the points from which gradient and curvatures of a dipole's field follow, relative
+    # to the radius of the bore
+    step_share = 1 / 4
+    cross = np.vstack([np.zeros(3), *(sign * step_share * bore * unit for unit in _DIRECTIONS
                                       for sign in (1, -1))])
     points = np.vstack([around, cross]) if order == 1 and not flat else around
     if magnet.contains(points).any():  # something stands in the bore
@@ -149,7 +144,7 @@ def magnetic_axis(
     if order == 1:
         if flat:
             return MagneticAxis(order, roll, roll_sd)
-        centre = _stationary(field[len(around):], columns[len(around):], STEP * bore,
+        centre = _stationary(field[len(around):], columns[len(around):], step_share * bore,
                              magnetizations)
         return MagneticAxis(order, roll, roll_sd, *centre)
     below, below_root = multipole(order - 1, field), multipole(order - 1, columns)
@@ -213,7 +208,10 @@ def _stationary(
         curvature[one, other] = curvature[other, one] = mixed
     inverse = np.linalg.pinv(curvature)
     place = -inverse @ gradient
-    if not np.linalg.norm(place) <= MOST_STEPS * step:
+    # farthest stationary point of a dipole's field that counts, in steps from the middle. Farther
+    # away the field has other curvatures; that of a homogeneous magnet may be anywhere.
+    most_steps = 1
+    if not np.linalg.norm(place) <= most_steps * step:
         return ()
     gradient_rows = (rows[1::2] - rows[2::2])[:3] / (2 * step)
     return (tuple(place.tolist()),

@@ -32,15 +32,14 @@ from halbach_fe.core.hdf5 import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.block_variation import Variations
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
-from halbach_fe.response.uncertain_amplitudes import (
+from halbach_fe.response.block_variation import (
+    Variations,
     amplitude_names,
     field_changes,
     shared_deviations,
 )
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import (
     SUPERPOSITION_TOLERANCE,
     ElementFields,
@@ -57,16 +56,6 @@ from halbach_fe.study.model import FIELD_KEYS
 
 LOADED_BYTES = 2**30
 """Size in bytes above which a matrix stays on the disk and is read in parts."""
-
-DEVIATION = 0.1
-"""Share of the difference between the columns' sum and the nominal array's field in the error bars,
-if columns only serve for deviations: blocks deviate by less than a tenth of their magnetization."""
-
-
-SIMILAR_TOLERANCE = 5e-4
-"""Tolerance of the check that columns of a similar magnet add up to the nominal array. Readings of
-blocks that deviate by 1 % are then wrong by 2e-6 of the largest reading: measured 1.3e-7 at a
-difference of 3.6e-5, by another inner radius in an iron tube."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +184,7 @@ def response_matrix(
         A magnet whose shapes or materials differ slightly, and which was solved for before with the
         session's cache. What its permeability and iron add to the field of single blocks, which
         takes most of the time, serves this magnet too if it adds up to the nominal array to
-        `SIMILAR_TOLERANCE`. The nominal array and the field in vacuum are computed in any case.
+        5e-4. The nominal array and the field in vacuum are computed in any case.
 
     Raises
     ------
@@ -216,7 +205,8 @@ def response_matrix(
     if magnet.study.uncertain_of_magnet:
         changes = observation.apply(field_changes(magnet, observation.points, session))
     if similar is not None and _serves(similar, magnet, observation.points, session):
-        built = _of_similar(magnet, similar, observation, session, _beside(path, key), changes)
+        built = _similar_response(
+            magnet, similar, observation, session, _beside(path, key), changes)
     if built is None:
         parts = finite_element_part(magnet, observation.points, session)
         error = reading_errors(magnet, observation, parts, error_bar_session(session))
@@ -238,7 +228,7 @@ def _serves(similar: Magnet, magnet: Magnet, points: Floats, session: Session) -
             and all(runs_serve_other_points(each, points) for each in (similar, magnet)))
 
 
-def _of_similar(
+def _similar_response(
     magnet: Magnet, similar: Magnet, observation: Observation, session: Session, path: Path,
     changes: Floats
 ) -> Response | None:
@@ -253,8 +243,12 @@ def _of_similar(
     built = _assemble(magnet, observation, replace(
         parts, nominal=nominal, along_nominal=nominal, sources=magnet.blocks, for_deviations=True),
         error, path, changes)
+    # tolerance of the check that columns of a similar magnet add up to the nominal array. Readings
+    # of blocks that deviate by 1 % are then wrong by 2e-6 of the largest reading: measured 1.3e-7
+    # at a difference of 3.6e-5, by another inner radius in an iron tube.
+    similar_tolerance = 5e-4
     return replace(built, of_similar=True) if (
-        built.superposition_error <= SIMILAR_TOLERANCE) else None
+        built.superposition_error <= similar_tolerance) else None
 
 
 def _assemble(
@@ -294,8 +288,12 @@ def _assemble(
     # less or more than the field of the nominal array
     unequal = total - direct
     offset = observation.apply(external_field(magnet, observation.points))
+    # share of the difference between the columns' sum and the nominal array's field in the error
+    # bars, if columns only serve for deviations: blocks deviate by less than a tenth of their
+    # magnetization
+    deviation = 0.1
     if parts.linearized or parts.for_deviations:
-        unequal *= DEVIATION
+        unequal *= deviation
         field = vacuum_part(magnet, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
     return Response(matrix, names, nominal, offset, np.hypot(error, unequal),

@@ -32,7 +32,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.deviation_field import Deviations
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.stats.gaussian import Gaussian, correlated_values
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
 from halbach_fe.study.types import COMPONENTS
@@ -42,22 +42,8 @@ Complexes = NDArray[np.complex128]
 UNITS = 1e4
 """Units per main multipole: unwanted multipoles are given in units of 1e-4 of the main one."""
 
-DEFAULT_RADIUS = 2 / 3
-"""Default reference radius relative to the inner radius of the blocks, the usual choice."""
-
-LEAST_RADIUS, MOST_RADIUS = 1e-3, 0.95
-"""Smallest and largest reference radius relative to the inner radius of the blocks. Far inside,
-multipoles of high orders are zero to all digits; nearer to the blocks, sums over angles and z need
-very many points, and finite elements are inexact."""
-
 DEFAULT_ORDERS = tuple(range(1, 11))
 """Default orders of multipoles."""
-
-SUM_ERROR = 1e-8
-"""Tolerance of sums over equally spaced angles or z, relative to the field at the blocks. Such a
-sum mixes a small part of a multipole into another. Harmonics of order k fall as (R / r)^k from the
-blocks' radius r inwards, and the sum over steps h along z of a field whose sources are at the
-distance d has the error exp(-2 pi d / h)."""
 
 NOTHING_THERE = 1e-6
 """Tolerance below which the main multipole counts as zero, relative to the largest multipole that
@@ -173,8 +159,8 @@ class Multipoles:
 
     def sizes_of(self, normals: Floats) -> Floats:
         """Return |c_n| (count, k) of samples made from standard normal numbers (count, 2 k)."""
-        values, vectors = np.linalg.eigh(self.covariance + np.diag(self.error**2))
-        drawn = self.mean + normals * np.sqrt(np.maximum(values, 0)) @ vectors.T
+        covariance = self.covariance + np.diag(self.error**2)
+        drawn = correlated_values(self.mean, covariance, normals)
         return np.hypot(*drawn.reshape(len(drawn), 2, -1).swapaxes(0, 1))
 
     def table(self) -> list[dict[str, float]]:
@@ -468,8 +454,11 @@ def _aliases(
     here = points[np.isclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=SAME_RADIUS)
                   & np.isclose(points[:, 2], z, atol=SAME_HEIGHT_M)]
     own = len(np.unique(np.round(np.arctan2(here[:, 1], here[:, 0]) / SAME_ANGLE)))
-    decay = min(radius / magnet.bore_radius, SLOWEST_DECAY)
-    needed = orders + int(np.ceil(np.log(ALIAS_LEFT) / np.log(decay)))
+    # orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
+    # first; where circles are near the blocks or outside of the bore, the second is their decay
+    alias_left, slowest_decay = 1e-6, 0.95
+    decay = min(radius / magnet.bore_radius, slowest_decay)
+    needed = orders + int(np.ceil(np.log(alias_left) / np.log(decay)))
     times = max(1, int(np.ceil(needed / own)))
     angle = np.arctan2(here[0, 1], here[0, 0]) + 2 * np.pi * np.arange(times * own) / (times * own)
     direction = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
@@ -594,15 +583,21 @@ def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
     positions = magnet.study.observation.positions
     bore = magnet.bore_radius
     radius = reference.radius_m
+    # default reference radius relative to the inner radius of the blocks, the usual choice
+    default_radius = 2 / 3
     if radius is None:
         own = positions.radius_m if isinstance(positions, CirclePositions) else ()
-        radius = own[0] if len(own) == 1 else DEFAULT_RADIUS * bore
-    if not LEAST_RADIUS * bore <= radius <= MOST_RADIUS * bore:
+        radius = own[0] if len(own) == 1 else default_radius * bore
+    # smallest and largest reference radius relative to the inner radius of the blocks. Far inside,
+    # multipoles of high orders are zero to all digits; nearer to the blocks, sums over angles and z
+    # need very many points, and finite elements are inexact.
+    least_radius, most_radius = 1e-3, 0.95
+    if not least_radius * bore <= radius <= most_radius * bore:
         raise StudyError(must_be(
             "--reference-radius-m", f"study {magnet.name}",
-            f"from {LEAST_RADIUS * bore:g} to {MOST_RADIUS * bore:.4g} m, as the blocks' inner "
+            f"from {least_radius * bore:g} to {most_radius * bore:.4g} m, as the blocks' inner "
             f"radius is {bore:g} m", f"{radius:g}",
-            "Was it meant in millimetres?" if radius / 1000 <= MOST_RADIUS * bore < radius / 10
+            "Was it meant in millimetres?" if radius / 1000 <= most_radius * bore < radius / 10
             else "Choose a smaller one." if radius > bore else ""))
     return radius
 
@@ -613,11 +608,16 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
     They are those of the circle at z, or in 3D with z None those of the field integrated along z.
     """
     bore = magnet.bore_radius
-    angles = max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(radius / bore))))
+    # tolerance of sums over equally spaced angles or z, relative to the field at the blocks. Such a
+    # sum mixes a small part of a multipole into another. Harmonics of order k fall as (R / r)^k
+    # from the blocks' radius r inwards, and the sum over steps h along z of a field whose sources
+    # are at the distance d has the error exp(-2 pi d / h).
+    sum_error = 1e-8
+    angles = max(2 * highest + 1, highest + int(np.ceil(np.log(sum_error) / np.log(radius / bore))))
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
     if magnet.dimension == 3 and z is None:
         end = magnet.field_reach
-        step = 2 * np.pi * (bore - radius) / -np.log(SUM_ERROR)
+        step = 2 * np.pi * (bore - radius) / -np.log(sum_error)
         limits = (-end, end, int(np.ceil(2 * end / step)) + 1)
     settings = FourierCoefficients(
         quantity="fourier_coefficients", harmonics=highest, positions=CirclePositions(
@@ -634,16 +634,9 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
                        positions[:2 * highest])
 
 
-ALIAS_LEFT, SLOWEST_DECAY = 1e-6, 0.95
-"""Orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
-first; where circles are near the blocks or outside of the bore, the second is their decay."""
-
 SAME_RADIUS, SAME_HEIGHT_M, SAME_ANGLE = 2e-6, 1e-6, 1e-6
 """Relative difference of radii, and difference of z in m, up to which points are on one circle, and
 angle in rad up to which points on it are one."""
-
-MAIN_UNITS = 9000.0
-"""Size of a multipole that can only be the main one, in units of it; its axes turn by little."""
 
 
 def text_table(**columns: Multipoles) -> list[dict[str, str]]:
@@ -653,8 +646,10 @@ def text_table(**columns: Multipoles) -> list[dict[str, str]]:
     empty if there is one column. The main multipole, 10 000 units by definition, is no error: its
     cell has a word. What is exact has no standard deviation.
     """
+    # size of a multipole that can only be the main one, in units of it; its axes turn by little
+    main_units = 9000.0
     def text(known: Multipoles, number: int) -> str:
-        if known.mean[number] > MAIN_UNITS:
+        if known.mean[number] > main_units:
             return "main"
         value, sd = round(float(known.mean[number]), 2), float(known.sd[number])
         spread = "" if not sd else " ± <0.01" if sd < 0.005 else f" ± {sd:.2f}"

@@ -21,13 +21,12 @@ from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.condensed_newton import Condensed, condense
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import (
+    Route,
     check_points,
     choose_route,
     finite_element_part,
-    formulation_of,
     vacuum_part,
 )
 from halbach_fe.solver.interpolation import locate, quadrature
@@ -42,15 +41,6 @@ AGREEMENT_T = 1e-8
 
 GetDP's relative residual of 1e-10 is about 1e-10 T, and the condensed solve converges to 1e-9 T. A
 wrong sign or Gauss point makes a difference of 1e-4 T."""
-
-VERIFIED_SAMPLES = 3
-"""Number of magnetizations for which the model is compared with GetDP's Newton method."""
-
-DEVIATIONS = 0.02
-"""Size of deviations from the nominal magnetization, for which the error of the mesh remains."""
-
-IRON_MATRIX_TOLERANCE = 1e-9
-"""Relative tolerance of the matrix in the iron. GetDP's Gauss points have 12 digits."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +113,8 @@ def nonlinear_model(
         raise StudyError(f"Input `curve` of the iron of study {magnet.name} must be given for a "
                          "non-linear model; instead it is missing. Use the response matrix.")
     observation = replace(observation, points=check_points(magnet, observation.points))
-    route = _mesh_route(magnet, observation.points)
-    base = _with_vacuum_for_iron(magnet, route)
+    route = choose_route(magnet, observation.points).meshed
+    base = _replace_iron_by_vacuum(magnet, route)
     linear = response_matrix(base, observation, replace(session, folder=session.folder / "linear"))
     condensed = condense_to_iron(magnet, observation, session, linear)
     error = _error(magnet, observation, session)
@@ -133,15 +123,17 @@ def nonlinear_model(
     settings = magnet.study.prior
     prior = prior or nominal_prior(linear.nominal, magnet.dimension, settings.magnitude_sd,
                                    settings.direction_sd_deg, settings.common_mode_sd)
-    samples = prior.sample(VERIFIED_SAMPLES, generator)
+    # number of magnetizations for which the model is compared with GetDP's Newton method
+    verified_samples = 3
+    samples = prior.sample(verified_samples, generator)
     agreement = compare_with_newton(model, magnet, observation, session, samples)
     model = replace(model, agreement_T=agreement)
-    if choose_route(magnet, observation.points) == "moments":
-        return _corrected(model, magnet, observation, session)
+    if choose_route(magnet, observation.points) is Route.MOMENTS:
+        return _correct_nominal(model, magnet, observation, session)
     return model
 
 
-def _corrected(
+def _correct_nominal(
     model: NonlinearModel, magnet: Magnet, observation: Observation, session: Session
 ) -> NonlinearModel:
     """Return the model with the nominal readings of the route ``moments``.
@@ -155,8 +147,10 @@ def _corrected(
     readings = observation.apply(vacuum_part(magnet, observation.points) + parts.nominal)
     correction = readings - model(model.nominal)
     error = reading_errors(magnet, observation, parts, error_bar_session(session))
+    # size of deviations from the nominal magnetization, for which the error of the mesh remains
+    deviation = 0.02
     return replace(model, offset=model.offset + correction,
-                   error=error + DEVIATIONS * np.abs(correction))
+                   error=error + deviation * np.abs(correction))
 
 
 def condense_to_iron(
@@ -168,9 +162,9 @@ def condense_to_iron(
     """
     curve = magnet.curve
     assert curve is not None  # the caller has checked it
-    route = _mesh_route(magnet, observation.points)
-    formulation = formulation_of(magnet, route)
-    assembly = assemble(_with_vacuum_for_iron(magnet, route), session, formulation)
+    route = choose_route(magnet, observation.points).meshed
+    formulation = route.formulation(magnet)
+    assembly = assemble(_replace_iron_by_vacuum(magnet, route), session, formulation)
     mesh, unknowns, size = assembly.mesh, assembly.unknowns, magnet.dimension
     gauss, weights = quadrature(mesh, np.flatnonzero(mesh.in_iron))
     gradient = sparse.csr_array(
@@ -214,9 +208,9 @@ def newton_readings(
     size = magnet.dimension
     samples = np.zeros((len(magnetizations), len(magnet.blocks), 3))
     samples[..., :size] = magnetizations.reshape(len(magnetizations), -1, size)
-    route = _mesh_route(magnet, observation.points)
+    route = choose_route(magnet, observation.points).meshed
     fields = solve_samples(magnet, observation.points, samples, session,
-                           formulation_of(magnet, route), cold=cold)
+                           route.formulation(magnet), cold=cold)
     if magnet.study.solver.method == "reaction":
         remanence = [samples[:, number] @ (MU_0 * block.recoil_tensor)
                      for number, block in enumerate(magnet.blocks)]
@@ -248,13 +242,7 @@ def compare_with_newton(
     return difference
 
 
-def _mesh_route(magnet: Magnet, points: Floats) -> str:
-    """Return the route of the mesh that holds the iron; ``moments`` has none."""
-    route = choose_route(magnet, points)
-    return "scalar_potential" if route == "moments" else route
-
-
-def _with_vacuum_for_iron(magnet: Magnet, route: str) -> Magnet:
+def _replace_iron_by_vacuum(magnet: Magnet, route: Route) -> Magnet:
     """Return the magnet with vacuum in place of the iron, on the same mesh.
 
     Symmetry is switched off, so that every block is solved by itself.
@@ -264,14 +252,14 @@ def _with_vacuum_for_iron(magnet: Magnet, route: str) -> Magnet:
     iron = iron_of(study)
     assert iron is not None  # only iron has a curve
     vacuum = iron.with_(curve=None, relative_permeability=1.0)
-    solver = {"symmetry": False} | ({} if magnet.dimension == 2 else {"route": route})
+    solver = {"symmetry": False} | ({} if magnet.dimension == 2 else {"route": route.value})
     return magnet.with_(**{key: vacuum}, solver=study.solver.with_(**solver))
 
 
 def _error(magnet: Magnet, observation: Observation, session: Session) -> Floats:
     """Return the error bar of the finite elements, (readings,) in T, for the nominal magnet."""
     if magnet.dimension == 3:  # by the mesh of the model, whose error it is
-        magnet = magnet.with_(solver__route=_mesh_route(magnet, observation.points))
+        magnet = magnet.with_(solver__route=choose_route(magnet, observation.points).meshed.value)
     parts = finite_element_part(magnet, observation.points, replace(
         session, folder=session.folder / "nominal"), columns=False)
     return reading_errors(magnet, observation, parts, error_bar_session(session))
@@ -294,7 +282,9 @@ def _check_iron(
     if not len(inside):
         return  # a single layer of elements has no inner unknowns; `compare_with_newton` must do
     difference = abs(ours - theirs).tocsr()[inside].max() / abs(theirs).max()
-    if not difference <= IRON_MATRIX_TOLERANCE:
+    # relative tolerance of the matrix in the iron. GetDP's Gauss points have 12 digits.
+    tolerance = 1e-9
+    if not difference <= tolerance:
         raise GetDPError(
             f"GetDP's matrix in the iron differs by {difference:.1e} from that of halbach-fe: this "
             "GetDP numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")

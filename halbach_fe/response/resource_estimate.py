@@ -31,16 +31,18 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.discretization_error import (
+    error_bar_session,
+    reading_errors,
+    variants_to_compare,
+)
 from halbach_fe.response.matrix import LOADED_BYTES
-from halbach_fe.response.mesh_convergence import variants_to_compare
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.formulation_choice import (
-    MESHES,
+    Route,
     check_points,
     choose_route,
     finite_element_part,
-    formulation_of,
 )
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of
@@ -66,10 +68,10 @@ GetDP runs was 0.95 to 2.3 times the measured one, and machines differ in more t
 class CostLaw:
     """Memory and time of a GetDP process as functions of its number n of unknowns.
 
-    The memory in bytes is ``GETDP_BYTES + n (bytes_each + fill n^(1/3))``. The factors of a matrix
-    grow as n^(4/3) in 3D (A. George, SIAM J. Numer. Anal. 10 (1973) 345) and as n log n in a plane,
-    where the logarithm is too weak to matter. The time in seconds on the reference machine is
-    ``GETDP_SECONDS``, plus ``matrix_s n^power`` for every matrix and ``solve_s n`` for every solve.
+    To the memory in bytes of a process comes ``n (bytes_each + fill n^(1/3))``. The factors of a
+    matrix grow as n^(4/3) in 3D (A. George, SIAM J. Numer. Anal. 10 (1973) 345) and as n log n in a
+    plane, where the logarithm is too weak to matter. To the time in seconds on the reference
+    machine comes ``matrix_s n^power`` for every matrix and ``solve_s n`` for every solve.
     """
 
     bytes_each: float
@@ -78,9 +80,6 @@ class CostLaw:
     solve_s: float
     power: float = 1.0
 
-
-GETDP_BYTES, GETDP_SECONDS = 50e6, 0.1
-"""Memory and time of a GetDP process that do not depend on its number of unknowns."""
 
 PLANE = CostLaw(3600, 0, 1.8e-5, 8e-7)
 """Law for plane meshes. The memory is within 5 % of that of eleven runs on cross-sections and
@@ -97,72 +96,24 @@ ITERATED = CostLaw(5150, 0, 2e-5, 5.8e-5)
 """Law for the scalar potential with conjugate gradients. It fits runs with 226 000 and 274 000
 unknowns: the memory within 1 %, and without iron the time within 5 %."""
 
-IRON_ITERATIONS = 5.0
-"""Factor by which thin iron increases the number of iterations."""
-
 EDGES = {1: CostLaw(2700, 90, 7e-7, 1.5e-6, 1.4), 2: CostLaw(2430, 88, 5.5e-7, 1.5e-6, 1.4)}
 """Laws for edge elements, by their order. The law of the first order fits runs with 27 000 to
 206 000 unknowns on three magnets: the memory within 7 %, the time within 40 %. That of the second
 order fits runs with 42 000, 132 000 and 264 000 unknowns within 4 % and 20 %."""
 
 STEPPED = CostLaw(10_700, 0, 8e-5, 0)
-"""Law for multigrid in Newton's steps. Together with `NEWTON_BYTES` it fits the memory of runs with
-61 000 and 203 000 unknowns within 1 %."""
-
-NEWTON_BYTES, NEWTON_MATRICES, NEWTON_STEPS = 4400, 2, 6
-"""For Newton's method: additional bytes per unknown for the Jacobian, matrices per step, and the
-assumed number of steps (3 to 9 were seen). The first two were measured with 11 000 and 86 000
-unknowns."""
+"""Law for multigrid in Newton's steps. Together with the bytes for the Jacobian it fits the memory
+of runs with 61 000 and 203 000 unknowns within 1 %."""
 
 PYTHON_BYTES, ELEMENT_BYTES = 0.27 * GIB, 2000
 """Memory in bytes of this program with its libraries, and per element for the mesh and the unknowns
 that it reads. The latter was 1000 to 2100 for meshes of 10 000 to 208 000 elements."""
-
-PART_COPIES, INFORMATION_COPIES = 4, 3
-"""Numbers of copies in memory of the rows of H that are processed together, and of the square root
-of the information while its singular values are computed. They were measured with 48 to 30 720
-parameters and 1 008 to 28 080 readings."""
-
-READING_BYTES, READING_SECONDS = 1200, 6e-5
-"""Memory in bytes and time in s per reading for labels, tables and figures, measured with a million
-readings."""
-
-POINT_BYTES = 340
-"""Memory in bytes per point for the exact field of a block: its matrix in the frames of the block
-and of the magnet, and the product between them."""
-
-OWN_SECONDS, ELEMENT_SECONDS, PAIR_SECONDS, MATRIX_SECONDS = 5.0, 1.5e-5, 5e-7, 1e-9
-"""Time in s of this program: to start and to write the report; per element of every GetDP process;
-per block and point of the exact field; and per entry of H, times the number of parameters or
-readings, whichever is smaller. Two threads took 2e-7 to 5e-7 s per block and point, in a plane and
-for sectors in space."""
-
-CELL_SECONDS, COLUMN_SECONDS = 1.2e-3, 1.6e-5
-"""Time in s of the method of moments per cell, and per entry of H. Measured with 990 cubes and 396
-readings, and with 4 032 cubes and 432 readings."""
-
-CELL_BYTES, COLUMN_CELL_BYTES, NEAR_BYTES = 8_000, 43_000, 300
-"""Memory in bytes of the method of moments per cell, per cell if H is computed too, and per pair of
-near cells. Slender and flat cells have many times the pairs of cubes.
-Without H the sum is within 20 % of that of lattices of 108 to 500 hexagonal prisms of 20 and 60 mm,
-aligned and turned at random, and of 512 and 1 728 cubes; with H it is that of the cubes above."""
-
-MODES_BYTES, MODES_SECONDS = 2.0 * GIB, 60.0
-"""Memory in bytes and time in s of iron by azimuthal modes with separate blocks in turn. Measured
-with 990 cubes in a tube that is 4 mm from them; iron that is farther away takes less."""
 
 MESH_BYTES = {"cross_section": 104, "meridian": 70, "extruded": 104}
 """Bytes per element of a mesh file, by the kind of mesh."""
 
 UNKNOWN_BYTES = {"edge_elements": 75}
 """Bytes per unknown of GetDP's list of unknowns, by route."""
-
-OTHER_UNKNOWN_BYTES = 30
-"""Bytes per unknown of GetDP's list of unknowns for all other routes."""
-
-GRID, GRID_SECONDS = 150, 0.095
-"""Side of the grid whose factorization measures the speed of a machine, and the processor time in s
-that the factorization took on the reference machine."""
 
 COARSER = {"cross_section": "enlarge mesh.block_size_m",
            "meridian": "enlarge mesh.meridian_size_m",
@@ -268,7 +219,7 @@ class Estimate:
             hints.append("take fewer mesh.cells_per_side" if self.route == "moments"
                          else "take fewer readings")
         else:
-            hints.append(COARSER[MESHES[largest.route]])
+            hints.append(COARSER[str(Route(largest.route).mesh)])
             if largest.route == "edge_elements" and self.route == largest.route:
                 hints.append("or take another solver.route or a lower solver.edge_order")
         return (f"This needs about {self.memory_GiB:.2g} GiB of memory, and the machine has "
@@ -326,10 +277,9 @@ def check_domain(magnet: Magnet, points: Floats) -> None:
     """Refuse points (n, 3) outside the mesh that the solver will make, as it does itself."""
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return
-    route = choose_route(magnet, points)
-    if route == "moments":  # the blocks need no boundary
+    kind = choose_route(magnet, points).mesh
+    if kind is None:  # blocks without a mesh need no boundary
         return
-    kind = MESHES[route]
     half_length = boundary_half_length(magnet, kind) if magnet.dimension == 3 else np.inf
     check_inside(magnet.name, boundary_radius(magnet, kind), half_length, points)
 
@@ -364,26 +314,35 @@ def problems_of(magnet: Magnet, session: Session) -> list[Problem]:
 
 def _problem(magnet: Magnet, purpose: str, size: RunSize, processes: int) -> Problem:
     """Return the cost of some equal runs, by the `CostLaw` of their route."""
-    formulation = formulation_of(magnet, size.route)
+    route = Route(size.route)
+    formulation = route.formulation(magnet)
     law = {"cross_section": PLANE, "azimuthal_modes": PLANE, "edge_elements": EDGES[
         magnet.study.solver.edge_order]}.get(size.route, FACTORIZED)
+    iron_iterations = 5.0  # factor by which thin iron increases the number of iterations
     if size.route == "scalar_potential" and size.unknowns > formulation.factorized:
         law = ITERATED
         if magnet.iron:
-            law = replace(law, solve_s=IRON_ITERATIONS * law.solve_s)
+            law = replace(law, solve_s=iron_iterations * law.solve_s)
     matrices, solves = size.matrices, size.solves
+    # for Newton's method: additional bytes per unknown for the Jacobian, matrices per step, and the
+    # assumed number of steps (3 to 9 were seen). The first two were measured with 11 000 and 86 000
+    # unknowns.
+    newton_bytes, newton_matrices, newton_steps = 4400, 2, 6
     if size.newton:
         if not solves and size.unknowns > formulation.factorized_for_newton:
             law = STEPPED
-        law = replace(law, bytes_each=law.bytes_each + NEWTON_BYTES)
-        matrices, solves = NEWTON_MATRICES * NEWTON_STEPS, solves + NEWTON_STEPS
+        law = replace(law, bytes_each=law.bytes_each + newton_bytes)
+        matrices, solves = newton_matrices * newton_steps, solves + newton_steps
     each = law.bytes_each + law.fill * size.unknowns ** (1 / 3)
-    seconds = (GETDP_SECONDS + matrices * law.matrix_s * size.unknowns**law.power
+    # memory and time of a GetDP process that do not depend on its number of unknowns
+    getdp_bytes, getdp_seconds = 50e6, 0.1
+    seconds = (getdp_seconds + matrices * law.matrix_s * size.unknowns**law.power
                + solves * law.solve_s * size.unknowns)
-    disk = size.elements * MESH_BYTES[MESHES[size.route]] + size.unknowns * (
-        UNKNOWN_BYTES.get(size.route, OTHER_UNKNOWN_BYTES) + 8 * solves)
+    other_unknown_bytes = 30  # bytes per unknown of GetDP's list of unknowns for all other routes
+    disk = size.elements * MESH_BYTES[str(route.mesh)] + size.unknowns * (
+        UNKNOWN_BYTES.get(size.route, other_unknown_bytes) + 8 * solves)
     return Problem(purpose, size.route, size.elements, size.unknowns, processes, matrices, solves,
-                   (GETDP_BYTES + size.unknowns * each) / GIB, seconds, disk / GIB)
+                   (getdp_bytes + size.unknowns * each) / GIB, seconds, disk / GIB)
 
 
 def _estimate(
@@ -401,19 +360,34 @@ def _estimate(
     moments_bytes, moments_seconds = _cost_of_moments(variants or (magnet,), points, matrix)
     fields = parameters * len(points) * 3 if problems or moments_seconds else 0
     information = parameters * min(readings, parameters)
+    # memory in bytes per point for the exact field of a block: its matrix in the frames of the
+    # block and of the magnet, and the product between them
+    point_bytes = 340
     # the fields of the blocks are freed before the posterior is computed
-    building = 8 * fields + POINT_BYTES * exact + moments_bytes
-    updating = 8 * (PART_COPIES * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
-                    + INFORMATION_COPIES * information)
+    building = 8 * fields + point_bytes * exact + moments_bytes
+    # numbers of copies in memory of the rows of H that are processed together, and of the square
+    # root of the information while its singular values are computed. They were measured with 48 to
+    # 30 720 parameters and 1 008 to 28 080 readings.
+    part_copies, information_copies = 4, 3
+    updating = 8 * (part_copies * min(matrix, NUMBERS_AT_ONCE, READINGS_AT_ONCE * parameters)
+                    + information_copies * information)
+    # memory in bytes and time in s per reading for labels, tables and figures, measured with a
+    # million readings
+    reading_bytes, reading_seconds = 1200, 6e-5
     own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(building, updating)
-           + (READING_BYTES * readings if parameters else 0)
+           + (reading_bytes * readings if parameters else 0)
            + (8 * matrix if 8 * matrix <= LOADED_BYTES else 8 * NUMBERS_AT_ONCE)) / GIB
     side_by_side = 0.0
-    seconds = OWN_SECONDS + ELEMENT_SECONDS * sum(
+    # time in s of this program: to start and to write the report; per element of every GetDP
+    # process; per block and point of the exact field; and per entry of H, times the number of
+    # parameters or readings, whichever is smaller. Two threads took 2e-7 to 5e-7 s per block and
+    # point, in a plane and for sectors in space.
+    own_seconds, element_seconds, pair_seconds, matrix_seconds = 5.0, 1.5e-5, 5e-7, 1e-9
+    seconds = own_seconds + element_seconds * sum(
         problem.elements * problem.processes for problem in problems)
-    seconds += moments_seconds + PAIR_SECONDS * len(blocks) * exact
-    seconds += MATRIX_SECONDS * matrix * min(readings, parameters)
-    seconds += READING_SECONDS * readings if parameters else 0
+    seconds += moments_seconds + pair_seconds * len(blocks) * exact
+    seconds += matrix_seconds * matrix * min(readings, parameters)
+    seconds += reading_seconds * readings if parameters else 0
     for purpose in dict.fromkeys(problem.what for problem in problems):
         runs = [run for problem in problems if problem.what == purpose
                 for run in [problem] * problem.processes]
@@ -442,17 +416,29 @@ def _cost_of_moments(
     from halbach_fe.solver.moments.interaction import Interaction  # import numba
 
     there = [magnet for magnet in magnets if not magnet.is_vacuum
-             and choose_route(magnet, points) == "moments"]
+             and choose_route(magnet, points) is Route.MOMENTS]
     found = [Interaction(cells_of(present_blocks(magnet.blocks),
                                   magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
              for magnet in there]
     cells = [len(each.cells) for each in found]
     iron = [magnet for magnet in there if magnet.iron]
-    per_cell = COLUMN_CELL_BYTES if entries else CELL_BYTES
-    memory = MODES_BYTES * bool(iron) + max(
-        (per_cell * len(each.cells) + NEAR_BYTES * each.near_pairs for each in found), default=0)
-    return memory, (CELL_SECONDS * sum(cells) + COLUMN_SECONDS * entries * bool(there)
-                    + MODES_SECONDS * len(iron))
+    # memory in bytes of the method of moments per cell, per cell if H is computed too, and per pair
+    # of near cells. Slender and flat cells have many times the pairs of cubes. Without H the sum is
+    # within 20 % of that of lattices of 108 to 500 hexagonal prisms of 20 and 60 mm, aligned and
+    # turned at random, and of 512 and 1 728 cubes; with H it is that of the cubes above.
+    cell_bytes, column_cell_bytes, near_bytes = 8_000, 43_000, 300
+    per_cell = column_cell_bytes if entries else cell_bytes
+    # memory in bytes and time in s of iron by azimuthal modes with separate blocks in turn.
+    # Measured with 990 cubes in a tube that is 4 mm from them; iron that is farther away takes
+    # less.
+    modes_bytes, modes_seconds = 2.0 * GIB, 60.0
+    memory = modes_bytes * bool(iron) + max(
+        (per_cell * len(each.cells) + near_bytes * each.near_pairs for each in found), default=0)
+    # time in s of the method of moments per cell, and per entry of H. Measured with 990 cubes and
+    # 396 readings, and with 4 032 cubes and 432 readings.
+    cell_seconds, column_seconds = 1.2e-3, 1.6e-5
+    return memory, (cell_seconds * sum(cells) + column_seconds * entries * bool(there)
+                    + modes_seconds * len(iron))
 
 
 def _route(magnet: Magnet, points: Floats, problems: Sequence[Problem]) -> str:
@@ -467,8 +453,11 @@ def machine_speed() -> float:
 
     It is measured by the shortest time of three factorizations of a sparse matrix of fixed size.
     """
-    line = sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(GRID, GRID))
-    identity = sparse.eye_array(GRID)
+    # side of the grid whose factorization measures the speed of a machine, and the processor time
+    # in s that the factorization took on the reference machine
+    side, usual_seconds = 150, 0.095
+    line = sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(side, side))
+    identity = sparse.eye_array(side)
     matrix = sparse.csc_array(sparse.kron(line, identity) + sparse.kron(identity, line))
 
     def factorize() -> float:
@@ -476,7 +465,7 @@ def machine_speed() -> float:
         splu(matrix)
         return time.perf_counter() - started
 
-    return GRID_SECONDS / min(factorize() for _ in range(3))
+    return usual_seconds / min(factorize() for _ in range(3))
 
 
 def available_memory() -> float | None:

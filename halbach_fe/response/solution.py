@@ -20,7 +20,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _observed(magnet: Magnet) -> tuple[Observation, Floats]:
 
 
 @alone
-def solve(magnet: Magnet, session: Session) -> Solution:
+def solve(magnet: Magnet, session: Session = NOT_KEPT) -> Solution:
     """Solve for the field of the nominal magnet at the study's positions.
 
     Iron with an H(B) curve is solved by Newton's method. The run folders of GetDP are kept in the
@@ -122,7 +122,7 @@ def solve(magnet: Magnet, session: Session) -> Solution:
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
         Its folder receives the run folders.
 
     Returns

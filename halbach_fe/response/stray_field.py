@@ -24,7 +24,7 @@ from halbach_fe.geometry.blocks import vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
-from halbach_fe.solver.session import Session, alone
+from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 
 LIMIT_T = 5e-4
@@ -34,26 +34,8 @@ NEAREST = 0.01
 """Distance from the cylinder around the magnet at which the search begins, relative to the radius
 of the magnet. Nearer to the edges of blocks the field is strong in any magnet."""
 
-FEWEST, MOST = 16, 64
-"""Limits of the number of places about the axis and along the other direction at which the largest
-|B| of a surface is looked for. They lie as far apart as the surface is from the magnet: finer
-patterns of the field have decayed there."""
-
 DISTANCES: Floats = np.array([0.125, 0.25, 0.5, 1.0, 2.0])
 """Distances from the magnet with which the search begins, relative to its radius."""
-
-BETWEEN = 5
-"""Number of distances from one of these to the next at which it is then looked for."""
-
-ZOOM = 11
-"""Number of places along both directions, within the steps around the largest |B| before, among
-which it is looked for in the end."""
-
-AROUND, OUTWARD = 96, 20
-"""Numbers of points of a plane's picture around the magnet, and outwards."""
-
-WIDER = 1.5
-"""Distance from the magnet up to which pictures go, relative to that of the line."""
 
 Surface = Callable[[float, Floats], Floats]
 """Takes a distance in m from the cylinder around the magnet, and places (n, 2): angles about the
@@ -136,7 +118,7 @@ class StrayField:
 
 @alone
 def stray_field(
-    magnet: Magnet, session: Session, magnetizations: Gaussian | None = None,
+    magnet: Magnet, session: Session = NOT_KEPT, magnetizations: Gaussian | None = None,
     limit_T: float = LIMIT_T,
 ) -> StrayField | None:
     """Tell how far outside of a magnet |B| reaches a limit, by default 0.5 mT.
@@ -144,7 +126,7 @@ def stray_field(
     Parameters
     ----------
     magnet : Magnet
-    session : Session
+    session : Session, optional
     magnetizations : Gaussian, optional
         Distribution of the magnetizations in A/m, for example the posterior of
         `halbach_fe.infer`; by default the nominal ones.
@@ -187,11 +169,12 @@ def stray_field(
         return np.column_stack([out * np.cos(angle), out * np.sin(angle),
                                 np.where(along < 0, -1, 1) * (half + distance)])
 
+    wider = 1.5  # distance from the magnet up to which pictures go, relative to that of the line
     try:
         found = [_farthest(field, surface, near, radius * DISTANCES, limit_T)
                  for surface in (beside, beyond)]
         reached = max((distance for distance, _ in found), default=near)
-        planes = _planes(field, radius, half, near, max(WIDER * reached, radius / 2))
+        planes = _planes(field, radius, half, near, max(wider * reached, radius / 2))
     except PointsOutsideError:
         return StrayField(limit_T, radius, half, unknown=(
             "The mesh around the iron ends before the field has fallen to that."))
@@ -229,18 +212,22 @@ def _farthest(
     while largest[-1][0] > limit_T:
         distances = distances[-1] * np.array([1.0, 2.0, 4.0])
         largest = _largest(field, surface, distances)
+    between = 5  # number of distances from one of these to the next at which it is then looked for
     if largest[0][0] <= limit_T:
-        distances = np.geomspace(near, distances[0], BETWEEN)
+        distances = np.geomspace(near, distances[0], between)
         largest = _largest(field, surface, distances)
     if largest[0][0] <= limit_T:
         return near, None
     last = max(number for number, (size, _, _) in enumerate(largest) if size > limit_T)
-    distances = np.geomspace(distances[last], distances[last + 1], BETWEEN)
+    distances = np.geomspace(distances[last], distances[last + 1], between)
     largest = _largest(field, surface, distances)
     last = max((number for number, (size, _, _) in enumerate(largest) if size > limit_T), default=0)
     middle = distances[last]
     _, place, step = largest[last]
-    around = np.linspace(-1, 1, ZOOM)
+    # number of places along both directions, within the steps around the largest |B| before, among
+    # which it is looked for in the end
+    zoom = 11
+    around = np.linspace(-1, 1, zoom)
     for _ in range(2):
         places = place + step * np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
         places[:, 1] = np.clip(places[:, 1], -1, 1)
@@ -259,10 +246,14 @@ def _largest(
 ) -> list[tuple[float, Floats, Floats]]:
     """Return the largest |B| in T at each distance, its place, and the steps of places, (2,)."""
     found, every = [], []
+    # limits of the number of places about the axis and along the other direction at which the
+    # largest |B| of a surface is looked for. They lie as far apart as the surface is from the
+    # magnet: finer patterns of the field have decayed there.
+    fewest, most = 16, 64
     for distance in distances:
         (x, y, z), = surface(distance, np.array([[0.0, 1.0]]))
         out = float(np.hypot(x, y))
-        angles, rows = (int(np.clip(length / distance, FEWEST, MOST))
+        angles, rows = (int(np.clip(length / distance, fewest, most))
                         for length in (2 * np.pi * out, 2 * max(abs(z), out)))
         places = np.stack(np.meshgrid(2 * np.pi * np.arange(angles) / angles,
                                       np.linspace(-1, 1, rows)), axis=-1).reshape(-1, 2)
@@ -297,11 +288,13 @@ def _planes(
     field: Field, radius: float, half: float, near: float, far: float
 ) -> tuple[StrayPlane, ...]:
     """Return |B| in three planes, from one distance in m from the cylinder around to another."""
-    distances = np.geomspace(near, far, OUTWARD)[:, None]
-    turn = np.linspace(0, 2 * np.pi, AROUND + 1)
+    # numbers of points of a plane's picture around the magnet, and outwards
+    n_around, n_outward = 96, 20
+    distances = np.geomspace(near, far, n_outward)[:, None]
+    turn = np.linspace(0, 2 * np.pi, n_around + 1)
     ring = (np.outer(radius + distances, np.cos(turn)), np.outer(radius + distances, np.sin(turn)))
     # around a rectangle: equal steps along its four sides, which grow with the distance
-    side = np.linspace(-1, 1, AROUND // 4 + 1)[:-1]
+    side = np.linspace(-1, 1, n_around // 4 + 1)[:-1]
     one = np.ones_like(side)
     along = np.concatenate([side, one, -side, -one, side[:1]])
     up = np.concatenate([-one, side, one, -side, -one[:1]])

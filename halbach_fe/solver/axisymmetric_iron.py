@@ -26,6 +26,9 @@ modes are not coupled.
 Many modes are needed where iron saturates close to blocks. The field of the blocks' edges, modes of
 high order, saturates the iron locally, and thus weakens its reaction in the modes of low order that
 reach the bore.
+
+Potentials in the iron are arrays (modes, iron, c): the complex coefficients of c potentials, for
+the modes that `Problem.numbers` lists.
 """
 
 from __future__ import annotations
@@ -36,21 +39,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.fft
 import scipy.sparse as sparse
+import scipy.sparse.linalg as sparse_linalg
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import NotConvergedError
 from halbach_fe.geometry.symmetry import unique_points
+from halbach_fe.solver.azimuthal_modes import to_cartesian
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.interpolation import locate
-from halbach_fe.solver.iron_grid import IronRectangle, Resolution, check_bodies
-from halbach_fe.solver.iron_modes import Complexes, Exterior, IronModes, assemble_modes, points_at
-from halbach_fe.solver.iron_newton import (
-    Problem,
-    Tangent,
-    coupled_modes,
-    newton,
-    to_angles,
-    to_modes,
+from halbach_fe.solver.iron_modes import (
+    Complexes,
+    Exterior,
+    IronModes,
+    IronRectangle,
+    Resolution,
+    assemble_modes,
+    check_bodies,
+    points_at,
 )
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.session import Session
@@ -68,38 +75,9 @@ with modes up to 37 it is 5 % off.
 FEWEST_MODES, MOST_MODES = 12, 128
 """Limits of the highest mode that is chosen by `SOURCE_MODES`."""
 
-NO_MODE = 1e-9
-"""Modes of the source that are smaller than this, relative to the largest one, are rounding
-errors."""
-
 TANGENT_MODES = 24
 """Highest mode of `IronReaction.tangent`. Modes of higher order decay before they reach the bore.
 """
-
-TANGENT_RESIDUAL = 1e-7
-"""Conjugate gradients stop at this relative residual in `IronReaction.tangent`."""
-
-ANGLES_PER_MODE = 3
-"""Angles of the non-linear law per mode: products of two modes do not alias into others."""
-
-ALIASING = 1e-2
-"""Angles of the source are doubled until the amplitudes of the highest quarter of the modes are
-below this value, relative to the largest. Modes fall about geometrically, so that those which would
-be mistaken for low modes are then below the square of this value."""
-
-FEWEST_ANGLES, MOST_ANGLES = 64, 512
-"""Limits of the number of angles at which a source is evaluated. Where blocks touch the iron, the
-modes of their field fall slowly, but these local fields do not reach the bore."""
-
-AXIS_RADIUS = 1e-6
-"""Points nearer to the axis than this fraction of the grid's first line are moved there, since
-psi/r is a limit on the axis."""
-
-NO_AMPLITUDE = 1e-7
-"""Modes are left out at points in a bore where (r / inner radius)^m is smaller."""
-
-COLUMNS_AT_ONCE = 8
-"""Number of sources that `IronReaction.tangent` solves for at a time, which limits the memory."""
 
 
 @dataclass(frozen=True)
@@ -187,12 +165,17 @@ class IronReaction:
         tangent = Tangent.of(problem, differential)
         highest = _modes_at(problem, points)
         result = np.empty((len(sources), len(points), 3))
-        for first in range(0, len(sources), COLUMNS_AT_ONCE):
-            part = sources[first:first + COLUMNS_AT_ONCE]
+        # conjugate gradients stop at this relative residual in `IronReaction.tangent`
+        tolerance = 1e-7
+        # number of sources that `IronReaction.tangent` solves for at a time, which limits the
+        # memory
+        step = 8
+        for first in range(0, len(sources), step):
+            part = sources[first:first + step]
             own = np.concatenate([_source_potential(problem, _sampled(state.modes, source))
                                   for source in part], axis=2)
-            total = tangent.solve(problem.stiffness(own), TANGENT_RESIDUAL)
-            result[first:first + COLUMNS_AT_ONCE] = _evaluate(self.name, state.modes, {
+            total = tangent.solve(problem.stiffness(own), tolerance)
+            result[first:first + step] = _evaluate(self.name, state.modes, {
                 number: _continue(state.modes, spaces[number], (total - own)[number])
                 for number in numbers[numbers <= highest].tolist()}, points)
         return result
@@ -250,11 +233,13 @@ def solve_iron(
 
 def _problem(modes: IronModes, bodies: tuple[IronRectangle, ...], numbers: Ints) -> Problem:
     """Return the discrete problem for some modes."""
+    # angles of the non-linear law per mode: products of two modes do not alias into others
+    angles_per_mode = 3
     return Problem(
         modes, bodies, numbers,
         tuple(modes.exterior(number).stiffness for number in numbers.tolist()),
         tuple(modes.gradient(number) for number in numbers.tolist()),
-        _fast(ANGLES_PER_MODE * int(numbers[-1]) + 8))
+        _fast(angles_per_mode * int(numbers[-1]) + 8))
 
 
 def _fast(count: int) -> int:
@@ -285,11 +270,18 @@ def _sampled(modes: IronModes, source: Source | Floats) -> Floats:
     """Return a source (angles, 3, k) in T at the Gauss points, at enough angles for its modes."""
     if not callable(source):
         return _cylindrical(source, _angles(len(source) // len(modes.gauss.r)))
-    angles = _angles(FEWEST_ANGLES)
+    # limits of the number of angles at which a source is evaluated. Where blocks touch the iron,
+    # the modes of their field fall slowly, but these local fields do not reach the bore.
+    fewest_angles, most_angles = 64, 512
+    angles = _angles(fewest_angles)
     values = _cylindrical(source(_nodes(modes, angles)), angles)
-    while len(values) < MOST_ANGLES:
+    # angles of the source are doubled until the amplitudes of the highest quarter of the modes are
+    # below this value, relative to the largest. Modes fall about geometrically, so that those which
+    # would be mistaken for low modes are then below the square of this value.
+    aliasing = 1e-2
+    while len(values) < most_angles:
         size = np.abs(scipy.fft.rfft(values, axis=0)).max(axis=(1, 2))
-        if size[3 * len(size) // 4:].max() <= ALIASING * size.max():
+        if size[3 * len(size) // 4:].max() <= aliasing * size.max():
             break
         between = _angles(len(values), 0.5)
         more = _cylindrical(source(_nodes(modes, between)), between)
@@ -300,7 +292,10 @@ def _sampled(modes: IronModes, source: Source | Floats) -> Floats:
 def _modes_of(values: Floats) -> tuple[list[int], int]:
     """Return the modes that a source (angles, 3, k) has, and the highest that matters."""
     size = np.abs(to_modes(values, slice(None))[:(len(values) + 1) // 2]).max(axis=(1, 2))
-    present = np.flatnonzero(size > NO_MODE * size.max())
+    # modes of the source that are smaller than this, relative to the largest one, are rounding
+    # errors
+    rounding = 1e-9
+    present = np.flatnonzero(size > rounding * size.max())
     highest = int(np.flatnonzero(size >= SOURCE_MODES * size.max())[-1]) if size.any() else 0
     return present.tolist(), int(np.clip(highest, FEWEST_MODES, MOST_MODES))
 
@@ -347,7 +342,9 @@ def highest_mode_at(bodies: Sequence[IronRectangle], points: Floats) -> int | No
     radius = float(np.hypot(points[:, 0], points[:, 1]).max(initial=0.0))
     if radius >= 0.999 * inner:
         return None
-    return int(np.ceil(np.log(NO_AMPLITUDE) / np.log(max(radius / inner, 1e-3)))) + 1
+    # modes are left out at points in a bore where (r / inner radius)^m is smaller
+    no_amplitude = 1e-7
+    return int(np.ceil(np.log(no_amplitude) / np.log(max(radius / inner, 1e-3)))) + 1
 
 
 def _modes_at(problem: Problem, points: Floats) -> int:
@@ -363,7 +360,10 @@ def _evaluate(
     mesh = modes.mesh
     check_inside(name, mesh.radius, mesh.half_length, points)
     r, phi = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
-    least = AXIS_RADIUS * mesh.points[mesh.points[:, 0] > 0, 0].min()
+    # points nearer to the axis than this fraction of the grid's first line are moved there, since
+    # psi/r is a limit on the axis
+    axis_radius = 1e-6
+    least = axis_radius * mesh.points[mesh.points[:, 0] > 0, 0].min()
     places, where = unique_points(np.column_stack([np.maximum(r, least), points[:, 2], 0 * r]))
     at = points_at(mesh, locate(mesh, places), modes.unknowns)
     columns = max((part.shape[1] for part in potentials.values()), default=1)
@@ -372,7 +372,250 @@ def _evaluate(
         wave = np.exp(1j * mode * phi)[:, None]
         for component, operator in enumerate((at.along_r, 1j * mode * at.over_r, at.along_z)):
             cylindrical[component] -= ((operator @ part)[where] * wave).real
-    radial, tangential, axial = cylindrical.transpose(0, 2, 1)
-    cosine, sine = np.cos(phi), np.sin(phi)
-    return np.stack([radial * cosine - tangential * sine, radial * sine + tangential * cosine,
-                     axial], axis=-1)
+    return to_cartesian(cylindrical.transpose(2, 1, 0), phi)
+
+
+def to_angles(by_mode: Complexes, numbers: Ints, angles: int) -> Floats:
+    """Return values (angles, ...) of sums of modes Re c_m exp(i m theta).
+
+    Parameters
+    ----------
+    by_mode : ndarray, shape (modes, ...)
+    numbers : ndarray of int, shape (modes,)
+        The modes m, all below half of ``angles``.
+    angles : int
+    """
+    spectrum = np.zeros((angles // 2 + 1, *by_mode.shape[1:]), complex)
+    spectrum[numbers] = by_mode * (angles / 2)
+    spectrum[0] *= 2
+    return np.asarray(scipy.fft.irfft(spectrum, angles, axis=0))
+
+
+def to_modes(values: Floats, numbers: Ints | slice) -> Complexes:
+    """Return coefficients (modes, ...) of values (angles, ...); reverses `to_angles`."""
+    spectrum = scipy.fft.rfft(values, axis=0) * (2 / len(values))
+    spectrum[0] /= 2
+    return np.asarray(spectrum[numbers])
+
+
+def coupled_modes(present: Sequence[int], highest: int) -> Ints:
+    """Return the modes up to ``highest`` that iron makes from those that a source has.
+
+    The permeability depends on |H|^2, whose modes are differences and sums of those of H. All modes
+    of H are therefore those present, plus or minus multiples of one number.
+    """
+    if not present:
+        return np.array([0])
+    first = present[0]
+    step = int(np.gcd.reduce([2 * first, *(abs(m - first) for m in present),
+                              *(m + first for m in present)]))
+    if step == 0:  # mode 0 alone
+        return np.array([0])
+    m = np.arange(highest + 1)
+    return np.flatnonzero(((m - first) % step == 0) | ((m + first) % step == 0))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The discrete problem.
+
+    Attributes
+    ----------
+    modes : IronModes
+    bodies : tuple of IronRectangle
+    numbers : ndarray of int
+        The azimuthal modes, ascending.
+    stiffnesses : tuple of sparse array, shape (iron, iron)
+        By mode: the stiffness of vacuum, condensed to the iron.
+    gradients : tuple of sparse array, shape (3 k, iron)
+        By mode: the operators to d/dr, m/r and d/dz at the k Gauss points of the iron.
+    angles : int
+        Angles at which the law is evaluated.
+    """
+
+    modes: IronModes
+    bodies: tuple[IronRectangle, ...]
+    numbers: Ints
+    stiffnesses: tuple[sparse.csr_array, ...]
+    gradients: tuple[sparse.csr_array, ...]
+    angles: int
+
+    def field(self, potential: Complexes, angles: int | None = None) -> Floats:
+        """Return grad psi (angles, 3, k, c) in cylindrical components at the Gauss points."""
+        columns = potential.shape[2]
+        by_mode = np.stack([(operator @ part).reshape(3, -1, columns) for operator, part in zip(
+            self.gradients, potential, strict=True)])
+        by_mode[:, 1] *= 1j
+        return to_angles(by_mode, self.numbers, angles or self.angles)
+
+    def integrate(self, vectors: Floats) -> Complexes:
+        """Return the integrals (modes, iron, c) of vectors (angles, 3, k, c) times grad v."""
+        by_mode = to_modes(vectors, self.numbers)
+        by_mode[:, 1] *= -1j
+        by_mode *= self.modes.gauss.weights[:, None]
+        return np.stack([operator.T @ part.reshape(-1, part.shape[2]) for operator, part in zip(
+            self.gradients, by_mode, strict=True)])
+
+    def stiffness(self, potential: Complexes) -> Complexes:
+        """Return S psi (modes, iron, c)."""
+        return np.stack([matrix @ part for matrix, part in zip(
+            self.stiffnesses, potential, strict=True)])
+
+    def dot(self, a: Complexes, b: Complexes) -> Floats:
+        """Return the scalar products (c,) of potentials and residuals (modes, iron, c)."""
+        shares = np.where(self.numbers == 0, 1.0, 0.5)  # means of cos^2(m theta)
+        return np.asarray(np.einsum("m,mic,mic->c", shares, a.conj(), b).real)
+
+    def law(self, field: Floats) -> tuple[Floats, Floats]:
+        """Return mu_r - 1 and 2 d mu_r / d(|g|^2) (angles, k) for grad psi (angles, 3, k)."""
+        square = np.einsum("aik,aik->ak", field, field)
+        excess, slope = np.empty_like(square), np.zeros_like(square)
+        for number, body in enumerate(self.bodies):
+            mine: NDArray[np.bool_] = self.modes.body == number
+            if isinstance(body.law, float | int):
+                excess[:, mine] = body.law - 1
+            else:
+                curve = body.law.permeability
+                excess[:, mine] = curve.coefficient(square[:, mine]) - 1
+                slope[:, mine] = 2 * curve.slope(square[:, mine])
+        return excess, slope
+
+    def residual(self, total: Complexes, source: Complexes) -> Complexes:
+        """Return the residual (modes, iron, 1) of the total potential."""
+        field = self.field(total)
+        excess, _ = self.law(field[..., 0])
+        return self.stiffness(total - source) + self.integrate(excess[:, None, :, None] * field)
+
+    def differential(self, field: Floats) -> Floats:
+        """Return d mu_0 M / d mu_0 H (angles, 3, 3, k) for grad psi (angles, 3, k)."""
+        excess, slope = self.law(field)
+        return np.asarray(excess[:, None, None] * np.eye(3)[:, :, None]
+                          + (slope[:, None] * field)[:, :, None] * field[:, None])
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """The derivative of the residual at a state, and its preconditioner.
+
+    Attributes
+    ----------
+    problem : Problem
+    differential : ndarray, shape (angles, 3, 3, k)
+        d mu_0 M / d mu_0 H.
+    factors : tuple of SuperLU
+        By mode: the derivative with the mean of ``differential`` over the angle.
+    """
+
+    problem: Problem
+    differential: Floats
+    factors: tuple[sparse_linalg.SuperLU, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, differential: Floats) -> Tangent:
+        """Return the tangent with a given differential susceptibility."""
+        mean = differential.mean(axis=0) * problem.modes.gauss.weights
+        # the radial and axial components are in phase; the azimuthal one is not, so that its
+        # product with them is left out
+        weights = sparse.block_array([[
+            sparse.diags_array(mean[i, j]) if (i == 1) == (j == 1) else None
+            for j in range(3)] for i in range(3)], format="csr")
+        return cls(problem, differential, tuple(
+            factorize(matrix + operator.T @ (weights @ operator)) for matrix, operator in zip(
+                problem.stiffnesses, problem.gradients, strict=True)))
+
+    def apply(self, step: Complexes) -> Complexes:
+        """Return the derivative of the residual along steps (modes, iron, c)."""
+        field = self.problem.field(step, len(self.differential))
+        change = np.stack([sum(self.differential[:, i, j, :, None] * field[:, j]
+                               for j in range(3)) for i in range(3)], axis=1)
+        return self.problem.stiffness(step) + self.problem.integrate(change)
+
+    def precondition(self, residual: Complexes) -> Complexes:
+        """Return approximate solutions (modes, iron, c)."""
+        result = np.empty_like(residual)
+        for factor, part, solution in zip(self.factors, residual, result, strict=True):
+            for column in range(part.shape[1]):  # SuperLU is slow with many columns at once
+                solution[:, column] = (factor.solve(part[:, column].real.copy())
+                                       + 1j * factor.solve(part[:, column].imag.copy()))
+        return result
+
+    def solve(self, right: Complexes, tolerance: float) -> Complexes:
+        """Solve for steps (modes, iron, c) by conjugate gradients.
+
+        ``tolerance`` is relative, in the norm of the preconditioner.
+
+        Raises
+        ------
+        NotConvergedError
+            If the residual does not fall to the tolerance.
+        """
+        dot = self.problem.dot
+        solution, residual = np.zeros_like(right), right.copy()
+        direction = better = self.precondition(residual)
+        size = first = dot(residual, better)
+        most_steps = 400
+        for _ in range(most_steps):
+            if (size <= tolerance**2 * first).all():
+                return solution
+            applied = self.apply(direction)
+            curvature = dot(direction, applied)
+            length = np.divide(size, curvature, out=np.zeros_like(size), where=curvature > 0)
+            solution = solution + length * direction
+            residual = residual - length * applied
+            better = self.precondition(residual)
+            before, size = size, np.maximum(dot(residual, better), 0.0)
+            direction = better + np.divide(size, before, out=np.zeros_like(size),
+                                           where=before > 0) * direction
+        worst = float(np.sqrt(np.max(size / np.maximum(first, 1e-300))))
+        raise NotConvergedError(
+            f"Conjugate gradients on the iron left a residual of {worst:.1e} after {most_steps} "
+            "steps. Smooth the H(B) curve.", (worst,))
+
+
+def newton(
+    problem: Problem, source: Complexes, start: Complexes | None = None
+) -> tuple[Complexes, tuple[float, ...]]:
+    """Solve for the total potential (modes, iron, 1) in T m by Newton's method.
+
+    A step is halved until the energy no longer rises steeply at its end; the energy is convex.
+
+    Returns
+    -------
+    total : ndarray
+    residuals : tuple of float
+        Relative residual at the start and after every step.
+
+    Raises
+    ------
+    NotConvergedError
+    """
+    total = np.zeros_like(source) if start is None else start
+    right = problem.stiffness(source)
+    residual = problem.residual(total, source)
+    norms: list[float] = []
+    # Newton's method stops at this residual relative to the sources, in the norm of the
+    # preconditioner. The reaction has then converged to some 1e-8.
+    tolerance = 1e-8
+    most_steps = 60
+    # step length, relative to the full Newton step, at which the line search gives up
+    smallest_step = 2.0**-20
+    while True:
+        tangent = Tangent.of(problem, problem.differential(problem.field(total)[..., 0]))
+        scale, size = (float(problem.dot(vector, tangent.precondition(vector))[0])
+                       for vector in (right, residual))
+        norms.append(float(np.sqrt(max(size, 0.0) / scale)) if scale > 0 else 0.0)
+        if norms[-1] <= tolerance:
+            return total, tuple(norms)
+        if len(norms) > most_steps or not np.isfinite(norms[-1]):
+            raise NotConvergedError(
+                f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
+                f"{len(norms) - 1} steps. Smooth the H(B) curve.", tuple(norms))
+        step = tangent.solve(-residual, min(0.1, max(norms[-1], 1e-4)))
+        slope = abs(float(problem.dot(residual, step)[0]))
+        length = 1.0
+        while True:
+            trial = problem.residual(total + length * step, source)
+            if float(problem.dot(trial, step)[0]) <= 0.5 * slope or length < smallest_step:
+                break
+            length /= 2
+        total, residual = total + length * step, trial

@@ -39,12 +39,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
 from halbach_fe.solver.getdp import DIRECT_SOLVER_OF_PLANE, Job
-from halbach_fe.solver.grid_interpolation import grid_operators
 from halbach_fe.solver.interpolation import (
     Located,
     apply_operator,
     compare_printed,
     coordinates,
+    grid_operators,
     locate,
     nodal_operators,
     probes_of,
@@ -58,8 +58,7 @@ from halbach_fe.solver.mesh import (
     count_mesh,
     verify_mesh,
 )
-from halbach_fe.solver.runs import Task, run_tasks
-from halbach_fe.solver.session import RunSize, Session
+from halbach_fe.solver.session import RunSize, Session, Task, run_tasks
 
 PROBLEM = "azimuthal_modes.pro"
 OUTPUT = "gradients.txt"
@@ -79,9 +78,6 @@ SHARED_UNKNOWNS = 100_000
 """Largest number of unknowns of the nominal array's modes that share a run of GetDP. It takes 0.2 s
 to start, as long as a mode of 10 000 unknowns. Large modes are runs of their own, side by side."""
 
-MAX_MODES = 64
-"""Highest mode up to which this route applies; points close to the blocks need more modes."""
-
 AXIS_RADIUS = 1e-8
 """Points nearer to the axis than this fraction of the inner radius count as points on the axis,
 where psi/r is a limit."""
@@ -89,10 +85,6 @@ where psi/r is a limit."""
 NO_WAVES = [0.0, 0.0]
 """Nominal remanence of a ring in runs for single blocks, which do not use it: as few values as
 GetDP's lists can have."""
-
-NO_REMANENCE = 1e-12
-"""Tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
-remanence is smaller, which are rounding errors and are not solved for."""
 
 
 def is_axisymmetric(magnet: Magnet) -> bool:
@@ -115,10 +107,12 @@ def is_axisymmetric(magnet: Magnet) -> bool:
 
 
 def few_modes_suffice(magnet: Magnet, points: Floats) -> NDArray[np.bool_]:
-    """Tell at which points (n, 3) in m at most `MAX_MODES` modes matter, if the route applies."""
+    """Tell at which points (n, 3) in m at most 64 modes matter, if the route applies."""
     if not is_axisymmetric(magnet):
         return np.zeros(len(points), bool)
-    return np.asarray(mode_decay(magnet, points) <= MODE_TOLERANCE ** (1 / MAX_MODES))
+    # highest mode up to which this route applies; points close to the blocks need more modes
+    most_modes = 64
+    return np.asarray(mode_decay(magnet, points) <= MODE_TOLERANCE ** (1 / most_modes))
 
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
@@ -310,7 +304,10 @@ def runs_of(
         nominal array has few.
     """
     size = np.abs(weights).max(axis=(1, 2, 3))
-    own = np.flatnonzero(size > NO_REMANENCE * size.max()).tolist()
+    # tolerance relative to the largest mode: the symmetry of the nominal array excludes modes whose
+    # remanence is smaller, which are rounding errors and are not solved for
+    no_remanence = 1e-12
+    own = np.flatnonzero(size > no_remanence * size.max()).tolist()
     runs = []
     if single is not None:
         count = single[1] - single[0] + 1
@@ -550,7 +547,7 @@ def _superpose(
         result[1 + 3 * number] = np.cos(middle) * along - np.sin(middle) * across
         result[2 + 3 * number] = np.sin(middle) * along + np.cos(middle) * across
         result[3 + 3 * number] = axial
-    return _to_cartesian(result, phi)
+    return to_cartesian(result, phi)
 
 
 def _field(gradients: dict[int, Floats], theta: Floats, sine: bool) -> Floats:
@@ -572,7 +569,7 @@ def _field(gradients: dict[int, Floats], theta: Floats, sine: bool) -> Floats:
     return field
 
 
-def _to_cartesian(field: Floats, phi: Floats) -> Floats:
+def to_cartesian(field: Floats, phi: Floats) -> Floats:
     """Convert B_r, B_theta, B_z (..., n, 3) at azimuths phi (n,) in rad to B_x, B_y, B_z."""
     cosine, sine = np.cos(phi), np.sin(phi)
     radial, tangential = field[..., 0], field[..., 1]

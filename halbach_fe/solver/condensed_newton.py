@@ -33,32 +33,8 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import NotConvergedError
 from halbach_fe.study.materials import ConstitutiveLaw
 
-MAX_ITERATIONS = 25
-"""Largest number of accelerated iterations. 4 to 6 are usual; where more are needed, Newton's
-method takes over."""
-
-MEMORY = 5
-"""Number of previous steps that the Anderson acceleration combines."""
-
 MAX_NEWTON_STEPS = 60
 """Largest number of Newton steps in one solve."""
-
-NEWTON_RESIDUAL = 1e-11
-"""Newton's method stops at this residual relative to the sources. Rounding leaves about 1e-14."""
-
-MAX_RESIDUAL = 1e-5
-"""Largest relative residual of an accepted accelerated solution. Readings that hardly change do not
-prove convergence by themselves: they see only a part of the iron's unknowns."""
-
-SAFE_RATE = 0.1
-"""Smallest factor per step by which the error is assumed to fall. A smaller ratio of the last two
-changes may be a coincidence."""
-
-SMALLEST_STEP = 2.0**-20
-"""Step length, relative to the full Newton step, at which the line search gives up."""
-
-COLUMNS_AT_ONCE = 256
-"""Number of columns that `condense` solves for at a time, which limits its memory."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +242,17 @@ class Condensed:
         steps: list[Floats] = []
         residuals: list[float] = []
         before = np.inf
-        for iteration in range(MAX_ITERATIONS):
+        # largest number of accelerated iterations. 4 to 6 are usual; where more are needed,
+        # Newton's method takes over.
+        max_iterations = 25
+        memory = 5  # number of previous steps that the Anderson acceleration combines
+        # largest relative residual of an accepted accelerated solution. Readings that hardly change
+        # do not prove convergence by themselves: they see only a part of the iron's unknowns.
+        max_residual = 1e-5
+        # smallest factor per step by which the error is assumed to fall. A smaller ratio of the
+        # last two changes may be a coincidence.
+        safe_rate = 0.1
+        for iteration in range(max_iterations):
             residual = self._residual(own, added)
             residuals.append(float(np.linalg.norm(residual)) / scale)
             step = -self._state.tangent.solve(residual)
@@ -274,11 +260,11 @@ class Condensed:
             if not np.isfinite(change) or (iteration > 3 and residuals[-1] > residuals[0]):
                 break
             # the changes fall by about this factor per step: change * rate / (1 - rate) remains
-            rate = min(max(change / before, SAFE_RATE), 0.9)
-            if residuals[-1] < MAX_RESIDUAL and change * rate / (1 - rate) <= tolerance / 4:
+            rate = min(max(change / before, safe_rate), 0.9)
+            if residuals[-1] < max_residual and change * rate / (1 - rate) <= tolerance / 4:
                 return added + step, iteration + 1, tuple(residuals), True
             before = change
-            points, steps = [*points[-MEMORY:], added], [*steps[-MEMORY:], step]
+            points, steps = [*points[-memory:], added], [*steps[-memory:], step]
             added = added + step
             if len(steps) > 1:
                 differences = np.diff(steps, axis=0)
@@ -299,7 +285,12 @@ class Condensed:
         scale = self._scale(own)
         residual = self._residual(own, added)
         norms = [float(np.linalg.norm(residual)) / scale]
-        while not norms[-1] <= NEWTON_RESIDUAL:  # written so that nan does not end the loop
+        # Newton's method stops at this residual relative to the sources. Rounding leaves about
+        # 1e-14.
+        tolerance = 1e-11
+        # step length, relative to the full Newton step, at which the line search gives up
+        smallest_step = 2.0**-20
+        while not norms[-1] <= tolerance:  # written so that nan does not end the loop
             if len(norms) > MAX_NEWTON_STEPS or not np.isfinite(norms[-1]):
                 raise NotConvergedError(
                     f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
@@ -310,11 +301,11 @@ class Condensed:
             while True:
                 trial = self._residual(own, added + length * step)
                 norm = float(np.linalg.norm(trial)) / scale
-                if norm < norms[-1] * (1 - 1e-4 * length) or length < SMALLEST_STEP:
+                if norm < norms[-1] * (1 - 1e-4 * length) or length < smallest_step:
                     break
                 length /= 2
             if not norm < norms[-1]:
-                if norms[-1] < 1e3 * NEWTON_RESIDUAL:  # rounding errors stop the progress
+                if norms[-1] < 1e3 * tolerance:  # rounding errors stop the progress
                     break
                 raise NotConvergedError(
                     f"Newton's method on the iron stalled at a residual of {norms[-1]:.1e}. Smooth "
@@ -386,8 +377,9 @@ def condense(
     schur = np.empty((len(surface), len(surface)))
     condensed = np.empty((outputs.shape[0], len(surface)))
     coupling, other_outputs = coupling[:, surface], outputs[:, rest]
-    for first in range(0, len(surface), COLUMNS_AT_ONCE):
-        part = slice(first, first + COLUMNS_AT_ONCE)
+    step = 256  # number of columns that `condense` solves for at a time, which limits its memory
+    for first in range(0, len(surface), step):
+        part = slice(first, first + step)
         solved = inner.solve(coupling[:, part].toarray())
         schur[:, part] = coupling.T @ solved
         condensed[:, part] = own[:, surface[part]].toarray() - other_outputs @ solved

@@ -26,12 +26,6 @@ from halbach_fe.solver.getdp import GetDP, Job
 CONNECT_S = 20.0
 """Time limit in s for the connection to the scheduler."""
 
-POLL_S = 0.05
-"""Time in s between two looks at whether a run has ended."""
-
-WATCH_S = 0.5
-"""Time in s between two looks of a worker at whether its task was cancelled."""
-
 
 @dataclass(frozen=True)
 class Answer:
@@ -110,13 +104,14 @@ class Cluster:
             If Dask failed.
         """
         given = {path.name: path.read_bytes() for path in folder.iterdir()}
+        poll_s = 0.05  # time in s between two looks at whether a run has ended
         try:
             future = self.client.submit(_answer, getdp, job, given, pure=False)
             try:
                 while not future.done():
                     if cancel is not None and cancel.is_set():
                         raise GetDPError("A run of GetDP was cancelled.")
-                    time.sleep(POLL_S)
+                    time.sleep(poll_s)
                 answer: Answer = future.result()
             finally:
                 with contextlib.suppress(Exception):  # the scheduler may have been lost
@@ -210,9 +205,10 @@ def _answer(getdp: GetDP, job: Job, given: dict[str, bytes]) -> Answer:
     key = worker.get_current_task()
     done = threading.Event()
 
+    watch_s = 0.5  # time in s between two looks of a worker at whether its task was cancelled
     def watch() -> None:
         """End the run of GetDP when the task was cancelled, since no client waits for it."""
-        while not done.wait(WATCH_S):
+        while not done.wait(watch_s):
             task = worker.state.tasks.get(key)
             if task is None or task.state in ("cancelled", "released", "forgotten"):
                 cancel.set()

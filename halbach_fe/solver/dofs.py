@@ -21,13 +21,8 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import GetDPError
 
 _VECTOR, _MATRIX = 1211214, 1211216  # PETSc's class identifiers
-_UNKNOWN = 1  # the type that GetDP gives to a degree of freedom that is solved for
-_IMAGINARY = "imaginary parts, which a static field has not"
-MOST_ENTITIES = 100
-"""Largest entity or unknown number in a list of unknowns, relative to the number of its rows.
 
-Most nodes, edges and faces have a row, so that larger numbers are a sign of a damaged file. Arrays
-are sized by these numbers."""
+_IMAGINARY = "imaginary parts, which a static field has not"
 
 
 @dataclass(frozen=True)
@@ -86,17 +81,22 @@ def _unknowns(text: str, cell_type: str) -> Unknowns:
     if not rows:
         raise ValueError("no unknowns")
     table = np.loadtxt(rows, usecols=range(5), comments=None, ndmin=2)
-    if not (np.abs(table) <= MOST_ENTITIES * max(1, len(table))).all():
+    # largest entity or unknown number in a list of unknowns, relative to the number of its rows.
+    # Most nodes, edges and faces have a row, so that larger numbers are a sign of a damaged file.
+    # Arrays are sized by these numbers.
+    most_entities = 100
+    if not (np.abs(table) <= most_entities * max(1, len(table))).all():
         raise ValueError("an entity or unknown has an impossibly large number")
     table = table.astype(int)
     count = int(text.partition("$DofData")[2].split("\n")[5].split()[1])
     if count < 1:
         raise ValueError("no unknowns")
     functions = []
+    solved_for = 1  # the type that GetDP gives to a degree of freedom that is solved for
     for kind in np.unique(table[:, 0]):
         of_kind = table[table[:, 0] == kind]
         index = np.full(np.abs(of_kind[:, 1]).max() + 1, -1)
-        solved = of_kind[of_kind[:, 3] == _UNKNOWN]
+        solved = of_kind[of_kind[:, 3] == solved_for]
         if not ((solved[:, 4] >= 1) & (solved[:, 4] <= count)).all():
             raise ValueError(f"the number of an unknown is not within 1 to {count}")
         index[np.abs(solved[:, 1])] = solved[:, 4] - 1

@@ -21,6 +21,9 @@ B_t remains.
 On straight edges the integrals are elementary; on arcs they are evaluated by Gauss-Legendre
 quadrature on panels that are no longer than their distance from the point, to an error of 1e-15 of
 the field. `halbach_fe.solver.prism_kernel` has them in compiled form.
+
+Fields of external sources (background, neighbouring magnets, magnetized objects) are added in
+vacuum: the magnet's permeability and iron do not react to them.
 """
 
 from __future__ import annotations
@@ -33,28 +36,14 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
-from halbach_fe.geometry.blocks import MagnetBlock, frames_of
-from halbach_fe.geometry.outline import Outline, plane_rotation
-from halbach_fe.geometry.symmetry import rotation_about_z
-
-_STEP = 1e-4
-"""Step of finite differences, relative to the largest radius of the blocks. Their relative error is
-the square of the step over the distance to a block."""
-
-_SHARE, _SHARE_OF_CUBOID = 10_000, 30_000
-"""Number of points that a thread evaluates at a time: several milliseconds of work, beside which
-0.3 ms of starting a thread do not count. A point takes 0.1 us by the closed form of cuboids."""
+from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import Outline
+from halbach_fe.study.magnet import Neighbour, check_apart
+from halbach_fe.study.materials import MU_0
 
 _AT_ONCE = 100_000
 """Number of points at which blocks of the same shape are evaluated at once: some 10 MB."""
-
-_SAME = 1e-13
-"""Distance, relative to the largest coordinate, below which points are the same: some rounding
-errors."""
-
-_SAME_FIELD = 1e-11
-"""Relative difference of the fields of two blocks that is rounding. A block that is displaced by a
-nanometre differs by more."""
 
 _DIGITS = 13
 """Of lengths in m, of blocks of the same shape: more than some rounding errors."""
@@ -121,14 +110,17 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
 
     out = np.empty((len(points), 6))
     rectangle = _rectangle(block.outline)
+    # number of points that a thread evaluates at a time: several milliseconds of work, beside which
+    # 0.3 ms of starting a thread do not count. A point takes 0.1 us by the closed form of cuboids.
+    points_per_thread, cuboid_points_per_thread = 10_000, 30_000
     if rectangle is not None and np.isfinite(block.z_max):
         (x, y), (a, b), cosine, sine = rectangle
-        share = _SHARE_OF_CUBOID
+        share = cuboid_points_per_thread
         work = partial(
             cuboid_fields, np.array([x, y, (block.z_min + block.z_max) / 2]),
             np.array([a, b, (block.z_max - block.z_min) / 2]), cosine, sine, points)
     else:
-        share = _SHARE
+        share = points_per_thread
         edges = [(*edge.start, *edge.end) for edge in block.outline if not edge.arc]
         arcs = [(edge.radius, *edge.angles) for edge in block.outline if edge.arc]
         tables = [arc_table(sweep) for _, _, sweep in arcs] or [arc_table(0.0)]
@@ -200,7 +192,7 @@ def _turn_deg(block: MagnetBlock) -> float:
 def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
     """Return what outlines have in common that are turned by different angles about z."""
     corners = [corner for edge in outline for corner in (edge.start, edge.end)]
-    turned = np.round(corners @ plane_rotation(np.radians(angle_deg)), _DIGITS)
+    turned = np.round(corners @ rotation_about_z(np.radians(angle_deg))[:2, :2], _DIGITS)
     return tuple(turned.ravel().tolist()), tuple(edge.arc for edge in outline)
 
 
@@ -262,7 +254,10 @@ def _equidistant_angles(points: Floats) -> int:
     if len(points) < 2:
         return 1
     radius = np.hypot(points[:, 0], points[:, 1])
-    small = _SAME * max(float(radius.max()), float(np.abs(points[:, 2]).max()))
+    # distance, relative to the largest coordinate, below which points are the same: some rounding
+    # errors
+    rounding = 1e-13
+    small = rounding * max(float(radius.max()), float(np.abs(points[:, 2]).max()))
     again = np.flatnonzero(np.hypot(radius - radius[0], points[:, 2] - points[0, 2]) <= small)
     count = int(again[1]) if len(again) > 1 else 0
     if not count or len(points) % count:
@@ -283,6 +278,9 @@ def _turned_blocks(
     block of its group. Blocks of the same field at three probes (3, 3) in m have the same shape.
     """
     groups: list[list[tuple[int, MagnetBlock]]] = []
+    # relative difference of the fields of two blocks that is rounding. A block that is displaced by
+    # a nanometre differs by more.
+    rounding = 1e-11
     for block in blocks:
         own = unit_field(block, probes)
         for group in groups:
@@ -292,7 +290,7 @@ def _turned_blocks(
             steps = (block.angle_deg - first.angle_deg) / 360 * angles
             turn = rotation_about_z(2 * np.pi * round(steps) / angles)
             turned = turn @ unit_field(first, probes @ turn) @ turn.T
-            if np.abs(turned - own).max() <= _SAME_FIELD * np.abs(own).max():
+            if np.abs(turned - own).max() <= rounding * np.abs(own).max():
                 group.append((round(steps) % angles, block))
                 break
         else:
@@ -323,7 +321,10 @@ def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
     zero = np.zeros(len(points))
     radial = np.column_stack([np.cos(angle), np.sin(angle), zero])
     azimuthal = np.column_stack([-np.sin(angle), np.cos(angle), zero])
-    step = _STEP * max(edge.radius for block in blocks for edge in block.outline)
+    # step of finite differences, relative to the largest radius of the blocks. Their relative error
+    # is the square of the step over the distance to a block.
+    relative_step = 1e-4
+    step = relative_step * max(edge.radius for block in blocks for edge in block.outline)
     places = np.vstack([points + sign * step * along for along in (radial, azimuthal)
                         for sign in (1, -1)])
     for block in blocks:
@@ -375,3 +376,54 @@ def _inside(block: MagnetBlock, order: int = 6) -> tuple[Floats, Floats]:
     points = np.concatenate([np.dstack([place, np.full_like(area, block.z_min + height * level)])
                              for level in t])
     return points.reshape(-1, 3), np.outer(height * weights, area).ravel()
+
+
+def external_field(magnet: Magnet, points: Floats) -> Floats:
+    """Return B (n, 3) in T of the study's external sources at points (n, 3) in m.
+
+    Raises
+    ------
+    StudyError
+        If a point is at a dipole.
+    """
+    external = magnet.external
+    check_apart(external, points, magnet.name)
+    field = np.tile(external.background_T, (len(points), 1)).astype(float)
+    for neighbour in external.neighbours:
+        field += neighbour_field(magnet, neighbour, points)
+    for dipole in external.dipoles:
+        field += dipole_field(np.array(dipole.position_m), np.array(dipole.moment_A_m2), points)
+    return field
+
+
+def neighbour_field(magnet: Magnet, neighbour: Neighbour, points: Floats) -> Floats:
+    """Return B of a second magnet with the study's blocks, shifted along z and turned about z.
+
+    Its permeability is that of vacuum, and its remanence is scaled by ``neighbour.factor``.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    neighbour : Neighbour
+    points : ndarray, shape (n, 3), in m
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T
+    """
+    turn = rotation_about_z(np.radians(neighbour.turn_deg))
+    local_points = (points - [0.0, 0.0, neighbour.z_m]) @ turn
+    return np.asarray(neighbour.factor * field_of(magnet.blocks, local_points) @ turn.T)
+
+
+def dipole_field(position: Floats, moment: Floats, points: Floats) -> Floats:
+    """Return B (n, 3) in T of a point dipole at points (n, 3) in m.
+
+    ``position`` (3,) is in m and ``moment`` (3,) in A m^2. See J. D. Jackson, Classical
+    Electrodynamics, 3rd ed., eq. 5.56.
+    """
+    offset = points - position
+    distance = np.linalg.norm(offset, axis=1)[:, None]
+    direction = offset / distance
+    along = (direction @ moment)[:, None]
+    return np.asarray(MU_0 / (4 * np.pi) * (3 * along * direction - moment) / distance**3)

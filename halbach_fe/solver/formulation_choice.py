@@ -12,25 +12,24 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
-from halbach_fe.solver.formulations import (
+from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
     SCALAR_POTENTIAL,
     Formulation,
     edge_elements,
-)
-from halbach_fe.solver.magnetostatics import (
     nominal_samples,
     solve_samples,
     solve_sources,
@@ -46,6 +45,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
@@ -53,36 +53,78 @@ SUPERPOSITION_TOLERANCE = 1e-8
 solver is used. The problem is linear, so that only rounding errors of about 1e-12 remain; a wrong
 or missing column makes a difference of 1e-3."""
 
-ITERATED_TOLERANCE = 1e-7
-"""The same tolerance for conjugate gradients, which stop at a relative residual of 1e-10. The
-difference was measured to be 1e-9 to 6e-9 on coarse meshes."""
+class Route(StrEnum):
+    """How a magnet is solved, by the name that studies and results have for it.
 
-PLACED_TOLERANCE = 0.1
-"""The same tolerance if the fields of some blocks are obtained from others by symmetry in 3D.
+    `choose_route` chooses it once; what differs from route to route is asked of it.
+    """
 
-The mesh is not symmetric, so that its discretization error remains. On meshes of 30 to 50 mm this
-error was measured to be 1 % to 8.5 % of the finite-element part for the scalar potential, and 1 %
-to 4 % for edge elements of order 2. When the mirror image was left out on purpose, the difference
-was 30 % and more for the scalar potential (8 % for edge elements on a coarse mesh with thin iron);
-for blocks rotated the wrong way or of the wrong sign it was mostly 100 % and more. A single wrong
-block among hundreds is not detected."""
+    CROSS_SECTION = "cross_section"
+    AZIMUTHAL_MODES = "azimuthal_modes"
+    EDGE_ELEMENTS = "edge_elements"
+    SCALAR_POTENTIAL = "scalar_potential"
+    MOMENTS = "moments"
 
-PLACED_TOLERANCE_LOWEST_ORDER = 0.5
-"""The same as `PLACED_TOLERANCE` for edge elements of order 1, whose error was measured to be 5 %
-(20 mm) to 35 % (50 mm). Only blocks of the wrong sign or rotated the wrong way, which make a
-difference of 100 % and more, are detected with certainty."""
+    @property
+    def mesh(self) -> str | None:
+        """Kind of mesh, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`; None without one."""
+        return {Route.CROSS_SECTION: "cross_section", Route.AZIMUTHAL_MODES: "meridian",
+                Route.MOMENTS: None}.get(self, "extruded")
 
-MOMENTS_TOLERANCE = 0.1
-"""The same tolerance for the route ``moments``. The columns have a single cell per block, and leave
-out what blocks and iron answer to each other."""
+    @property
+    def dual(self) -> Route | None:
+        """The route of the dual formulation on the same mesh, whose energy brackets the exact one
+        from the other side; None if there is none.
+        """
+        return {Route.EDGE_ELEMENTS: Route.SCALAR_POTENTIAL,
+                Route.SCALAR_POTENTIAL: Route.EDGE_ELEMENTS}.get(self)
 
-MESHES = {"cross_section": "cross_section", "azimuthal_modes": "meridian",
-          "edge_elements": "extruded", "scalar_potential": "extruded"}
-"""Kind of mesh by route, a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`."""
+    @property
+    def meshed(self) -> Route:
+        """The route of the mesh that holds non-linear iron; ``moments`` has none."""
+        return Route.SCALAR_POTENTIAL if self is Route.MOMENTS else self
 
-BOUNDARY_NEAR = 0.5
-"""Fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
-because the condition on the boundary affects their field."""
+    def formulation(self, magnet: Magnet) -> Formulation:
+        """Return the formulation of the mesh of all space, of other routes that of edges."""
+        return {Route.CROSS_SECTION: CROSS_SECTION, Route.SCALAR_POTENTIAL: SCALAR_POTENTIAL}.get(
+            self) or edge_elements(magnet.study.solver.edge_order)
+
+    def element_size_m(self, magnet: Magnet) -> float:
+        """Return the size of the elements, or for the method of moments of the cells of blocks."""
+        mesh = magnet.study.mesh
+        if self is Route.AZIMUTHAL_MODES:
+            return meridian_size(magnet)
+        if self is Route.MOMENTS:
+            smallest = min(block.volume for block in magnet.blocks) ** (1 / 3)
+            return float(smallest / (mesh.cells_per_side or CELLS_PER_SIDE))
+        return mesh.block_size_m
+
+    def superposition_tolerance(self, magnet: Magnet, placed: bool) -> float:
+        """Return the tolerance of the check that blocks add up; ``placed`` is by symmetry."""
+        if placed and self is not Route.AZIMUTHAL_MODES:  # whose mesh has the symmetry
+            # A 3D mesh is not symmetric, so that its discretization error remains. On meshes of 30
+            # to 50 mm it was measured to be 1 % to 8.5 % of the finite-element part for the scalar
+            # potential, and 1 % to 4 % for edge elements of order 2. When the mirror image was left
+            # out on purpose, the difference was 30 % and more for the scalar potential (8 % for
+            # edge elements on a coarse mesh with thin iron); for blocks rotated the wrong way or of
+            # the wrong sign it was mostly 100 % and more. A single wrong block among hundreds is
+            # not detected. The error of edge elements of order 1 was 5 % (20 mm) to 35 % (50 mm):
+            # only blocks of the wrong sign or rotated the wrong way are detected with certainty.
+            lowest_order = self is Route.EDGE_ELEMENTS and magnet.study.solver.edge_order == 1
+            return 0.5 if lowest_order else 0.1
+        # conjugate gradients stop at a relative residual of 1e-10; the difference was measured to
+        # be 1e-9 to 6e-9 on coarse meshes
+        return 1e-7 if self is Route.SCALAR_POTENTIAL else SUPERPOSITION_TOLERANCE
+
+    def solve(
+        self, magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session
+    ) -> Floats:
+        """Solve a linear problem; the result is that of `solve_sources`."""
+        if self is Route.AZIMUTHAL_MODES:
+            reciprocal = saves_solves(magnet, points, blocks)
+            return solve_modes(magnet, points, blocks, session,
+                               single_blocks=reciprocal_gradients if reciprocal else None)
+        return solve_sources(magnet, points, blocks, session, self.formulation(magnet))
 
 
 @dataclass(frozen=True)
@@ -137,6 +179,16 @@ def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
         magnet, points, session, columns=False, estimate=False).nominal
 
 
+def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
+    """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
+    points = np.asarray(points_m, float)
+    if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
+        raise StudyError(must_be("points_m", magnet.name, "numbers x, y, z in m: an array (..., 3)",
+                                 f"one of shape {points.shape}"))
+    field = field_function(magnet, Session.temporary())(points.reshape(-1, 3))
+    return field.reshape(points.shape)
+
+
 def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:
     """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
 
@@ -149,7 +201,7 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
         return solve_nominal(magnet, plane, session)
 
     auto = magnet.study.solver.route == "auto" and not magnet.has_losses
-    if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) != "moments" or (
+    if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) is not Route.MOMENTS or (
             auto and is_axisymmetric(magnet)):
         return solved
     reaction = solve_separate(magnet, session, estimate=False)
@@ -168,7 +220,7 @@ def iron_change(magnet: Magnet, points: Floats, session: Session) -> Floats | No
     The result is None for routes on which the whole magnet is solved in the same time.
     """
     points = check_points(magnet, points)
-    if choose_route(magnet, points) != "moments" or not magnet.iron:
+    if choose_route(magnet, points) is not Route.MOMENTS or not magnet.iron:
         return None
     return iron_alone(magnet, points, session)
 
@@ -207,19 +259,19 @@ def finite_element_part(
         return ElementFields(SUPERPOSITION_TOLERANCE, zero, zero, magnet.blocks,
                              lambda number, some: np.zeros((len(points[some]), 3, size)))
     route = choose_route(magnet, points)
-    if route == "moments":
-        return _by_moments(magnet, points, session, columns, estimate)
+    if route is Route.MOMENTS:
+        return _moments_part(magnet, points, session, columns, estimate)
     if not columns:
         nominal = _solve_nominal(magnet, points, session, route)
-        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved)
+        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column)
     placed = uses_symmetry(magnet)
     symmetry = symmetry_of(magnet) if placed else no_symmetry(magnet)
     places, index = symmetry.source_points(points)
     if magnet.is_nonlinear:
         nominal, fields = solve_tangent(magnet, places, symmetry.sources, session,
-                                        formulation_of(magnet, route))
+                                        route.formulation(magnet))
     else:
-        fields = _solve(magnet, places, symmetry.sources, session, route)
+        fields = route.solve(magnet, places, symmetry.sources, session)
         nominal = fields[0]
     # The first source is placed by the identity, so its source points are the points themselves.
     here = index[symmetry.sources[0]]
@@ -231,12 +283,12 @@ def finite_element_part(
         return placement.from_source(source_fields)
 
     tangent = fields[0, here]
-    return ElementFields(_superposition_tolerance(magnet, route, placed),
+    return ElementFields(route.superposition_tolerance(magnet, placed),
                          nominal[here] if magnet.is_nonlinear else tangent, tangent,
                          magnet.blocks, block)
 
 
-def _by_moments(
+def _moments_part(
     magnet: Magnet, points: Floats, session: Session, columns: bool, estimate: bool
 ) -> ElementFields:
     """Return the reaction of separate blocks and rotationally symmetric iron.
@@ -250,25 +302,28 @@ def _by_moments(
             magnet.with_(solver__route=route), points[chosen], session.within(route), columns,
             estimate))
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
-        return _joined(magnet, points, parts)
+        return _join_parts(magnet, points, parts)
     if session.counter is not None:
         zero = np.zeros((len(points), 3))
-        return ElementFields(np.nan, zero, zero, magnet.blocks, _not_solved, zero)
+        return ElementFields(np.nan, zero, zero, magnet.blocks, _refuse_column, zero)
     solved = solve_separate(magnet, session, estimate)
     nominal, error = solved.field_with_errors(points) if estimate else (
         solved.field(points), None)
     if not columns:
-        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _not_solved, error)
+        return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column, error)
     block = separate_columns(magnet, points, solved.iron, session.progress)
     along = nominal
     if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
-    return ElementFields(MOMENTS_TOLERANCE, nominal, along, magnet.blocks, block, error,
+    # the same tolerance for the route ``moments``. The columns have a single cell per block, and
+    # leave out what blocks and iron answer to each other.
+    moments_tolerance = 0.1
+    return ElementFields(moments_tolerance, nominal, along, magnet.blocks, block, error,
                          for_deviations=True)
 
 
-def _joined(
+def _join_parts(
     magnet: Magnet, points: Floats, parts: Sequence[tuple[Ints, ElementFields]]
 ) -> ElementFields:
     """Return the fields at all points (n, 3) from those that several routes have at some.
@@ -301,7 +356,7 @@ def runs_serve_other_points(magnet: Magnet, points: Floats) -> bool:
 
     That is so by azimuthal modes, unless reciprocity solves for these points (n, 3) in m instead.
     """
-    if choose_route(magnet, points) != "azimuthal_modes":
+    if choose_route(magnet, points) is not Route.AZIMUTHAL_MODES:
         return False
     symmetry = symmetry_of(magnet) if uses_symmetry(magnet) else no_symmetry(magnet)
     return not saves_solves(magnet, symmetry.source_points(points)[0], symmetry.sources)
@@ -316,37 +371,17 @@ def uses_symmetry(magnet: Magnet) -> bool:
     return magnet.study.solver.symmetry and magnet.dimension == 3 and not magnet.is_nonlinear
 
 
-def _superposition_tolerance(magnet: Magnet, route: str, placed: bool) -> float:
-    """Return the tolerance that applies; ``placed`` tells whether symmetry places the blocks."""
-    if placed and route == "edge_elements" and magnet.study.solver.edge_order == 1:
-        return PLACED_TOLERANCE_LOWEST_ORDER
-    if placed and route != "azimuthal_modes":  # the half-plane's mesh has the symmetry
-        return PLACED_TOLERANCE
-    return ITERATED_TOLERANCE if route == "scalar_potential" else SUPERPOSITION_TOLERANCE
-
-
-def _not_solved(number: int, some: Ints | slice) -> Floats:
+def _refuse_column(number: int, some: Ints | slice) -> Floats:
     """Take the place of `ElementFields.block` if only the nominal array was solved for."""
     raise AssertionError(f"block {number} was not solved for")
 
 
-def _solve(
-    magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session, route: str
-) -> Floats:
-    """Solve a linear problem by a route; the result is that of `solve_sources`."""
-    if route == "azimuthal_modes":
-        return solve_modes(
-            magnet, points, blocks, session,
-            single_blocks=reciprocal_gradients if saves_solves(magnet, points, blocks) else None)
-    return solve_sources(magnet, points, blocks, session, formulation_of(magnet, route))
-
-
-def _solve_nominal(magnet: Magnet, points: Floats, session: Session, route: str) -> Floats:
+def _solve_nominal(magnet: Magnet, points: Floats, session: Session, route: Route) -> Floats:
     """Return the finite-element part of B (n, 3) in T of the nominal array."""
     if magnet.is_nonlinear:
         return solve_samples(magnet, points, nominal_samples(magnet), session,
-                             formulation_of(magnet, route))[0]
-    return _solve(magnet, points, (), session, route)[0]
+                             route.formulation(magnet))[0]
+    return route.solve(magnet, points, (), session)[0]
 
 
 def finer_in_words(magnet: Magnet, points: Floats) -> str:
@@ -358,26 +393,20 @@ def finer_in_words(magnet: Magnet, points: Floats) -> str:
     iron is fixed.
     """
     mesh, route = magnet.study.mesh, choose_route(magnet, points)
-    if route not in ("moments", "azimuthal_modes"):
+    if route not in (Route.MOMENTS, Route.AZIMUTHAL_MODES):
         return f"a smaller mesh.block_size_m (now {1e3 * mesh.block_size_m:.3g} mm)"
     keys = []
-    if route == "moments" and (magnet.has_losses or any(
+    if route is Route.MOMENTS and (magnet.has_losses or any(
             block.recoil_permeability != 1.0 or not block.isotropic for block in magnet.blocks)):
         keys.append(f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})")
-    if route == "azimuthal_modes" or (
+    if route is Route.AZIMUTHAL_MODES or (
             magnet.study.solver.route == "auto" and not magnet.has_losses
             and bool(few_modes_suffice(magnet, points).any())):
         keys.append(f"a smaller mesh.meridian_size_m (now {1e3 * meridian_size(magnet):.3g} mm)")
     return " and ".join(keys)
 
 
-def formulation_of(magnet: Magnet, route: str) -> Formulation:
-    """Return the finite-element formulation of a route other than ``azimuthal_modes``."""
-    return {"cross_section": CROSS_SECTION, "scalar_potential": SCALAR_POTENTIAL}.get(
-        route) or edge_elements(magnet.study.solver.edge_order)
-
-
-def choose_route(magnet: Magnet, points: Floats) -> str:
+def choose_route(magnet: Magnet, points: Floats) -> Route:
     """Return the study's route, or for ``auto`` the fastest that applies to the magnet and points.
 
     Raises
@@ -386,7 +415,7 @@ def choose_route(magnet: Magnet, points: Floats) -> str:
         If the study asks for azimuthal modes and they do not apply, see `is_axisymmetric`.
     """
     if magnet.dimension == 2:
-        return "cross_section"
+        return Route.CROSS_SECTION
     asked = magnet.study.solver.route
     if magnet.has_losses:  # which are not rotationally symmetric
         asked = "moments"
@@ -414,7 +443,7 @@ def choose_route(magnet: Magnet, points: Floats) -> str:
             f"Input `array` of study {magnet.name} must consist of equal rings for the route "
             f"{asked.replace('_', ' ')}; instead it has rings of their own or free blocks. Use the "
             "method reaction, and iron of coaxial tubes or discs.")
-    return asked
+    return Route(asked)
 
 
 def check_points(
@@ -461,21 +490,22 @@ def check_points(
     points = places.points
     route = choose_route(magnet, points)
     # only meshes have a boundary, beyond which the solve refuses points
-    unbounded = route == "moments" or (
-        magnet.is_vacuum and magnet.study.solver.method == "reaction")
-    for remark in (places.on_faces(), places.far_away() if unbounded else None):
+    mesh = None if magnet.is_vacuum and magnet.study.solver.method == "reaction" else route.mesh
+    for remark in (places.on_faces(), places.far_away() if mesh is None else None):
         if remark is not None:
             warnings.warn(remark, HalbachWarning, stacklevel=2)
-    if unbounded:
+    if mesh is None:
         return points
-    mesh = MESHES[route]
     directions = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,
              boundary_radius(magnet, mesh))]
     if magnet.dimension == 3:
         directions.append((np.abs(points[:, 2]), magnet.half_length,
                      boundary_half_length(magnet, mesh)))
+    # fraction of the way from the magnet to the outer boundary. Points farther out cause a warning,
+    # because the condition on the boundary affects their field.
+    boundary_near = 0.5
     for position, end, boundary in directions:
-        near = position > end + BOUNDARY_NEAR * (boundary - end)
+        near = position > end + boundary_near * (boundary - end)
         if near.any() and position.max() <= boundary:  # the solve refuses points beyond it
             x, y, z = points[np.argmax(near)]
             warnings.warn(
@@ -484,3 +514,44 @@ def check_points(
                 f"{z:g}) m. Enlarge `open_boundary` of study {magnet.name}.", HalbachWarning,
                 stacklevel=2)
     return points
+
+
+def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
+    """Return the derivative of B along the nominal direction of magnetization of a block.
+
+    The iron is at its operating point in the nominal array.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    block : int
+        Number of the block, from 0.
+    points : ndarray, shape (n, 3), in m
+        Anywhere inside the outer boundary, also in magnet and iron.
+    session : Session
+
+    Returns
+    -------
+    ndarray, shape (n, 3), in T m/A
+
+    Raises
+    ------
+    StudyError
+        If the array has no block of this number.
+    """
+    blocks = magnet.blocks
+    if not 0 <= block < len(blocks):
+        raise StudyError(f"Input block of study {magnet.name} must be one of its {len(blocks)} "
+                         f"blocks; instead received number {block + 1}. Correct the number.")
+    # Solve for B itself by a vector potential: in materials the field in vacuum has no exact form
+    # to which a reaction could be added, and the gradient of the scalar potential is H, not B.
+    direct = magnet.with_(solver__method="direct", solver__route="auto")
+    formulation = choose_route(direct, points).formulation(direct)
+    if magnet.is_nonlinear:
+        fields = solve_tangent(direct, points, (block,), session, formulation, anywhere=True)[1]
+    else:
+        fields = solve_sources(direct, points, (block,), session, formulation, anywhere=True)
+    size, changed = magnet.dimension, blocks[block]
+    # the change of remanence in T for a change of magnetization by 1 A/m along the easy axis
+    remanence = MU_0 * changed.recoil_tensor @ np.array(changed.easy_axis)
+    return np.einsum("knc,k->nc", fields[1:1 + size], remanence[:size])

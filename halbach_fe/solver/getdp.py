@@ -32,9 +32,6 @@ from halbach_fe.core.files import is_full
 
 ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
 LOG_NAME = "getdp.log"
-MAX_NAME = 200
-"""Largest accepted length of a file name. GetDP keeps paths in buffers of 256 characters, and
-appends to them."""
 
 MAX_RELATIVE_RESIDUAL = 1e-8
 """Largest accepted residual of a linear solve, relative to its first residual. A direct solver
@@ -392,10 +389,13 @@ def declared_constants(folder: Path) -> set[str]:
 
 def _check_before(job: Job, folder: Path) -> None:
     """Check the names, files and constants of a job before GetDP is started."""
+    # largest accepted length of a file name. GetDP keeps paths in buffers of 256 characters, and
+    # appends to them.
+    longest = 200
     for name in (job.problem, job.mesh, *job.outputs):
-        if len(name) > MAX_NAME:
+        if len(name) > longest:
             raise _failure(f"the name {name[:30]}... has {len(name)} characters, and GetDP's "
-                           f"buffers end at 256; keep names under {MAX_NAME}", folder)
+                           f"buffers end at 256; keep names under {longest}", folder)
     for name in (job.problem, job.mesh):
         if not (folder / name).is_file():
             raise _failure(f"{name} is missing from the run folder", folder)

@@ -33,7 +33,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
 
 from halbach_fe.core.errors import MAX_QUOTED, HalbachWarning, OutputError, printable
-from halbach_fe.core.temporary_files import remove_orphans, temporary_name
+from halbach_fe.core.files import remove_orphans, temporary_name
 from halbach_fe.solver.getdp import LOG_NAME, GetDP, Job
 
 FOLDER_VARIABLE = "HALBACH_FE_CACHE"

@@ -18,20 +18,14 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError
-from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
+from halbach_fe.geometry.domain import Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.regions import Regions
 from halbach_fe.study.model import Study
 
 MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
 MERIDIAN = "meridian"
 """Prefix of the file names of the mesh of the (r, z) half-plane."""
-
-MERIDIAN_ELEMENTS = 12
-"""Default number of elements across the blocks in the (r, z) half-plane."""
-ROUGH_MERIDIAN_ELEMENTS = 3
-"""The same where a tenth of the accuracy suffices."""
 
 # Dimension of a cell by meshio's name of its type.
 _DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad": 2, "tetra10": 3}
@@ -161,20 +155,22 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
 def meridian_size(magnet: Magnet) -> float:
     """Return the element size in m at the magnet in the mesh of the (r, z) half-plane."""
     thickness = min(radii[1] - radii[0] for _, radii in magnet.ring_sections)
-    return magnet.study.mesh.meridian_size_m or thickness / MERIDIAN_ELEMENTS
+    meridian_elements = 12  # default number of elements across the blocks in the (r, z) half-plane
+    return magnet.study.mesh.meridian_size_m or thickness / meridian_elements
 
 
 def with_rough_mesh(study: Study) -> Study:
     """Return a study with a coarse mesh of the (r, z) half-plane.
 
-    With `ROUGH_MERIDIAN_ELEMENTS` through the thickness of a ring, what iron or permeability change
+    With three elements through the thickness of a ring, what iron or permeability change
     in the field of a magnet of sectors is right to 0.2 % (rms) in a sixth of the time of the usual
     mesh. That suffices to tell whether readings speak for such an effect.
     """
     if study.dimension == 2:
         return study
     radii = (radii for _, radii in build_magnet(study).ring_sections)
-    rough = min(outer - inner for inner, outer in radii) / ROUGH_MERIDIAN_ELEMENTS
+    rough_meridian_elements = 3  # across the blocks, where a tenth of the accuracy suffices
+    rough = min(outer - inner for inner, outer in radii) / rough_meridian_elements
     return study.with_(mesh__meridian_size_m=max(rough, study.mesh.meridian_size_m or 0.0))
 
 

@@ -38,10 +38,9 @@ from halbach_fe.solver.azimuthal_modes import (
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.dofs import Unknowns, read_matrix, read_unknowns
 from halbach_fe.solver.getdp import Job
-from halbach_fe.solver.grid_interpolation import grid_operators
+from halbach_fe.solver.interpolation import grid_operators
 from halbach_fe.solver.iron_modes import GaussPoints, axis_unknowns, check_matrix, gauss_points
-from halbach_fe.solver.runs import LOOK_S, MATRIX_FILE, Task, run_tasks
-from halbach_fe.solver.session import RunSize, Session
+from halbach_fe.solver.session import LOOK_S, MATRIX_FILE, RunSize, Session, Task, run_tasks
 
 SAVED_SOLVES = 2000
 """Solves that reciprocity must save. Below that GetDP takes less than some two minutes for the

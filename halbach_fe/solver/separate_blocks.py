@@ -30,40 +30,16 @@ from halbach_fe.solver.axisymmetric_iron import (
     solve_iron,
 )
 from halbach_fe.solver.exact_block_field import field_on_circles, unit_fields
-from halbach_fe.solver.iron_grid import IronRectangle, Resolution
+from halbach_fe.solver.iron_modes import IronRectangle, Resolution
 from halbach_fe.solver.session import Session
 
 if TYPE_CHECKING:
     from halbach_fe.solver.moments.irreversible import KneeLaw
     from halbach_fe.solver.moments.solve import Moments, System
 
-ALTERNATION_TOLERANCE = 1e-6
-"""Largest change of the iron's field in the blocks at which the alternation ends, relative to the
-largest remanence. The blocks answer with some 5 % of it."""
-
-MAX_TURNS = 30
 
 MANY_BLOCKS = 64
 """Number of blocks from which their field on the iron is summed by expansions."""
-
-IRON_DEGREE = 8
-"""Degree of the expansions of the induced polarization at the many points of iron. With 12 it takes
-five times as long, and changes the field by 5e-5 of its largest value there, rms (990 cubes of
-12.7 mm, 4 mm from a tube); that field is some 5 % of the source."""
-
-TANGENT_ANGLES = 64
-"""Angles at which the fields of single blocks on the iron are given, for the 24 modes of
-`IronReaction.tangent`."""
-
-
-LOSS_SHARE = 0.25
-"""Error bar of the field of irreversible losses, relative to the change that the law of the mean
-field in every cell makes (`halbach_fe.solver.moments.irreversible`).
-
-Where that module compares 3 and 4 cells a side with finer ones, the error was 0.08 to 0.24 of the
-change in rings of cuboids, rms, and up to 0.3 near single cubes. The change with 2 cells, which
-only signatures have, is no measure of their error.
-"""
 
 Field = Callable[[Floats], Floats]
 """Takes points (n, 3) in m and returns a field (n, 3) in T."""
@@ -119,7 +95,13 @@ class SeparateReaction:
         if not self.without_losses or len(self.blocks) < 2:
             return np.zeros((len(points), 3))
         found, by_mean = (each.reaction(points) for each in self.blocks)
-        return LOSS_SHARE * (found - by_mean)
+        # error bar of the field of irreversible losses, relative to the change that the law of the
+        # mean field in every cell makes (`halbach_fe.solver.moments.irreversible`). Where that
+        # module compares 3 and 4 cells a side with finer ones, the error was 0.08 to 0.24 of the
+        # change in rings of cuboids, rms, and up to 0.3 near single cubes. The change with 2 cells,
+        # which only signatures have, is no measure of their error.
+        loss_share = 0.25
+        return loss_share * (found - by_mean)
 
 
 def applies(magnet: Magnet) -> bool:
@@ -144,10 +126,10 @@ def solve_separate(
     """
     own = _Blocks.of(magnet, 2 if estimate else 1)
     if not magnet.iron:
-        return _alone(own)
+        return _reaction_without_iron(own)
     blocks, systems = own.blocks, own.systems()
     bodies = iron_rectangles(magnet)
-    remanent = _remembered(field_in_vacuum(blocks))
+    remanent = _cached_field(field_in_vacuum(blocks))
     if not systems:
         return SeparateReaction((), solve_iron(
             bodies, remanent, session, magnet.name, estimate=estimate))
@@ -156,18 +138,26 @@ def solve_separate(
     middles = np.array([block.middle + block.displacement_m for block in blocks])
     scale = max(abs(block.remanence) for block in blocks)
     before = iron.field(middles)
-    for _ in range(MAX_TURNS):
+    # largest change of the iron's field in the blocks at which the alternation ends, relative to
+    # the largest remanence. The blocks answer with some 5 % of it.
+    tolerance = 1e-6
+    most_turns = 30
+    # degree of the expansions of the induced polarization at the many points of iron. With 12 it
+    # takes five times as long, and changes the field by 5e-5 of its largest value there, rms (990
+    # cubes of 12.7 mm, 4 mm from a tube); that field is some 5 % of the source.
+    iron_degree = 8
+    for _ in range(most_turns):
         polarized = own.polarized(systems[0], iron.field)
-        source = _sum(remanent, partial(polarized.reaction, degree=IRON_DEGREE))
+        source = _sum_of_fields(remanent, partial(polarized.reaction, degree=iron_degree))
         iron = solve_iron(
             bodies, source, session.within("turns"), magnet.name, rough, False, start=iron)
         now = iron.field(middles)
-        if np.abs(now - before).max() <= ALTERNATION_TOLERANCE * scale:
+        if np.abs(now - before).max() <= tolerance * scale:
             return own.reaction(systems, solve_iron(
                 bodies, source, session, magnet.name, estimate=estimate))
         before = now
     raise HalbachError(
-        f"Blocks and iron of study {magnet.name} do not come to rest in {MAX_TURNS} turns: the "
+        f"Blocks and iron of study {magnet.name} do not come to rest in {most_turns} turns: the "
         f"last changed the iron's field by {np.abs(now - before).max():.1e} T. Please report this "
         "with the study.")
 
@@ -200,14 +190,17 @@ def separate_columns(
         Takes the number of a block, from 0, and indices (k,) of points or a slice; returns the
         reaction (k, 3, 3) in T per T of remanence along each axis.
     """
-    from halbach_fe.solver.moments.columns import reaction_columns  # imports numba
+    from halbach_fe.solver.moments.solve import reaction_columns  # imports numba
 
     blocks = magnet.blocks
     of_blocks = reaction_columns(
         blocks, points, progress=progress) if _permeable(blocks) else None
     of_iron: Floats | None = None
+    # angles at which the fields of single blocks on the iron are given, for the 24 modes of
+    # `IronReaction.tangent`
+    tangent_angles = 64
     if iron is not None:
-        nodes = iron.nodes(TANGENT_ANGLES)
+        nodes = iron.nodes(tangent_angles)
         of_iron = np.array([
             np.moveaxis(iron.tangent(np.moveaxis(unit, 2, 0), points), 0, 2)
             for unit in unit_fields(blocks, nodes)])
@@ -250,7 +243,7 @@ def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     return interaction.field_function(polarization)
 
 
-def _remembered(function: Field) -> Field:
+def _cached_field(function: Field) -> Field:
     """Return a function that does not compute the field at the same points again."""
     known: dict[bytes, Floats] = {}
 
@@ -263,7 +256,7 @@ def _remembered(function: Field) -> Field:
     return field
 
 
-def _sum(first: Field, second: Field) -> Field:
+def _sum_of_fields(first: Field, second: Field) -> Field:
     """Return the sum of two fields."""
     return lambda points: first(points) + second(points)
 
@@ -348,9 +341,9 @@ class _Blocks:
 
 
 @lru_cache(maxsize=2)  # every map of a campaign, and every round of an update, asks for the same
-def _alone(own: _Blocks) -> SeparateReaction:
+def _reaction_without_iron(own: _Blocks) -> SeparateReaction:
     """Return the reaction of blocks without iron."""
-    known = _alone(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
+    known = _reaction_without_iron(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
     return own.reaction(own.systems(), known=known)
 
 

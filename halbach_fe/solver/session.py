@@ -1,33 +1,43 @@
-"""The settings of all runs of GetDP: executable, folder, cache, number of processes, progress."""
+"""The settings of all runs of GetDP, and parallel runs, each in its own folder.
+
+A `Session` has the executable, folder, cache, number of processes and progress. A run is described
+by a `Task`. Results come from the cache if it has them. The first failure ends all runs. The
+folders of finished runs are kept, so that a run can be repeated by hand.
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import os
+import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+import numpy as np
+
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.files import make_folder
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import GetDPError, NotConvergedError, OutputError
+from halbach_fe.core.files import (
+    folder_until_exit,
+    is_full,
+    make_folder,
+    remove_orphans,
+    temporary_path,
+)
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.pace import Progress
-from halbach_fe.core.result_folder import locked_folder
-from halbach_fe.core.temporary_files import remove_orphans, temporary_path
+from halbach_fe.core.result_folder import is_run_folder, locked_folder
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.getdp import NO_GETDP, GetDP, Run, getdp_or_none
+from halbach_fe.solver.getdp import NO_GETDP, GetDP, Job, Run, getdp_or_none
 from halbach_fe.solver.getdp_cache import Cache, default_cache
-
-DEFAULT_JOBS = 2
-"""Number of parallel runs of GetDP, if the machine has as many cores. Most problems consist of two
-runs, with the real materials and with vacuum in their place."""
-
-TEMPORARY_CACHE_BYTES = 4 * 2**30
-"""Size limit of a cache that lasts as long as one search, see `Session.with_cache`."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -157,9 +167,17 @@ class Session:
         """
         if jobs is not None:
             check_number("jobs", "Session.open", jobs, 1, whole=True)
+        # number of parallel runs of GetDP, if the machine has as many cores. Most problems consist
+        # of two runs, with the real materials and with vacuum in their place.
+        default_jobs = 2
         return cls(getdp_or_none(getdp), Path(folder),
-                   jobs=jobs or min(DEFAULT_JOBS, os.cpu_count() or 1), progress=progress,
+                   jobs=jobs or min(default_jobs, os.cpu_count() or 1), progress=progress,
                    cache=default_cache(None))
+
+    @classmethod
+    def temporary(cls) -> Session:
+        """Return a session with the usual settings, whose folder is removed when Python ends."""
+        return cls.open(folder_until_exit())
 
     @classmethod
     def counting(cls, jobs: int) -> Session:
@@ -182,27 +200,254 @@ class Session:
             return
         remove_orphans(make_folder(self.folder))  # of processes that were killed
         folder = temporary_path(self.folder / "cache")
+        # size limit of a cache that lasts as long as one search, see `Session.with_cache`
+        temporary_cache_bytes = 4 * 2**30
         try:
-            yield replace(self, cache=Cache(folder, TEMPORARY_CACHE_BYTES))
+            yield replace(self, cache=Cache(folder, temporary_cache_bytes))
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+NOT_KEPT = Session(NO_GETDP, Path())
+"""Stands for a session whose files nobody wants to keep, see `Session.temporary`."""
 
 
 def alone(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function with an argument ``session``, in whose folder nobody else may write.
 
-    A second run in the same folder raises OutputError until the function has returned. Functions
-    may call each other. Arguments of other classes than its own are refused, see `typed`.
+    `NOT_KEPT` becomes a session of its own. A second run in the same folder raises OutputError
+    until the function has returned. Functions may call each other. Arguments of other classes than
+    its own are refused, see `typed`.
     """
     signature = inspect.signature(function)
 
     @typed
     @functools.wraps(function)
     def locked(*arguments: P.args, **options: P.kwargs) -> R:
-        session = signature.bind(*arguments, **options).arguments["session"]
+        bound = signature.bind(*arguments, **options)
+        session = bound.arguments.get("session", NOT_KEPT)
+        if session is NOT_KEPT:
+            session = bound.arguments["session"] = Session.temporary()
         if session.counter is not None:  # which writes nothing
-            return function(*arguments, **options)
+            return function(*bound.args, **bound.kwargs)
         with locked_folder(session.folder):
-            return function(*arguments, **options)
+            return function(*bound.args, **bound.kwargs)
 
     return locked
+
+
+NEWTON_HISTORY = "newton.csv"
+"""File in the run folder with the relative residual of every Newton step."""
+
+LOOK_S = 0.2
+"""Longest time in s for which the main thread waits for runs without looking at signals. A signal
+that comes just before a thread blocks does not wake it, and Ctrl-C would then have no effect."""
+
+MATRIX_FILE = "matrix.bin"
+"""File in the run folder to which PETSc writes the matrix."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run of GetDP.
+
+    Attributes
+    ----------
+    name : str
+        Name of its folder.
+    stage : callable
+        Takes the run folder, fills it, and returns the job to run there.
+    read : callable
+        Takes the run folder after the run, verifies the result and returns it.
+    shape : tuple of int
+        Shape of the result.
+    solves : int
+        Number of solves that the run reports as progress.
+    size : RunSize
+        Size of the run, for estimates of its cost.
+    matrix : bool
+        Whether PETSc writes the matrix to `MATRIX_FILE`.
+    """
+
+    name: str
+    stage: Callable[[Path], Job]
+    read: Callable[[Path], Floats]
+    shape: tuple[int, ...]
+    solves: int
+    size: RunSize
+    matrix: bool = False
+
+
+def run_tasks(tasks: Sequence[Task], session: Session) -> list[Floats]:
+    """Run GetDP for every task, ``session.jobs`` at a time; the first failure ends them all.
+
+    If the session only counts runs, the tasks are recorded and their results are zeros.
+
+    Raises
+    ------
+    GetDPError
+        The error of the first run that failed.
+    """
+    if session.counter is not None:
+        session.counter.batches.append((session.purpose, [task.size for task in tasks]))
+        return [np.zeros(task.shape) for task in tasks]
+    counter = _Counter(sum(task.solves for task in tasks), session.progress)
+    cancel = threading.Event()
+    stored: list[bool] = []
+
+    def run(task: Task) -> Floats:
+        with run_folder(session.folder, task.name, cancel) as folder:
+            job = replace(task.stage(folder), processes=session.processes)
+            if task.matrix:
+                job = replace(job, matrix=MATRIX_FILE)
+            history: list[str] = []
+
+            def on_line(line: str) -> None:
+                counter.line(line)
+                if line.startswith("NEWTON"):
+                    history.append(line)
+
+            entry = session.cache.entry(session.getdp, job, folder) if session.cache else None
+            try:
+                if entry is None or not entry.restore(on_line):
+                    session.run(session.getdp, job, folder, on_line, cancel)
+            except GetDPError as error:
+                raise _with_history(error, newton_residuals(history)) from None
+            result = task.read(folder)
+            if entry is not None:
+                stored.append(entry.store())  # only now: reading has verified the result
+            for name in job.large:  # repeating the run by hand does not need these files
+                (folder / name).unlink()
+            return result
+
+    futures: list[Future[Floats]] = []
+    with ThreadPoolExecutor(max(1, session.jobs)) as pool:
+        try:
+            for task in tasks:  # Ctrl-C may come here, while the first runs go on already
+                futures.append(pool.submit(run, task))
+            running: Collection[Future[Floats]] = futures
+            while running:
+                done, running = wait(futures, LOOK_S, FIRST_EXCEPTION)
+                for future in done:
+                    future.result()
+            return [future.result() for future in futures]
+        finally:
+            cancel.set()  # on failure and on Ctrl-C, end the runs that still go on
+            for future in futures:
+                future.cancel()
+            if session.cache is not None and any(stored):
+                session.cache.trim()
+
+
+def _with_history(error: GetDPError, history: list[list[float]]) -> GetDPError:
+    """Return the error, with the residuals of the last sample if Newton's method failed.
+
+    ``history`` has the relative residuals by sample and step.
+    """
+    if "Newton's method did not converge" not in error.sentence or not history:
+        return error
+    residuals = tuple(history[-1])
+    return NotConvergedError(
+        f"{error.sentence} Relative residuals of sample {len(history)}: "
+        f"{', '.join(f'{residual:.1e}' for residual in residuals)}. Refine the mesh in the iron, "
+        "or smooth its H(B) curve.", residuals, error.log)
+
+
+class _Counter:
+    """Counts the finished solves of several threads, and reports them as progress."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self._lock, self._done, self._total = threading.Lock(), 0, total
+        self._progress = progress
+
+    def line(self, line: str) -> None:
+        """Count a line of a log if it reports a finished solve."""
+        if line.startswith(("SOURCE", "SAMPLE")) and self._progress is not None:
+            with self._lock:
+                self._done += 1
+                self._progress(self._done, self._total)
+
+
+def variant_name(vacuum: bool) -> str:
+    """Return the name of a variant in run folders: real materials, or vacuum in their place."""
+    return "vacuum" if vacuum else "real"
+
+
+def newton_residuals(lines: Iterable[str]) -> list[list[float]]:
+    """Return the relative residuals of Newton's method in a log of GetDP, by sample and step."""
+    history: list[list[float]] = []
+    for line in lines:
+        match = re.search(
+            r"NEWTON \d+ (\d+) (\d{1,20}(?:\.\d{1,20})?(?:e[-+]?\d+)?|nan|inf)\b", line)
+        if match and (history or match[1] == "0"):
+            if match[1] == "0":  # step 0 starts the next sample
+                history.append([])
+            history[-1].append(float(match[2]))
+    return history
+
+
+def newton_history(folder: Path) -> list[float]:
+    """Return the relative residuals of the last sample's Newton steps.
+
+    ``folder`` is a session's folder, with the finished run for the real materials.
+    """
+    log = folder / f"getdp-{variant_name(False)}" / runner.LOG_NAME
+    return newton_residuals(log.read_text("utf-8").splitlines())[-1]
+
+
+def write_history(folder: Path) -> int:
+    """Write the residuals in the log of a run as a table, and return the number of Newton steps."""
+    history = newton_residuals((folder / runner.LOG_NAME).read_text("utf-8").splitlines())
+    rows = [f"{sample},{step},{residual:.6e}" for sample, residuals in enumerate(history)
+            for step, residual in enumerate(residuals)]
+    (folder / NEWTON_HISTORY).write_text("\n".join(["sample,step,residual", *rows, ""]), "utf-8")
+    return sum(len(residuals) - 1 for residuals in history)
+
+
+@contextmanager
+def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Path]:
+    """Make a private folder for a run, and keep it after the run.
+
+    Parameters
+    ----------
+    parent : Path
+    name : str
+        The folder is kept as ``name`` if the run succeeds, and as ``name-failed`` (with the log) if
+        it raises a GetDPError. In all other cases, and if the run was cancelled, it is removed.
+    cancel : threading.Event
+        Set if the run was cancelled.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    remove_orphans(make_folder(parent))
+    folder = temporary_path(parent / name)
+    try:
+        folder.mkdir()
+        yield folder
+        _replace(folder, parent / name)
+    except GetDPError as error:
+        if cancel.is_set():
+            raise
+        if is_full(parent):  # what GetDP wrote is cut off, which it does not notice
+            raise runner.disk_error(parent, error.sentence.rstrip(".")) from None
+        failed = parent / f"{name}-failed"
+        _replace(folder, failed)
+        if error.log is not None:
+            error.log = failed / error.log.name
+        raise
+    except OSError as error:
+        raise OutputError(f"Cannot write into {parent}: {error.strerror}.") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _replace(folder: Path, target: Path) -> None:
+    """Rename a folder to ``target``, and remove the folder of an older run of that name."""
+    if os.path.lexists(target) and not is_run_folder(target):
+        raise OutputError(f"{target} is no folder of a run of GetDP, which would replace it. Name "
+                          "another folder, or move this to another place.")
+    shutil.rmtree(target, ignore_errors=True)
+    folder.rename(target)

@@ -137,6 +137,14 @@ class Gaussian:
         return self.mean + np.asarray(self.root @ draws.T).T
 
 
+def correlated_values(mean: Floats, covariance: Floats, normals: Floats) -> Floats:
+    """Return samples (count, m) of a normal distribution from standard normal numbers of the same
+    shape.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(mean + normals * np.sqrt(np.maximum(values, 0)) @ vectors.T)
+
+
 def nominal_prior(
     nominal: Floats, dimension: int, magnitude_sd: float, direction_sd_deg: float,
     common_mode_sd: float = 0.0,

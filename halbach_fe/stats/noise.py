@@ -22,15 +22,6 @@ from halbach_fe.core.errors import MeasurementError, must_be
 
 Rows = slice | Ints | NDArray[np.bool_]
 
-ASYMMETRY = 1e-9
-"""Largest asymmetry of a covariance, relative to the product of the two standard deviations.
-Rounding in products of sparse matrices gives 1e-15."""
-
-SINGULAR = 1e-12
-"""Smallest conditional variance of a reading, given the readings before it in its block, relative
-to its variance. For a singular covariance rounding leaves about 1e-15. The independent noise of a
-probe is always more than 1e-6 of the standard deviation that the readings of a point share."""
-
 
 @dataclass(frozen=True)
 class NoiseCovariance:
@@ -59,7 +50,10 @@ class NoiseCovariance:
             return
         asymmetry = abs(self.covariance - self.covariance.T).tocoo()
         rows, columns = asymmetry.coords
-        if (asymmetry.data > ASYMMETRY * self.sd[rows] * self.sd[columns]).any():
+        # largest asymmetry of a covariance, relative to the product of the two standard deviations.
+        # Rounding in products of sparse matrices gives 1e-15.
+        largest_asymmetry = 1e-9
+        if (asymmetry.data > largest_asymmetry * self.sd[rows] * self.sd[columns]).any():
             worst = int(np.argmax(asymmetry.data / (self.sd[rows] * self.sd[columns])))
             raise _covariance_error("symmetric", "two different values for readings "
                                     f"{rows[worst] + 1} and {columns[worst] + 1}")
@@ -84,6 +78,11 @@ class NoiseCovariance:
         if self.independent:
             return sparse.diags_array(self.sd).tocsr(), sparse.diags_array(1 / self.sd).tocsr()
         parts = []
+        # smallest conditional variance of a reading, given the readings before it in its block,
+        # relative to its variance. For a singular covariance rounding leaves about 1e-15. The
+        # independent noise of a probe is always more than 1e-6 of the standard deviation that the
+        # readings of a point share.
+        singular = 1e-12
         for index, blocks in _blocks(self.covariance):
             scale = self.sd[index]
             try:
@@ -91,7 +90,7 @@ class NoiseCovariance:
                 conditional_variance = np.einsum("kii->ki", lower) ** 2
             except np.linalg.LinAlgError:
                 conditional_variance = np.zeros(1)
-            if conditional_variance.min() < SINGULAR:
+            if conditional_variance.min() < singular:
                 raise _covariance_error("positive definite", "a singular or indefinite matrix, as "
                                         "if the noise of a reading were the sum of others")
             parts.append((index, scale[:, :, None] * lower,

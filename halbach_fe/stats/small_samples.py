@@ -8,9 +8,6 @@ import scipy.special as special
 from halbach_fe.core.arrays import Floats
 from halbach_fe.stats.gaussian import Gaussian, block_diagonal_root, stacked_root
 
-MIN_TESTED = 8
-"""Smallest sample size for which the approximation of the Anderson-Darling p-value is valid."""
-
 
 def false_discovery_rates(p: Floats) -> Floats:
     """Return p-values (n,) of independent tests, adjusted for their number.
@@ -131,10 +128,12 @@ def anderson_darling(samples: Floats) -> tuple[float, float]:
         p-value, by the approximation of M. A. Stephens in R. B. D'Agostino, M. A. Stephens (eds.),
         Goodness-of-Fit Techniques (1986), table 4.9.
 
-    Both are NaN for fewer than `MIN_TESTED` samples, and if all samples are equal.
+    Both are NaN for fewer than eight samples, and if all samples are equal.
     """
     count = len(samples)
-    if count < MIN_TESTED or np.ptp(samples) == 0:
+    # smallest sample size for which the approximation of the Anderson-Darling p-value is valid
+    fewest = 8
+    if count < fewest or np.ptp(samples) == 0:
         return np.nan, np.nan
     z = np.sort((samples - samples.mean()) / samples.std(ddof=1))
     odd = 2 * np.arange(count) + 1

@@ -119,7 +119,7 @@ def write_free_blocks(blocks: FreeBlocks | Mapping[str, Sequence[Any]], path: st
     if path.suffix not in (".csv", *HDF5):
         raise OutputError(must_be("suffix", where, f".csv, {', '.join(HDF5)}",
                                   f"'{path.suffix}'"))
-    table = _validated(blocks, where, lambda number: f"row {number + 1}")
+    table = validated_blocks(blocks, where)
     columns: dict[str, Sequence[Any]] = {
         column: getattr(table, column) for column in COLUMNS if table.given(column).any()}
     if "outline_m" in columns:
@@ -131,6 +131,11 @@ def write_free_blocks(blocks: FreeBlocks | Mapping[str, Sequence[Any]], path: st
         write_text(path, csv_text({column: ["" if value is None else str(value)
                                             for value in values]
                                    for column, values in columns.items()}))
+
+
+def validated_blocks(columns: FreeBlocks | Mapping[str, Sequence[Any]], where: str) -> FreeBlocks:
+    """Return columns, by name, as a table of free blocks; raise StudyError if they are none."""
+    return _validated(columns, where, lambda number: f"row {number + 1}")
 
 
 def _validated(given: object, where: str, rows: Callable[[int], str]) -> FreeBlocks:

@@ -33,8 +33,8 @@ class InstrumentSd(StudyModel):
     ``translation_m`` is the standard deviation of the place of the map's middle along each axis of
     the magnet, ``rotation_rad`` that of the turn of the map about each axis through its middle. The
     others are those of each component of the instrument's keys of the same name. State what was
-    known without the map, for a pose that `halbach-fe register` found some millimetres and 0.01, so
-    that the same readings are not counted twice.
+    known without the map, so that the same readings are not counted twice. `halbach-fe register`
+    writes this table: of the pose that it found, at least ten of its error bars.
     """
 
     translation_m: PositionSd = 0.0

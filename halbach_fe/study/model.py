@@ -166,6 +166,10 @@ class Study(StudyModel):
                             f"maps of one {shared} must state the same {table}.{key}, but those of "
                             f"{shared} '{name}' do not")
 
+    def __repr__(self) -> str:
+        """Return the name: all keys are many lines, which `halbach_fe.write_study` writes."""
+        return f"Study({self.name})"
+
     def of_map(self, number: int) -> Study:
         """Return the study of one of the maps alone, with the map's own tables."""
         one = self.maps[number]

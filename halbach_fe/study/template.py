@@ -63,17 +63,22 @@ class MagnetTemplate:
     position_sd_m: float = 1e-4
 
 
-def new_study(name: str, magnet: MagnetTemplate, folder: Path = Path()) -> str:
+def new_study(
+    name: str, magnet: MagnetTemplate, folder: Path = Path(), table: FreeBlocks | None = None
+) -> str:
     """Return the text of a valid study file in a folder, with comments that explain its keys.
+
+    ``table`` holds the blocks if they are those of no file yet.
 
     Raises
     ------
     StudyError
         If no valid study has these values.
     """
-    table, bored = None, True
+    bored = True
     if magnet.free_blocks is not None:
         table = free_blocks_of_file(folder / magnet.free_blocks)
+    if table is not None:
         inner, outer = table.radii_m
         bored = inner > MIN_LENGTH_M
         magnet = replace(magnet, outer_radius_m=float(f"{outer:.4g}"), inner_radius_m=float(
@@ -92,7 +97,7 @@ def new_study(name: str, magnet: MagnetTemplate, folder: Path = Path()) -> str:
     text = environment.get_template(TEMPLATE).render(
         name=_name(name), magnet=magnet, table=table, half=half, around=around,
         sphere=_sphere(points, flat=half is None and around > 0) if points else [])
-    parse_new_study(text, folder)
+    parse_new_study(text, folder, table)
     return text
 
 
@@ -119,10 +124,12 @@ def _half_length(magnet: MagnetTemplate, table: FreeBlocks | None) -> float | No
     return None if magnet.ring_length_m is None else magnet.rings * magnet.ring_length_m / 2
 
 
-def parse_new_study(text: str, folder: Path = Path()) -> Study:
+def parse_new_study(text: str, folder: Path = Path(), table: FreeBlocks | None = None) -> Study:
     """Return the study in a new file; raise StudyError if the options make it invalid."""
-    where = "new study"
-    return parse_study(with_free_blocks(tomllib.loads(text), folder, where), where)
+    where, document = "new study", tomllib.loads(text)
+    if table is not None:
+        document["array"]["free_blocks"] = table
+    return parse_study(with_free_blocks(document, folder, where), where)
 
 
 def write_new_study(path: Path, magnet: MagnetTemplate) -> None:

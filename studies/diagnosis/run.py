@@ -34,7 +34,8 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.material import TYPICAL_COEFFICIENT_PER_K
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.search import NominalSolver
+from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.diagnosis.search import NominalSolver, marginal_of
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT, InferenceResult
@@ -46,7 +47,7 @@ from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.stated_probabilities import (
+from halbach_fe.stats.calibration import (
     error_if_calibrated,
     expected_calibration_error,
     frequencies,
@@ -182,6 +183,9 @@ def quadrupole(points: np.ndarray, generator: np.random.Generator) -> np.ndarray
 
 
 OUTSIDE = {"coil": coil, "ripple": ripple, "quadrupole": quadrupole}
+OUTSIDE_NAME = "outside"
+"""Name of their log Bayes factor among those of hidden effects."""
+
 OUTSIDE_SIZES = (5.0, 20.0)
 """Their rms over all readings, in units of the noise."""
 
@@ -205,11 +209,13 @@ def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, A
     readings = with_outside(case, campaign.readings) if case.outside else campaign.readings
     blocks = campaign.blocks if case.with_blocks else None
     found = diagnose(study, readings, session, blocks, solver=solver)
+    best = own_factors(found, case.hidden)
+    if case.outside:
+        best[OUTSIDE_NAME] = factor_of(found, readings, readings["B_T"] - campaign.readings["B_T"])
     result = {"case": case.name, "magnet": study.name, "hidden": list(case.hidden),
               "outside": case.outside, "with_blocks": case.with_blocks,
               "labels": labels_of(study, case.faults), "truth": campaign.truth["effects"],
-              **outcome(found),
-              "best": own_factors(found, case.hidden)}
+              **outcome(found), "best": best}
     if found.unknown is None and not found.solver_error:
         result |= after_update(found, campaign, readings, session, blocks)
     if case.hidden == ("iron_ring",):
@@ -344,6 +350,17 @@ def own_factors(found: Diagnosis, hidden: Sequence[str]) -> dict[str, float]:
         beside = best_factors(found.evidence, found.candidates, others)
         factors[name] = max(beside[one] for one in names)
     return factors
+
+
+def factor_of(found: Diagnosis, readings: xr.Dataset, added: xr.DataArray) -> float:
+    """Log Bayes factor of what was added (n, 3) in T to the readings, of about that size, over
+    blocks that deviate.
+    """
+    before = found.before
+    whitened, _, marginal, residual = marginal_of(
+        before, Campaign.of(found.corrected_study, readings))
+    column = whitened(before.observation.read(np.nan_to_num(added.values)[None]))
+    return marginal.evidence(column, residual).fit([0]).log_evidence
 
 
 @cache
@@ -500,7 +517,7 @@ def summary(results: list[dict[str, Any]]) -> dict[str, float]:
     pairs = [one for one in results if len(one["hidden"]) == 2
              and all(detectable(one, name) for name in one["hidden"])]
     clean = [one for one in results if not one["hidden"] and not one["outside"]]
-    outside = [one for one in results if one["outside"]]
+    outside = [one for one in results if one["outside"] and detectable(one, OUTSIDE_NAME)]
     right = [one for one in single + pairs if all(named(one, name) for name in one["hidden"])]
     iron = [one for one in results if "fringe_T" in one]
     true = np.array([one["hidden"][0] for one in single])

@@ -24,7 +24,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.plan import plan_summary, write_plan
 from halbach_fe.report.sensitivity import Sensitivity, plan_rows, write_sensitivity
 from halbach_fe.response.matrix import Response, response_matrix
-from halbach_fe.solver.gateaux import gateaux_derivative
+from halbach_fe.solver.formulation_choice import gateaux_derivative
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import read_study

@@ -214,7 +214,7 @@ def test_forces_of_no_magnet(short_dipole, session):
     (lambda magnet, session: hf.build_magnet("study.toml"), "a Study; .* by hf.read_study"),
     (lambda magnet, session: hf.read_study(magnet), "path of read_study must be a path"),
     (lambda magnet, session: hf.Session.open(magnet), "folder of Session.open must be a path"),
-    (lambda magnet, session: hf.solve(magnet), "must be magnet, session; instead: missing"),
+    (lambda magnet, session: hf.solve(), "must be magnet, session; instead: missing"),
     (lambda magnet, session: hf.write_report(magnet), "must be result, folder; instead: missing"),
     (lambda magnet, session: hf.campaign_report("solved", "page.html"), "a list of folders"),
     (lambda magnet, session: hf.solve(session, magnet), "magnet of solve must be a Magnet"),

@@ -23,7 +23,7 @@ def files(tmp_path_factory):
     (folder / "study.toml").write_text(STUDY)
     field = np.column_stack([0 * ANGLE + 0.55, 0 * ANGLE, 0 * ANGLE])
     field[:, :2] += 1e-3 * np.random.default_rng(1).standard_normal((12, 2))
-    data = field_map(POINTS, field, sigma=np.full((12, 3), 1e-3))
+    data = field_map(POINTS, field, sigma_T=np.full((12, 3), 1e-3))
     write_map(data.assign(time_s=("point", np.arange(12.0))), folder / "map.csv")
     return folder / "study.toml", folder / "map.csv"
 
@@ -62,6 +62,33 @@ def test_every_verb_that_reads_maps_takes_the_options(files, tmp_path, capsys, v
         verb, str(study), "--measurements", str(data)]
     assert main([*words, "--length-unit", "mm", "-o", str(tmp_path / "x")]) == 4
     assert "m in the file and --length-unit mm" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_map_that_says_its_units_needs_no_option(files, tmp_path, capsys):
+    """It is read as import-map reads it, and that is said. Controls: without units it is refused,
+    and so is a map of our own with a fault.
+    """
+    study, data = files
+    lines = [line for line in data.read_text().splitlines() if not line.startswith("#")]
+    rows = np.array([line.split(",")[:6] for line in lines[1:]], float)
+    def write(name, header, table):
+        np.savetxt(tmp_path / name, table, delimiter=",", header=header, comments="", fmt="%.12g")
+        return str(tmp_path / name)
+
+    mm = write("mm.csv", "x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT]", 1e3 * rows)
+    own = write("own.csv", "x_m,y_m,z_m,Bx_T,By_T,Bz_T", rows)
+    for path, out in ((mm, "mm"), (own, "own")):
+        assert main(["infer", str(study), "--measurements", path, "-o", str(tmp_path / out)]) == 0
+        said = capsys.readouterr().err
+        assert ("positions in mm and B in mT" in said) == (out == "mm")
+    for one, other in zip(posterior(tmp_path / "mm"), posterior(tmp_path / "own"), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+    bare = write("bare.csv", "x,y,z,Bx,By,Bz", rows)
+    assert main(["infer", str(study), "--measurements", bare, "-o", str(tmp_path / "no")]) == 4
+    assert "import-map" in capsys.readouterr().err
+    (tmp_path / "own.csv").write_text((tmp_path / "own.csv").read_text() + "0.01,0,0,?,0,0\n")
+    assert main(["infer", str(study), "--measurements", own, "-o", str(tmp_path / "no")]) == 4
+    assert "?" in capsys.readouterr().err
 
 
 def test_advice_repeats_the_options(files, tmp_path, capsys):

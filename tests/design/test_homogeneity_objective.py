@@ -17,8 +17,8 @@ from scipy.stats import ks_2samp
 from halbach_fe.api import plan, shim, sort, tolerance
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, StudyError
-from halbach_fe.design.exchange_search import Assignment, Slots
 from halbach_fe.design.objective import check_objective, objective_of
+from halbach_fe.design.sorting import Assignment, Slots
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.inference.infer import infer

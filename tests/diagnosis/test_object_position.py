@@ -13,7 +13,7 @@ from halbach_fe.diagnosis.effects.surroundings import FerromagneticObjectEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.measurement.field_map import field_map, points_of
-from halbach_fe.solver.external_field import dipole_field
+from halbach_fe.solver.exact_block_field import dipole_field
 from tests.diagnosis.campaign import CIRCLES, STUDY, measured
 
 POSITION_M = np.array([0.043, 0.171, 0.148])

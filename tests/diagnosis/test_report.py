@@ -14,7 +14,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
-from halbach_fe.diagnosis.result import Suspicion, UnknownCause, UnknownPart
+from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion, UnknownCause, UnknownPart
 from halbach_fe.diagnosis.summary import (
     amounts,
     diagnosis_summary,
@@ -22,6 +22,7 @@ from halbach_fe.diagnosis.summary import (
     note,
     place_in_words,
 )
+from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import change_table, found_table, write_diagnosis_report
@@ -135,6 +136,19 @@ def test_verdicts(flat):
     assert besides.trust.startswith("Yes, but what is suspected is not in the model. ")
     assert "Measure the same map 2 times in all" in besides.step
     assert "infer" in besides.command
+    beside = [replace(one, hypothesis=Hypothesis(EFFECTS[name], Place(at_m=(0.3,) * count)),
+                      values=np.ones(count), sd=np.ones(count))
+              for name, count in (("neighbour_magnet", 1), ("ferromagnetic_object", 3))]
+    assert answer(replace(found, identified=tuple(beside))).trust.startswith("Only in part. ")
+    for each in beside:
+        assert answer(replace(found, identified=(each,))).trust.startswith("Yes. ")
+    others = [IdentifiedEffect(Hypothesis(EFFECTS[name], Place(1, 1)), np.ones(1), np.ones(1), None)
+              for name in ("block_demagnetized", "block_missing")]
+    several = replace(one, rivals=tuple(others), selection=replace(one.selection, alternatives=(
+        (Candidate("block_demagnetized", "r01s01", ()), 1.0),)))
+    assert answer(replace(found, identified=(several,), study=with_uncertain_effects(
+        found.corrected_study, [several]))).step.endswith(
+            "an update is right whichever it is; without missing block.")
     assert "Far larger" not in verdict(found)
     assert "had not converged" in verdict(replace(found, converged=False))
     assert not answer(replace(found, converged=False)).sound
@@ -172,6 +186,11 @@ def test_verdicts(flat):
     assert diagnosis_summary(doubt)["verdict"] == "suspected"
     assert diagnosis_summary(doubt)["suspected"][0]["effects"] == {"gain_x": 0.6, "gain_y": 0.3}
     assert diagnosis_summary(doubt)["suspected"][0]["not_named"] == "odds"
+    zero = IdentifiedEffect(Hypothesis(EFFECTS["gain_x"], Place()), np.ones(1), np.ones(1), None)
+    assert "right whether it is there or not" in answer(replace(
+        doubt, suspected=(replace(suspicion, fitted=(zero,)),),
+        study=with_uncertain_effects(doubt.corrected_study, [], [zero]))).step
+    assert "right whether it is there or not" not in answer(doubt).step
     for reason, said in (("which", "the map does not tell which"), ("impossible", "no valid study"),
                          ("roughly", "only estimated"), ("dropped", "dropped it again")):
         text = verdict(replace(nothing, suspected=(replace(

@@ -42,6 +42,7 @@ def test_a_few_cases(study, ring, session, hidden, outside):
     if outside:
         assert (found["unknown"], found["named"]) == ("instrument", [])
         assert "posterior_chi2" not in found
+        assert found["best"]["outside"] > 100  # five times the noise or more, of 162 readings
         return
     assert [names[0] for names in found["named"]] == [name for name, _ in hidden]
     assert study.wrong(found) == 0
@@ -76,16 +77,19 @@ def test_rates_count_what_they_say(study, tmp_path):
         result(["gain_x", "arm_sag"], [["arm_sag"], ["gain_x"]]),
         result(["gain_x", "z_scale"], [["gain_x"]]),
         result(), result(named=[["offset_x"]]), result(), result(unknown="field"),
-        result(outside="coil", unknown="field"), result(outside="ripple")]
+        result(outside="coil", unknown="field", best={"outside": 99.0}),
+        result(outside="ripple", best={"outside": 9.0}),
+        result(outside="quadrupole", best={"outside": 2.0})]  # blocks imitate it: does not count
     rates = study.summary(results)
     assert rates["single_cases"] == 4
     assert rates["naming_rate_single"] == 0.75
     assert rates["naming_rate_pairs"] == 0.5
     assert rates["false_alarm_rate"] == 0.5
     assert rates["unknown_rate"] == 0.5
+    assert rates["outside_cases"] == 2
     assert rates["iron_fringe_reduction"] == pytest.approx(10)
     assert rates["others_named_per_case"] == pytest.approx(1 / 6)
-    assert rates["yes_beside_wrong"] == pytest.approx(2 / 13)  # background, and offset_x
+    assert rates["yes_beside_wrong"] == pytest.approx(2 / 14)  # background, and offset_x
     assert rates["clean_named_rate"] == 0.25
     assert rates["first_named_single"] == 0.75
     rows = study.reliability(results)

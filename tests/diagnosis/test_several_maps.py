@@ -167,7 +167,13 @@ def test_poses_that_are_open_hide_no_effect_and_take_none(generator, tmp_path):
     assert found.study.maps[0] == found.corrected_study.maps[0]
     assert found.study.of_map(1).instrument.translation_m == (0.0, 0.0, 0.05)
     assert found.after.study.of_map(1).instrument.translation_m[2] != 0.05
-    assert separations(found, maps, Session.open(tmp_path), SOME) == []
+    # what would tell the offset from a field outside, with poses as open as before
+    offset = next(one for one in found.identified if one.hypothesis.effect.name == "offset_x")
+    doubtful = replace(found, identified=(replace(offset, selection=replace(
+        offset.selection, alternatives=((Candidate("background", "", ()), 0.0),))),))
+    (pair,) = separations(doubtful, maps, Session.open(tmp_path), SOME)
+    assert pair.recommended is not None
+    assert pair.recommended.name == "probe_rolled"
 
 
 def test_what_nobody_listed_is_unknown_and_named_with_its_map(generator, tmp_path):

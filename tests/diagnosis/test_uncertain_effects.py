@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import magpylib
 import numpy as np
 import pytest
@@ -12,14 +14,19 @@ from halbach_fe.api import shim
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.summary import STUDY_FILE, write_study
+from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.report.inference import write_inference_report
+from halbach_fe.response.block_variation import shared_deviations
 from halbach_fe.response.magnetic_axis import magnetic_axis
-from halbach_fe.response.uncertain_amplitudes import shared_deviations
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
@@ -108,6 +115,62 @@ def test_the_update_after_a_diagnosis_is_no_surer_than_it_may_be(
     assert sd == pytest.approx(tilt.sd[0], rel=0.05)  # 2 % are the wide prior's, about another mean
     assert result.amplitudes.prior_sd[0] > 3 * sd
     assert abs(tilt.values[0] + result.amplitudes.change[0] - TILT_RAD) < 3.5 * sd
+
+
+def test_what_the_map_does_not_tell_apart_is_estimated_together(session, tmp_path):
+    """Blocks with another inner radius, or farther out: whichever is the first name."""
+    generator = np.random.default_rng(1)  # other noise tells them apart
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | SHORT})
+    polarizations = drawn(study, generator)
+    wider = study.with_(array__inner_radius_m=study.array.inner_radius_m + 6e-4)
+    shown = field_map(POINTS, field(wider, polarizations, POINTS)
+                      + NOISE_T * generator.standard_normal(POINTS.shape))
+    effects = [one for one in catalogue() if one.name in ("radial_gap", "inner_radius")]
+    found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
+    (named,) = found.identified
+    (rival,) = named.rivals
+    assert {named.name, rival.name} == {"radial_gap", "inner_radius"}
+    assert found.study == with_uncertain_effects(study, [named])
+    write_study(tomlkit.dumps(study.model_dump(mode="json", exclude_none=True)), study, found,
+                tmp_path)
+    assert read_study(tmp_path / STUDY_FILE) == found.study
+    assert "the others with uncertain amplitudes about 0" in answer(found).step
+    assert answer(found).trust.startswith("Only in part")
+    least = 4 * np.sqrt(2 / polarizations.size)
+    for one, other in ((named, rival), (rival, named)):
+        both = with_uncertain_effects(study, [replace(one, rivals=(other,))])
+        chi2, result = update(both, shown, polarizations, session.within(one.name))
+        assert chi2 < 1 + least
+        change = dict(zip(result.amplitudes.names, result.amplitudes.change, strict=True))
+        assert len(change) == 2
+    first = both.with_(uncertain=both.uncertain[:1])  # the control: the wrong name alone
+    assert one.name == "radial_gap"
+    assert update(first, shown, polarizations, session.within("first"))[0] > 10
+
+
+def test_only_what_changes_nothing_is_put_beside_a_named_effect():
+    """Amplitudes of 0, and all parts of an effect. That a block is missing is no number, and a
+    memory over other rows would change that of the named one.
+    """
+    study = parse_study(DOCUMENT)
+    by_name = {one.name: one for one in catalogue()}
+
+    def found(name, values, place=None, rivals=()):
+        values = np.array(values)
+        return IdentifiedEffect(Hypothesis(by_name[name], place or Place()), values,
+                                np.abs(values), None, rivals)
+
+    slow = by_name["slow_readings"].places(study)
+    gap = found("ring_gap", [2e-4, 0.0], Place(1), (
+        found("block_missing", [1.0], Place(1, 1)), found("ring_gap", [3e-4, 0.0], Place(2)),
+        found("slow_readings", [2e-3], slow[1]), found("gain_z", [0.1])))
+    names = {one.name: one.sd for one in with_uncertain_effects(study, [gap]).uncertain}
+    assert names == {
+        "ring_gap r01.gap_m": 2e-4, "ring_gap r01.shift_m": 1e-4,  # 0 in its likeliest part
+        "ring_gap r02.gap_m": 2e-4, "ring_gap r02.shift_m": 1e-4, "gain_z.gain": 0.015}  # wide
+    moved = with_uncertain_effects(study, [gap]).array.exceptions
+    apart = [sum(one.shift_m[2] for one in moved if one.ring == ring) for ring in (1, 2, 3)]
+    assert np.ptp(apart) == pytest.approx(2e-4)  # the named gap alone
 
 
 def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator):

@@ -63,6 +63,7 @@ def test_an_unlisted_cause_is_unknown(small, diagnosed, seed):
     assert false_names(found) == []
     assert found.unknown is not None
     assert found.unknown.alone
+    assert max(found.probabilities, key=found.probabilities.get) == "unknown"
     first = found.unknown.parts[0]
     if cause.acts_on == "source":
         assert found.unknown.kind != "instrument"

@@ -30,8 +30,8 @@ from halbach_fe.core.errors import (
     OutputError,
     StudyError,
 )
+from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.regions import Regions
 from halbach_fe.inference import mcmc, storage
 from halbach_fe.inference.mcmc import _Run
 from halbach_fe.inference.storage import _stored_root, read_posterior
@@ -53,8 +53,7 @@ from halbach_fe.solver.formulation_choice import finite_element_part
 from halbach_fe.solver.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
 from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
 from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
-from halbach_fe.solver.runs import newton_residuals
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import Session, newton_residuals
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
 from halbach_fe.study.edit_file import edited_text
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS

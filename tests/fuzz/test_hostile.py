@@ -11,7 +11,7 @@ import pytest
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.solver.runs import newton_residuals
+from halbach_fe.solver.session import newton_residuals
 from tests.conftest import ROOT
 from tests.fuzz.bombs import BOMBS, SECRET
 from tests.fuzz.contract import refusal

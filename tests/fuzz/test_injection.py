@@ -12,14 +12,13 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.cli.common import print_table
 from halbach_fe.core.errors import MeasurementError, MeshError, StudyError
+from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.regions import Regions
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import Picture
-from halbach_fe.solver.formulations import CROSS_SECTION
-from halbach_fe.solver.magnetostatics import fill_run_folder
+from halbach_fe.solver.magnetostatics import CROSS_SECTION, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study

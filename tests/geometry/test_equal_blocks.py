@@ -6,9 +6,9 @@ import tomllib
 
 import pytest
 
-from halbach_fe.geometry.equal_blocks import own_turns, turned_onto
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.symmetry import rotation_about_z
+from halbach_fe.geometry.symmetry import block_images, symmetry_images
 from tests.conftest import parse_study
 from tests.support.short_dipole import TEXT
 
@@ -19,8 +19,8 @@ def test_an_ideal_multipole_is_turned_onto_itself(order, blocks, count):
     magnet = build_magnet(parse_study(tomllib.loads(TEXT.replace(
         "multipole_order = 1", f"multipole_order = {order}").replace(
         "blocks_per_ring = 8", f"blocks_per_ring = {blocks}"))))
-    turns = own_turns(magnet)
+    turns = symmetry_images(magnet)
     assert len(turns) == count  # 2 n less the one that leaves all blocks where they are
     assert all(sorted(each) == list(range(len(magnet.blocks))) for each in turns)
-    third = turned_onto(magnet, rotation_about_z(2.0943951023931953))
+    third = block_images(magnet, rotation_about_z(2.0943951023931953))
     assert (third is not None) == (order == 3)

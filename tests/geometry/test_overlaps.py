@@ -13,10 +13,10 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.free_blocks import sector_outline
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import closed_outline, plane_rotation
+from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.geometry.overlaps import block_in_iron, overlapping_blocks
 
 INNER, OUTER = 0.104, 0.1865
@@ -52,7 +52,7 @@ def outline_of(kind, count, number, first=0.0, inner=INNER, outer=OUTER):
     near = inner * np.tan(np.pi / count)
     far = near if kind == "cuboid" else outer * np.tan(np.pi / count)  # inner corners touch
     corners = np.array([(inner, -near), (outer, -far), (outer, far), (inner, near)])
-    return closed_outline(corners @ plane_rotation(angle).T)
+    return closed_outline(corners @ rotation_about_z(angle)[:2, :2].T)
 
 
 def ring(kind="sector", count=16, limits=FINITE, **values):

@@ -21,6 +21,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, shared_doubts
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.prior import answer, write_prior
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
@@ -234,6 +235,24 @@ def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, 
     with pytest.warns(HalbachWarning, match=r"known to \d+ % only, where the study alone states "):
         assert "Not yet" in answer(prior(truth, sigma=moments / 2)).trust
     assert prior(1.3 * truth, vacuum_dipole(prior__common_mode_sd=0.2)).doubts == ()
+
+
+def test_a_table_with_a_common_uncertainty_is_not_doubted(vacuum_dipole, generator):
+    """All blocks 2 % stronger than a table of 1 % each is nothing that chance does. Controls:
+    the table itself, and a coil whose calibration is known to 2 %.
+    """
+    slots, rings, truth = blocks_and_truth(vacuum_dipole(), generator)
+
+    def doubted(factor, **keys):
+        magnet = build_magnet(vacuum_dipole(**keys))
+        table = table_of(vacuum_dipole(), slots, truth, rings)
+        sigma = 0.01 * np.linalg.norm(table.moment, axis=1)
+        prior = prior_from_blocks(magnet, replace(table, sigma=sigma)).gaussian
+        return [one.name for one in shared_doubts(magnet, factor * prior.mean, prior)]
+
+    assert doubted(1.02) == [ALL_BLOCKS]
+    assert doubted(1.0) == []
+    assert doubted(1.02, prior__common_mode_sd=0.02) == []
 
 
 def test_moments_are_kept(vacuum_dipole, generator):

@@ -28,7 +28,10 @@ from halbach_fe.inference.registration import (
     register,
     turn_from_axes,
 )
+from halbach_fe.magnets import to_magpylib
 from halbach_fe.measurement.doubted_terms import (
+    ALL_AXES,
+    ALL_BLOCKS,
     Term,
     doubted_from,
     doubts,
@@ -103,18 +106,22 @@ def magnet():
     return build_magnet(parse_study(tomllib.loads(TEXT)))
 
 
-def quadrupole_map(generator, factor):
-    """A ring of eight sectors by magpylib, 1 % off, read with a factor."""
-    sources = []
-    for slot in range(8):
-        direction = np.radians(135.0 * slot)
-        size = 1.3 * (1 + 0.01 * generator.standard_normal())
-        sources.append(magpylib.magnet.CylinderSegment(
-            dimension=(0.02, 0.04, 0.03, 45.0 * slot - 22.5, 45.0 * slot + 22.5),
-            polarization=size * np.array([np.cos(direction), np.sin(direction), 0.0])))
+def quadrupole_field(points, sizes=(1.3,) * 8):
+    """A ring of eight sectors by magpylib, of these remanences in T."""
+    return magpylib.Collection(*(magpylib.magnet.CylinderSegment(
+        dimension=(0.02, 0.04, 0.03, 45.0 * slot - 22.5, 45.0 * slot + 22.5),
+        polarization=size * np.array([np.cos(angle), np.sin(angle), 0.0]))
+        for slot, size, angle in zip(range(8), sizes, np.radians(135.0 * np.arange(8)),
+                                     strict=True))).getB(points)
+
+
+def quadrupole_map(generator, factor, spread=0.01, turn_rad=0.0):
+    """The ring with blocks 1 % off, turned about z, read with a factor."""
+    sizes = 1.3 * (1 + spread * generator.standard_normal(8))
     points = np.stack(np.meshgrid(0.004 * np.arange(-2, 3), 0.004 * np.arange(-2, 3),
                                   0.006 * np.arange(-3, 4), indexing="ij"), -1).reshape(-1, 3)
-    field = factor * magpylib.Collection(*sources).getB(points)
+    turn = Rotation.from_rotvec([0, 0, turn_rad])
+    field = factor * turn.apply(quadrupole_field(turn.inv().apply(points), sizes))
     return field_map(points, field + 2e-4 * generator.standard_normal(field.shape))
 
 
@@ -274,6 +281,60 @@ def test_terms_that_infer_finds_are_judged_too(generator, tmp_path):
     assert any(name.startswith("gain of B") for name in named)
     assert "gain of B" in off.disagreement
     assert infer(magnet, quadrupole_map(generator, 1.01), Session.open(tmp_path / "c")).doubts == ()
+
+
+@pytest.mark.parametrize(("factor", "turn", "also", "doubted"), [
+    (1.02, 0.0, "", [ALL_BLOCKS]), (1.0, 0.01, "", [f"{ALL_AXES} about z"]),
+    (1.0, 0.0, "", []), (1.02, 0.0, "\n[instrument_sd]\ngain = 0.02\n", []),
+    (1.02, 0.0, "common_mode_sd = 0.02", []),
+    (1.0, 0.01, "\n[instrument_sd]\nrotation_rad = 0.05\n", [])])
+def test_what_all_blocks_share_is_compared_with_the_prior_of_their_mean(
+        factor, turn, also, doubted, generator, tmp_path):
+    """A map times 1.02 moves no block by more than three of its standard deviations, but their
+    mean, which is known to 1 %/sqrt(8), by 5. A map turned by 10 mrad about z turns all
+    magnetizations of the quadrupole back by twice as much: so does a turn of the ring. Controls:
+    the map itself, and studies that state how far instrument or batch may be off.
+    """
+    text = QUADRUPOLE.replace("common_mode_sd = 0.01", also)
+    magnet = build_magnet(parse_study(tomllib.loads(text)))
+    result = infer(magnet, quadrupole_map(generator, factor, 0.002, turn), Session.open(tmp_path))
+    said = inference_answer(result)
+    assert [one.name for one in result.shared_doubts] == doubted
+    assert said.trust.startswith("Only with care" if doubted else "Yes")
+    if doubted:
+        term = result.shared_doubts[0]
+        expected = factor - 1 if factor != 1 else -2 * turn
+        assert term.value == pytest.approx(expected, rel=0.2)
+        assert term.distance > 4.5
+        assert ("gain of the instrument" in said.trust) == (factor != 1)
+        assert f"[instrument_sd] {'rotation_rad' if turn else 'gain'}" in said.trust
+
+
+@pytest.mark.parametrize(("weak", "sigma_T", "held"), [
+    (0.12, 1e-3, True),
+    (0.015, 1e-3, False),  # 1.5 standard deviations of its prior
+    (0.12, 2e-6, False)])  # the readings alone say where it is
+def test_a_block_that_its_prior_holds_back_is_named(generator, tmp_path, weak, sigma_T, held):
+    """One block is weaker than a prior of 1 % allows, and the readings know it to 0.5 % only."""
+    magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
+    source = to_magpylib(magnet)
+    source[2].polarization = (1 - weak) * source[2].polarization
+    points = 0.6 * GRID
+    result = infer(magnet, field_map(points, source.getB(points) + sigma_T * (
+        generator.standard_normal(points.shape)), sigma_T), Session.open(tmp_path))
+    block = np.linalg.norm(result.posterior.mean[6:9]) / np.linalg.norm(
+        magnet.nominal_magnetization[6:9])
+    said = inference_answer(result)
+    assert [one.name for one in result.held_back][:1] == ["block r01s03"] * held
+    if held:
+        assert not said.sound
+        assert block > 1 - weak + 0.005  # it is held back indeed
+        assert said.trust.startswith("Only in part. Block")
+        assert "r01s03" in said.trust
+        assert "halbach-fe diagnose" in said.command
+    else:
+        assert block == pytest.approx(1 - weak, abs=0.01)
+        assert "Only in part" not in said.trust
 
 
 def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path):

@@ -108,10 +108,15 @@ def test_a_map_of_one_component(generator, tmp_path, errors, axis):
     assert known.components == f"B{'xyz'[axis]}"
     assert f"map, B{'xyz'[axis]} alone" in page
     assert "the direction of the mean of B is not told" in page
-    # what lies across adds (B_across / B)^2 / 2 to |B|
+    # what lies across adds (B_across / B)^2 / 2 to |B|; its bars are those of this component
     across = np.linalg.norm(np.delete(field, axis, axis=1), axis=1)
     second = float(np.max(across**2 / size**2)) / 2
-    assert known.mean_T == pytest.approx(mean, abs=4 * known.mean_sd_T + second * mean)
+    said = re.search(r"but for some ([\d.\u202f]+) ppm", found.map_remarks[0])[1]
+    stated = 1e-6 * float(said.replace("\u202f", ""))
+    assert second / 3 < stated < 5 * second
+    assert known.mean_T == pytest.approx(float(weights @ np.abs(field[:, axis])),
+                                         abs=4 * known.mean_sd_T)
+    assert known.mean_T == pytest.approx(mean, abs=4 * known.mean_sd_T + stated * mean)
     assert known.mean_sd_T < 1e-4 * mean  # which was ten times the field
     for each in found.of_map.values():
         low, middle, high = each.rms_range_ppm
@@ -132,7 +137,7 @@ def test_a_map_of_the_magnitude(generator, tmp_path, errors):
     size = np.linalg.norm(true_field(1, points, errors=errors), axis=1)
     mean = float(weights @ size)
     rms = 1e6 * float(np.sqrt(weights @ (size / mean - 1)**2))
-    second = float(re.search(r"but for some (\d+) ppm", found.map_remarks[0])[1])
+    second = float(re.search(r"but for some ([\d.]+) ppm", found.map_remarks[0])[1])
     assert second < 500  # 3 % of 36 blocks leave some 1 % of the field: 100 ppm
     # of 729 readings: 2.6 % is one sd; what is of second order is no noise
     assert 0.9 < found.map_misfit < np.hypot(1, 1e-6 * second * mean / NOISE_T) + 0.1

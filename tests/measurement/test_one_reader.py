@@ -22,7 +22,7 @@ def imported(tmp_path, text, **declared):
 
 
 def full_map():
-    data = field_map(POINTS, FIELD, sigma=1e-5 * (1 + np.arange(18).reshape(6, 3)),
+    data = field_map(POINTS, FIELD, sigma_T=1e-5 * (1 + np.arange(18).reshape(6, 3)),
                      attributes={"probe": "Hall, serial 0815", "temperature": "21 °C"})
     return data.assign(time_s=("point", 3.25 + 1.5 * np.arange(6)),
                        scan=("point", np.array(["a", "a", "b", "b", "7", "7"])))

@@ -13,7 +13,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.verification import answer, write_verification
 from halbach_fe.report.words import decimals, flux_density, ppm, relative
-from halbach_fe.response.mesh_convergence import observed_order, refined, verify
+from halbach_fe.response.discretization_error import observed_order, refined, verify
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from tests.support.pages import page

@@ -31,8 +31,12 @@ from halbach_fe.response.nonlinear import (
 )
 from halbach_fe.solver import condensed_newton as engine
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
-from halbach_fe.solver.formulations import CROSS_SECTION
-from halbach_fe.solver.magnetostatics import nominal_samples, solve_samples, solve_tangent
+from halbach_fe.solver.magnetostatics import (
+    CROSS_SECTION,
+    nominal_samples,
+    solve_samples,
+    solve_tangent,
+)
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.solver.session import Session

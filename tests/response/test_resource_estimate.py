@@ -18,7 +18,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import resource_estimate
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors, refined
 from halbach_fe.solver import mesh
-from halbach_fe.solver.formulation_choice import MESHES, choose_route, finite_element_part
+from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from halbach_fe.solver.getdp import run
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
@@ -69,7 +69,7 @@ def studies(dipole, short_dipole):
 @pytest.mark.parametrize("name", ["cross-section", "modes", "symmetry", "second order"])
 def test_a_small_mesh_is_counted_exactly(studies, name, tmp_path):
     study = studies[name]
-    kind = MESHES[choose_route(build_magnet(study), observation_of(study).points)]
+    kind = choose_route(build_magnet(study), observation_of(study).points).mesh
     build = mesh.build_meridian if kind == "meridian" else mesh.build_mesh
     real = mesh.verify_mesh(build(build_magnet(study), tmp_path))
     found = mesh.count_mesh(build_magnet(study), kind)

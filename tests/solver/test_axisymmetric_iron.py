@@ -10,10 +10,9 @@ import pytest
 from halbach_fe.core.errors import GetDPError, PointsOutsideError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import iron_modes
-from halbach_fe.solver.axisymmetric_iron import solve_iron
+from halbach_fe.solver.axisymmetric_iron import coupled_modes, solve_iron, to_angles, to_modes
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.iron_grid import IronRectangle, Resolution, grid_lines, iron_cells
-from halbach_fe.solver.iron_newton import coupled_modes, to_angles, to_modes
+from halbach_fe.solver.iron_modes import IronRectangle, Resolution, grid_lines, iron_cells
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.study.materials import froehlich_kennelly
 from halbach_fe.synthetic import ngsolve_reaction

@@ -16,7 +16,6 @@ import pytest
 from halbach_fe.core.errors import GetDPError, GetDPNotFoundError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.formulation_choice import solve_nominal
-from halbach_fe.solver.formulations import CROSS_SECTION, edge_elements
 from halbach_fe.solver.getdp import (
     ENVIRONMENT_VARIABLE,
     GetDP,
@@ -29,7 +28,13 @@ from halbach_fe.solver.getdp import (
     read_vectors,
     run,
 )
-from halbach_fe.solver.magnetostatics import FLUX_DENSITY_FILE, SOLUTIONS_FILE, fill_run_folder
+from halbach_fe.solver.magnetostatics import (
+    CROSS_SECTION,
+    FLUX_DENSITY_FILE,
+    SOLUTIONS_FILE,
+    edge_elements,
+    fill_run_folder,
+)
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.session import Session
 from tests.conftest import circle

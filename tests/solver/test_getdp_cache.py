@@ -18,7 +18,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
-from halbach_fe.core.temporary_files import remove_orphans, temporary_name
+from halbach_fe.core.files import remove_orphans, temporary_name
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp_cache as module
 from halbach_fe.solver.formulation_choice import solve_nominal

@@ -10,11 +10,10 @@ from halbach_fe.core.files import make_folder
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver import azimuthal_modes, grid_interpolation
+from halbach_fe.solver import azimuthal_modes, interpolation
 from halbach_fe.solver.azimuthal_modes import solve_modes
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.grid_interpolation import SAME_LINE
-from halbach_fe.solver.interpolation import nodal_operators
+from halbach_fe.solver.interpolation import SAME_LINE, nodal_operators
 from halbach_fe.solver.mesh import build_meridian, verify_mesh
 from tests.conftest import circle
 
@@ -63,8 +62,8 @@ def test_readings_on_grid_lines_have_columns_that_add_up(short_dipole, session, 
     found = response_matrix(magnet, observation, session.within("both"))
     assert found.superposition_error < 1e-11  # rounding; measured 2e-13 for such a magnet
 
-    first_line = grid_interpolation._first_line
-    monkeypatch.setattr(grid_interpolation, "_first_line", lambda lines, at, side, *given, **more:
+    first_line = interpolation._first_line
+    monkeypatch.setattr(interpolation, "_first_line", lambda lines, at, side, *given, **more:
                         first_line(lines, at, "right", *given, **more))
     with pytest.raises(GetDPError, match="do not add up"):
         response_matrix(magnet, observation, session.within("one"))

@@ -11,8 +11,7 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import check_superposition, response_matrix, superposition_error
 from halbach_fe.solver.exact_block_field import field_of, unit_field
 from halbach_fe.solver.formulation_choice import solve_nominal
-from halbach_fe.solver.formulations import edge_elements
-from halbach_fe.solver.magnetostatics import solve_sources
+from halbach_fe.solver.magnetostatics import edge_elements, solve_sources
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from tests.conftest import circle
 

@@ -12,9 +12,15 @@ from scipy.sparse.linalg import spsolve
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import read_solutions, read_unknowns
-from halbach_fe.solver.formulations import CROSS_SECTION, SCALAR_POTENTIAL, edge_elements
 from halbach_fe.solver.interpolation import locate, probes_of
-from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, RunRequest, fill_run_folder
+from halbach_fe.solver.magnetostatics import (
+    CROSS_SECTION,
+    SCALAR_POTENTIAL,
+    SOLUTIONS_FILE,
+    RunRequest,
+    edge_elements,
+    fill_run_folder,
+)
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from tests.conftest import circle
 

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError
-from halbach_fe.solver import runs
 from halbach_fe.solver.getdp import Job
-from halbach_fe.solver.runs import Task, run_tasks
-from halbach_fe.solver.session import RunSize
+from halbach_fe.solver.session import RunSize, Task, run_tasks
 
 PATIENCE_S = 60.0
 """What a run that nobody ends would take."""
@@ -41,7 +39,7 @@ def test_an_interruption_while_runs_are_handed_out_ends_the_first(session, monke
             assert begun.wait(PATIENCE_S)
             return future
 
-    monkeypatch.setattr(runs, "ThreadPoolExecutor", Interrupted)
+    monkeypatch.setattr("halbach_fe.solver.session.ThreadPoolExecutor", Interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_tasks([task("one"), task("two")], replace(session, run=run))
     assert ended == [True], "the first run went on until its end"

@@ -9,13 +9,18 @@ import pytest
 import xarray as xr
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.design.measurement_plan import plan_measurement, spread
+from halbach_fe.design.measurement_plan import (
+    greedy,
+    information,
+    plan_measurement,
+    spread,
+    variance_left,
+)
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.stats.d_optimal import greedy, information, variance_left
 from halbach_fe.stats.gaussian import nominal_prior
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}

@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import SamplingError
-from halbach_fe.stats.convergence import assess_convergence, require_convergence
+from halbach_fe.stats.calibration import ranks, uniformity
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import update
 from halbach_fe.stats.noise import independent_noise
-from halbach_fe.stats.pcn import Posterior, Proposal, laplace, prior_reference, sample
-from halbach_fe.stats.sbc import ranks, uniformity
+from halbach_fe.stats.pcn import (
+    Posterior,
+    Proposal,
+    assess_convergence,
+    laplace,
+    prior_reference,
+    require_convergence,
+    sample,
+)
 
 SIZE = 3
 

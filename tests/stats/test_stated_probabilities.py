@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from halbach_fe.stats.stated_probabilities import (
+from halbach_fe.stats.calibration import (
     Bin,
     error_if_calibrated,
     expected_calibration_error,

@@ -17,8 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import _key
-from halbach_fe.solver.formulations import CROSS_SECTION
-from halbach_fe.solver.magnetostatics import fill_run_folder
+from halbach_fe.solver.magnetostatics import CROSS_SECTION, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.session import Session
 from halbach_fe.study import materials

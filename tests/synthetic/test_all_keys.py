@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.external_field import external_field
+from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.moments.solve import solve_moments
 from halbach_fe.study.array import Array, BlockException, Ring
 from halbach_fe.study.free_blocks import COLUMNS, SIZES

@@ -134,8 +134,8 @@ def _apart_and_along(nominal: NominalFields, place: Place, number: int) -> list[
 def _gap_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of the rings that a gap and a common shift move."""
     rings, (gap, shift) = study.array.rings, values
-    return [BlockException(ring=ring, shift_m=(0.0, 0.0, length)) for ring in range(1, rings + 1)
-            if (length := _apart(rings, place.ring, ring) * gap + shift)]
+    return [BlockException(ring=ring, shift_m=(
+        0.0, 0.0, _apart(rings, place.ring, ring) * gap + shift)) for ring in range(1, rings + 1)]
 
 
 EFFECTS = (

@@ -11,7 +11,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, added
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.external_field import dipole_field, neighbour_field
+from halbach_fe.solver.exact_block_field import dipole_field, neighbour_field
 from halbach_fe.solver.formulation_choice import choose_route
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.magnet import Neighbour, PointDipole

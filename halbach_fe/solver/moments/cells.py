@@ -23,10 +23,6 @@ CHORD = np.pi / 6
 """Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
 1.7 % of its radius on either side, if its area is right."""
 
-ROUND = 6
-"""Largest number of corners of a convex polygon that is cut at the middles of its sides. A rounder
-one is cut from its centroid to every other corner, which makes half as many cells."""
-
 
 @dataclass(frozen=True)
 class Cells:
@@ -177,7 +173,7 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     """Return centres, axes, vertices, half heights and cuboid flags in the block's frame."""
     height = block.z_max - block.z_min
     size = np.cbrt(block.volume) / per_side
-    quads = _corrected(quadrilaterals(block.outline, size, per_side), block)
+    quads = _scale_to_outline(quadrilaterals(block.outline, size, per_side), block)
     layers = max(per_side, round(height / size))
     levels = block.z_min + height * (np.arange(layers) + 0.5) / layers
     _, middle = area_and_centroid(quads)
@@ -225,7 +221,7 @@ def _outline_centroid(block: MagnetBlock) -> Floats:
     return total / block.area
 
 
-def _corrected(quads: Floats, block: MagnetBlock) -> Floats:
+def _scale_to_outline(quads: Floats, block: MagnetBlock) -> Floats:
     """Scale and move quadrilaterals (k, 4, 2) to the area and the centroid of an outline."""
     if not any(edge.arc for edge in block.outline):
         return quads
@@ -244,7 +240,7 @@ def quadrilaterals(outline: Outline, size: float, least: int = 1) -> Floats:
     if grid is not None:
         return _grid(grid, size, least)
     polygon = _polygon(outline, size)
-    pieces = _from_centroid(polygon) if _is_convex(polygon) else _merged(
+    pieces = _cut_from_centroid(polygon) if _is_convex(polygon) else _merge_triangles(
         polygon, _triangles(polygon))
     return np.concatenate([_grid(_edges(piece), size) for piece in pieces])
 
@@ -316,11 +312,14 @@ def _is_convex(polygon: Floats) -> bool:
                for i in range(len(polygon)))
 
 
-def _from_centroid(polygon: Floats) -> list[Floats]:
+def _cut_from_centroid(polygon: Floats) -> list[Floats]:
     """Cut a convex polygon (m, 2) into quadrilaterals about its centroid."""
     centre = area_and_centroid(polygon[None])[1][0]
     count = len(polygon)
-    if count <= ROUND:
+    # largest number of corners of a convex polygon that is cut at the middles of its sides. A
+    # rounder one is cut from its centroid to every other corner, which makes half as many cells.
+    most_corners = 6
+    if count <= most_corners:
         middles = (polygon + np.roll(polygon, -1, axis=0)) / 2
         return [np.array([polygon[i], middles[i], centre, middles[i - 1]]) for i in range(count)]
     pieces = [np.array([centre, polygon[i], polygon[i + 1], polygon[(i + 2) % count]])
@@ -349,7 +348,7 @@ def _triangles(polygon: Floats) -> list[tuple[int, int, int]]:
     return [*found, (left[0], left[1], left[2])]
 
 
-def _merged(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floats]:
+def _merge_triangles(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floats]:
     """Return quadrilaterals of the triangles of a polygon (m, 2).
 
     Two triangles that share a side become one if it is convex; others are cut in three.
@@ -371,5 +370,5 @@ def _merged(polygon: Floats, triangles: list[tuple[int, int, int]]) -> list[Floa
                 continue
             break
         else:
-            pieces += _from_centroid(polygon[list(triangle)])
+            pieces += _cut_from_centroid(polygon[list(triangle)])
     return pieces

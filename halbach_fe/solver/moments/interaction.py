@@ -17,33 +17,14 @@ from halbach_fe.solver.exact_block_field import matrix_of
 from halbach_fe.solver.moments import near, tree
 from halbach_fe.solver.moments.cells import Cells, gauss_nodes
 
-OPENING = 0.6
-"""Largest sum of the radii of two clusters, relative to their distance, that allows expansions."""
-
-DEGREE = 6
-"""Degree of the expansions between cells. The reaction of 96 cubes differs by less than 1e-5 of it
-from that by exact sums."""
-
 READING_DEGREE = 12
 """Degree of the expansions at points, where an error is not multiplied by chi. In the bore of 96
 cubes the error was 3e-4 of the reaction, and 6e-4 with degree 8."""
-
-FAR_REACH = 2.5
-"""Distance of points from a cell with 2 nodes per direction, in radii of it, below which they see
-exact parts of it, if expansions have `READING_DEGREE`. The field of its dipoles is 3e-5 of its
-polarization off there, and 5e-4 at 1.7 radii; with 3 nodes it is 3e-5 off at 1.7."""
-
-TOUCHING, CLOSE = 1.0, 1.4
-"""Distances of two cells, in units of the sum of their radii, below which they count as touching or
-close."""
 
 QUADRATURES = ((8, True), (4, False), (3, False), (3, False), (2, False))
 """Gauss nodes per direction for the mean of the field of a near cell, and whether they are graded
 towards the faces: touching cells of one block, of two blocks, close ones of two blocks, other ones
 of one block, of two blocks. A block's own permeability makes its own cells matter most."""
-
-ALIKE = 1e-8
-"""Largest difference of congruent pairs of cells, relative to the largest cell."""
 
 MOST_KEPT = 10_000_000
 """Largest number of near pairs whose matrices at 8 nodes are kept: 1 GB."""
@@ -113,8 +94,8 @@ class Interaction:
     """
 
     cells: Cells
-    opening: float = OPENING
-    degree: int = DEGREE
+    opening: float = 0.6
+    degree: int = 6  # the reaction of 96 cubes differs by less than 1e-5 from exact sums
     reading_degree: int = READING_DEGREE
 
     @cached_property
@@ -158,12 +139,16 @@ class Interaction:
         """
         cells, close = self.cells, self._pairs[1]
         targets, sources = close.targets, close.sources
+        # distances of two cells, in units of the sum of their radii, below which they count as
+        # touching or close
+        touching, near_ratio = 1.0, 1.4
         is_near = [near.touching(targets, sources, cells.centre, cells.radius, ratio)
-                   for ratio in (TOUCHING, TOUCHING + 1e-6, CLOSE)]
+                   for ratio in (touching, touching + 1e-6, near_ratio)]
         quadrature = np.where(
             cells.block[targets] == cells.block[sources], np.where(is_near[1], 0, 3),
             np.where(is_near[0], 1, np.where(is_near[2], 2, 4)))
-        scale = ALIKE * float(cells.radius.max())
+        alike = 1e-8  # largest difference of congruent pairs of cells, relative to the largest cell
+        scale = alike * float(cells.radius.max())
         shapes = np.unique(np.round(np.hstack([
             cells.vertices.reshape(len(cells), -1) / scale, cells.half[:, None] / scale,
             cells.cuboid[:, None]])), axis=0, return_inverse=True)[1].ravel()
@@ -183,7 +168,7 @@ class Interaction:
             distinguish(np.einsum("nj,nj->n", cells.axes[targets, :, i], offset) / scale)
             for j in range(3):
                 distinguish(np.einsum("nk,nk->n", cells.axes[targets, :, i],
-                                      cells.axes[sources, :, j]) / ALIKE)
+                                      cells.axes[sources, :, j]) / alike)
         _, first, kinds = np.unique(keys, return_index=True, return_inverse=True)
         return first, kinds.ravel(), quadrature[first]
 
@@ -389,7 +374,12 @@ class Interaction:
         if self.opening == 0:
             return np.inf
         exact = self.cells.divisions == 2 and self.reading_degree >= READING_DEGREE
-        return max(FAR_REACH if exact else 0.0, 1 / self.opening)
+        # distance of points from a cell with 2 nodes per direction, in radii of it, below which
+        # they see exact parts of it, if expansions have `READING_DEGREE`. The field of its dipoles
+        # is 3e-5 of its polarization off there, and 5e-4 at 1.7 radii; with 3 nodes it is 3e-5 off
+        # at 1.7.
+        far_reach = 2.5
+        return max(far_reach if exact else 0.0, 1 / self.opening)
 
     def readings(self, points: Floats) -> Floats:
         """Return the field at points (k, 3) in m per polarization of nodes, (k, 3, n, q, 3)."""

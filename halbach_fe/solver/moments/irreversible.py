@@ -40,33 +40,9 @@ from halbach_fe.solver.moments.solve import Applied, Moments, System
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 
-AT_KNEE = 0.9
-"""Part of the remanence that is left at the knee, by the definition of H_k in IEC 60404-8-1."""
-
-TOLERANCE = 1e-4
-"""Largest residual of a polarization, relative to the remanence, that ends Newton's method. Losses
-are some 10 % where they matter, and the coercivity is hardly known to 1 %."""
-
-MAX_STEPS, MAX_HALVINGS = 40, 6
-"""Largest number of Newton's steps, and of halvings of one of them."""
-
-INNER_TOLERANCE, INNER_STEPS = 0.05, 30
-"""Residual that ends GMRES, relative to its right-hand side, and its largest number of steps."""
-
-INNER_DEGREE = 3
-"""Degree of the expansions within GMRES, whose result only has to point the right way."""
-
-OWN_FIELD = 1 / 3
-"""Field of a cell in itself relative to its polarization, for the preconditioner: that of a
-cube."""
-
-
 TUBE = 1 / 2
 """Field within a long tube that is polarized across, relative to its polarization: such tubes are
 what is lost along the edges."""
-
-BISECTIONS = 40
-"""Steps of the bisection for the part of the remanence at a node, to 1e-12."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +71,9 @@ class KneeLaw:
     @property
     def width_T(self) -> float:  # noqa: N802 - a unit
         """The width w in T."""
-        return self.coercivity_T * (1 - self.squareness) / (2 * float(np.arctanh(AT_KNEE)))
+        # part of the remanence that is left at the knee, by the definition of H_k in IEC 60404-8-1
+        at_knee = 0.9
+        return self.coercivity_T * (1 - self.squareness) / (2 * float(np.arctanh(at_knee)))
 
     def kept(self, field: Floats) -> Floats:
         """Return the part p of the remanence that is left at mu_0 H . u = ``field``, in T."""
@@ -113,7 +91,8 @@ class KneeLaw:
         all arguments are broadcast.
         """
         least, most = -np.ones(field.shape), np.ones(field.shape)
-        for _ in range(BISECTIONS):
+        bisections = 40  # steps of the bisection for the part of the remanence at a node, to 1e-12
+        for _ in range(bisections):
             part = (least + most) / 2
             is_above = part > self.kept(field - TUBE * (strength * part - mean))
             least, most = np.where(is_above, least, part), np.where(is_above, part, most)
@@ -210,35 +189,46 @@ def _uniform(
 
     polarization = system.remanence
     left, part, slope = residual(polarization)
-    for count in range(MAX_STEPS):
+    # largest residual of a polarization, relative to the remanence, that ends Newton's method.
+    # Losses are some 10 % where they matter, and the coercivity is hardly known to 1 %.
+    tolerance = 1e-4
+    # largest number of Newton's steps, and of halvings of one of them
+    most_steps, most_halvings = 40, 6
+    # residual that ends GMRES, relative to its right-hand side, and its largest number of steps
+    gmres_tolerance, gmres_steps = 0.05, 30
+    # degree of the expansions within GMRES, whose result only has to point the right way
+    degree = 3
+    # field of a cell in itself relative to its polarization, for the preconditioner: that of a cube
+    own_field = 1 / 3
+    for count in range(most_steps):
         size = float(np.linalg.norm(left))
-        if np.abs(left).max(initial=0.0) <= TOLERANCE * scale:
+        if np.abs(left).max(initial=0.0) <= tolerance * scale:
             return polarization, part, count
         by_field = (strength * slope)[:, None, None] * (easy[:, :, None] * easy[:, None])
         tangent, own = chi + by_field, np.eye(3) - tube * by_field
 
         def times(vector: Floats, tangent: Floats = tangent, own: Floats = own) -> Floats:
             step = vector.reshape(-1, 3)
-            field = interaction.mean_field(step, INNER_DEGREE)
+            field = interaction.mean_field(step, degree)
             return np.asarray(np.einsum("nij,nj->ni", own, step)
                               - np.einsum("nij,nj->ni", tangent, field)).ravel()
 
-        inverse = np.asarray(np.linalg.inv(own + OWN_FIELD * tangent), float)
+        inverse = np.asarray(np.linalg.inv(own + own_field * tangent), float)
 
         def precondition(vector: Floats, inverse: Floats = inverse) -> Floats:
             return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).ravel()
 
         unknowns = (left.size, left.size)
         step, _ = gmres(LinearOperator(unknowns, times, dtype=float), -left.ravel(),
-                        rtol=INNER_TOLERANCE, restart=INNER_STEPS, maxiter=1,
+                        rtol=gmres_tolerance, restart=gmres_steps, maxiter=1,
                         M=LinearOperator(unknowns, precondition, dtype=float))
         step = step.reshape(-1, 3)
-        for halving in range(MAX_HALVINGS):
+        for halving in range(most_halvings):
             tried = polarization + step / 2**halving
             left, part, slope = residual(tried)
             if np.linalg.norm(left) < size:
                 break
         polarization = tried
     raise HalbachError(
-        f"The irreversible losses of the blocks do not settle in {MAX_STEPS} steps: the last left "
+        f"The irreversible losses of the blocks do not settle in {most_steps} steps: the last left "
         f"{np.abs(left).max() / scale:.1e} of the remanence. Please report this with the study.")

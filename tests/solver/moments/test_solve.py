@@ -15,9 +15,13 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.solver.moments.columns import reaction_columns
 from halbach_fe.solver.moments.interaction import Interaction
-from halbach_fe.solver.moments.solve import System, reaction_with_errors, solve_moments
+from halbach_fe.solver.moments.solve import (
+    System,
+    reaction_columns,
+    reaction_with_errors,
+    solve_moments,
+)
 from tests.solver.moments.bodies import OUTLINES, block, cuboid, cuboid_matrix, graded
 
 SIDE = 0.012

@@ -1,0 +1,351 @@
+"""Magnets made in Python, without a file: of rings, of single blocks, and of magpylib's sources.
+
+A magnet made here has a study like one that `halbach-fe new` writes: positions to measure at, the
+noise of a probe that suits its field, and the usual tolerances of blocks. `Magnet.with_` changes
+any of it, and `write_study` writes it down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.files import write_text
+from halbach_fe.geometry.free_blocks import blocks_table, free_outline
+from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.solver.exact_block_field import field_of, gradient_of
+from halbach_fe.study.edit_file import FREE_BLOCKS_FILE, study_text
+from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
+from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
+from halbach_fe.study.model import Study
+from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
+from halbach_fe.synthetic.optional_packages import import_extra
+
+LEAST_SIGMA_T = 1e-6
+"""Noise of the best probes in T."""
+
+STAGES_M = (1e-5, 1e-4)
+"""Errors in m of good and of usual stages."""
+
+FIELDS = 200
+"""About so many points suffice for the size of the field."""
+
+HALVES_DEG = ((0.0, 180.0), (180.0, 360.0))
+"""A whole ring of magpylib is two sectors here."""
+
+
+def halbach_ring(
+    order: int = 1, blocks: int = 16, *, inner_radius_m: float, outer_radius_m: float,
+    length_m: float | None = None, rings: int = 1, remanence_T: float | None = None,
+    recoil_permeability: float | None = None, material: str | None = None,
+    shape: Literal["sector", "trapezoid", "cuboid"] = "sector", name: str = "magnet",
+) -> Magnet:
+    """Return a magnet of equal rings whose magnetization turns from block to block.
+
+    Parameters
+    ----------
+    order : int
+        1 for a dipole, 2 for a quadrupole, ...
+    blocks : int
+        Blocks in each ring.
+    inner_radius_m, outer_radius_m : float
+    length_m : float, optional
+        Length of the whole magnet; without it the magnet is an infinite cross-section.
+    rings : int
+        Rings along the length.
+    remanence_T : float, optional
+        By default 1.3 T.
+    recoil_permeability : float, optional
+        Relative; 1 by default, for which all fields are closed forms. Blocks of NdFeB and SmCo have
+        1.03 to 1.10.
+    material : str, optional
+        A grade such as ``N42`` in place of these two.
+    shape : str
+    name : str
+
+    Returns
+    -------
+    Magnet
+
+    Raises
+    ------
+    StudyError
+        If there is no such magnet.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.halbach_ring(order=2, blocks=16, inner_radius_m=0.015, outer_radius_m=0.04,
+    ...                          length_m=0.05, remanence_T=1.2)
+    >>> magnet
+    Magnet(magnet: 16 blocks in 3D)
+    >>> magnet.field_T([[0.01, 0, 0], [0, 0, 0]]).round(4) + 0.0
+    array([[0.9072, 0.    , 0.    ],
+           [0.    , 0.    , 0.    ]])
+    """
+    if material is not None and (remanence_T, recoil_permeability) != (None, None):
+        raise StudyError(must_be("material", "halbach_ring", "given alone, as it has a remanence "
+                                 "and a recoil permeability", "both"))
+    ring_length = None if length_m is None else length_m / rings
+    magnet = new_magnet(MagnetTemplate(
+        order, blocks, rings, inner_radius_m, outer_radius_m, ring_length,
+        MagnetTemplate.remanence_T if remanence_T is None else remanence_T, shape,
+        material=material), name)[0]
+    if material is not None:
+        return magnet
+    return magnet.with_(array__recoil_permeability=recoil_permeability or 1.0)
+
+
+def magnet_of_blocks(
+    table: FreeBlocks | Mapping[str, Sequence[Any]], order: int = 1, name: str = "magnet"
+) -> Magnet:
+    """Return a magnet of single blocks of any shape, anywhere.
+
+    Parameters
+    ----------
+    table : FreeBlocks or mapping of sequence
+        Columns by name, see `halbach_fe.study.free_blocks.FreeBlocks`; a DataFrame is such a
+        mapping. Blocks without ``name`` are numbered.
+    order : int
+        The main multipole: 1 for a dipole.
+    name : str
+
+    Returns
+    -------
+    Magnet
+
+    Raises
+    ------
+    StudyError
+        If the columns do not describe blocks, or the blocks overlap.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.magnet_of_blocks({
+    ...     "shape": ["cuboid"], "x_m": [0.04], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
+    ...     "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]})
+    >>> magnet.field_T([0.0, 0.0, 0.0]).round(4) + 0.0
+    array([0.0255, 0.    , 0.    ])
+    """
+    if not isinstance(table, FreeBlocks):
+        columns = {column: _plain(table[column]) for column in table}
+        count = max((len(values) for values in columns.values()), default=0)
+        columns.setdefault("name", [f"b{number}" for number in range(1, count + 1)])
+        table = validated_blocks(columns, f"the blocks of {name}")
+    return new_magnet(MagnetTemplate(order), name, table=table)[0]
+
+
+def _plain(column: Sequence[Any]) -> list[Any]:
+    """Return the values of a column; those that are not there are None."""
+    return [None if isinstance(value, float) and np.isnan(value) else value
+            for value in np.asarray(column, dtype=object).tolist()]
+
+
+def new_magnet(
+    template: MagnetTemplate, name: str, folder: Path = Path(), table: FreeBlocks | None = None
+) -> tuple[Magnet, MagnetTemplate]:
+    """Return the magnet of a new study, and its template with the noise that suits its field.
+
+    ``table`` has blocks in place of those of a file in ``folder``.
+    """
+    def built(template: MagnetTemplate) -> Magnet:
+        return build_magnet(parse_new_study(new_study(name, template, folder, table), folder,
+                                            table))
+
+    template = with_noise(template, built(template))
+    return built(template), template
+
+
+def with_noise(template: MagnetTemplate, magnet: Magnet) -> MagnetTemplate:
+    """Return a template with the noise of readings in T and of positions in m, of one digit, that
+    suit a magnet.
+
+    A good probe reads to a ten-thousandth of the largest field, but not below `LEAST_SIGMA_T`. A
+    stage is so exact that its errors make about the same noise, within `STAGES_M`. The field is
+    that of the blocks alone.
+    """
+    points = points_from(magnet.study.observation.positions)
+    points = points[::max(1, len(points) // FIELDS)]
+    sigma = max(LEAST_SIGMA_T, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
+    slope = float(np.sqrt(np.mean(gradient_of(magnet.blocks, points) ** 2)))
+    stage = float(np.clip(sigma / slope if slope else np.inf, *STAGES_M))
+    return replace(template, sigma_T=float(f"{sigma:.1g}"), position_sd_m=float(f"{stage:.1g}"))
+
+
+def write_study(magnet: Magnet | Study, path: str | Path) -> None:
+    """Write the study of a magnet as a file that `halbach_fe.read_study` reads back the same.
+
+    Parameters
+    ----------
+    magnet : Magnet or Study
+    path : str or Path
+        Free blocks are written beside it, as ``free_blocks.csv``.
+
+    Returns
+    -------
+    None
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
+    >>> hf.write_study(magnet, "ring.toml")
+    >>> hf.read_study("ring.toml") == magnet.study
+    True
+    """
+    study = magnet.study if isinstance(magnet, Magnet) else magnet
+    path, table = Path(path), study.array.free_blocks
+    write_text(path, study_text(study))
+    if table is not None:
+        write_free_blocks(table, path.with_name(FREE_BLOCKS_FILE))
+
+
+def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:
+    """Return the magnet of magpylib's Cuboids, Cylinders and CylinderSegments.
+
+    Parameters
+    ----------
+    sources : magpylib.Collection, or a sequence of sources
+        Every source stands at one place; its polarization is the remanence of a block with a recoil
+        permeability of 1, as magpylib has it.
+    order : int
+        The main multipole: 1 for a dipole.
+    name : str
+
+    Returns
+    -------
+    Magnet
+
+    Raises
+    ------
+    StudyError
+        If a source is of another kind, moves along a path, or overlaps another one.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> import magpylib
+    >>> cube = magpylib.magnet.Cuboid(dimension=(0.02, 0.02, 0.02), polarization=(1.3, 0, 0),
+    ...                               position=(0.04, 0, 0))
+    >>> hf.from_magpylib(cube)
+    Magnet(magnet: 1 blocks in 3D)
+    """
+    listed = getattr(sources, "sources_all", None)
+    if listed is None:
+        listed = list(sources) if isinstance(sources, Sequence) else [sources]
+    rows = [row for number, source in enumerate(listed, 1)
+            for row in _rows_of(source, f"b{number}")]
+    if not rows:
+        raise StudyError(must_be("sources", "from_magpylib", "magnets", "none"))
+    return magnet_of_blocks({column: [row.get(column) for row in rows] for column in dict.fromkeys(
+        key for row in rows for key in row)}, order, name)
+
+
+def _rows_of(source: Any, name: str) -> list[dict[str, Any]]:
+    """Return the rows of a table of blocks that are a source of magpylib."""
+    kind, what = type(source).__name__, f"source {name}"
+    if kind not in ("Cuboid", "Cylinder", "CylinderSegment"):
+        raise StudyError(must_be(what, "from_magpylib", "a Cuboid, Cylinder or CylinderSegment",
+                                 f"a {kind}", "hf.magnet_of_blocks takes prisms of any outline."))
+    if np.ndim(source.position) != 1 or source.dimension is None or source.polarization is None:
+        raise StudyError(must_be(what, "from_magpylib", "at one place, with dimension and "
+                                 "polarization", "another one"))
+    turn: Rotation = source.orientation
+    remanence = turn.apply(source.polarization)
+    common = dict(zip(("x_m", "y_m", "z_m"), map(float, source.position), strict=True)) | dict(
+        zip(REMANENCE_VECTOR, map(float, remanence), strict=True)) | {"name": name}
+    size = list(map(float, source.dimension))
+    if kind == "Cuboid":
+        sizes = dict(zip(("size_x_m", "size_y_m", "size_z_m"), size, strict=True))
+        return [common | _turned(turn) | sizes | {"shape": "cuboid"}]
+    if kind == "Cylinder":
+        return [common | _turned(turn) | {
+            "shape": "cylinder", "radius_m": size[0] / 2, "size_z_m": size[1]}]
+    inner, outer, height, *angles = size
+    parts = HALVES_DEG if angles[1] - angles[0] == 360.0 else (tuple(angles),)
+    return [common | _turned(turn * Rotation.from_euler("z", (start + stop) / 2, degrees=True)) | (
+        {"shape": "sector", "inner_radius_m": inner, "outer_radius_m": outer, "size_z_m": height,
+         "angle_deg": stop - start, "name": name + ("ab"[number] if len(parts) > 1 else "")})
+        for number, (start, stop) in enumerate(parts)]
+
+
+def _turned(turn: Rotation) -> dict[str, float]:
+    """Return the columns of a block's rotation."""
+    return dict(zip(("rotation_x_deg", "rotation_y_deg", "rotation_z_deg"),
+                    map(float, np.degrees(turn.as_rotvec())), strict=True))
+
+
+def to_magpylib(magnet: Magnet) -> Any:
+    """Return a magnet's blocks as a ``magpylib.Collection``.
+
+    Its polarizations are the remanences: magpylib's own field has no permeability and no iron.
+
+    Parameters
+    ----------
+    magnet : Magnet
+
+    Returns
+    -------
+    magpylib.Collection
+
+    Raises
+    ------
+    StudyError
+        If a block is a prism that is not convex, or the magnet is a cross-section.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
+    >>> len(hf.to_magpylib(magnet)) == len(magnet.blocks)
+    True
+    """
+    magpylib = import_extra("magpylib")
+    if magnet.dimension == 2:
+        raise StudyError(must_be("magnet", "to_magpylib", "of finite length", "a cross-section"))
+    table = FreeBlocks.model_validate(blocks_table(magnet))
+    return magpylib.Collection([_source(magpylib, table, number) for number in range(len(table))],
+                               style_label=magnet.name)
+
+
+def _source(magpylib: Any, table: FreeBlocks, number: int) -> Any:
+    """Return the source of magpylib that a row of a table of blocks describes."""
+    row = {column: getattr(table, column)[number] for column in COLUMNS
+           if table.given(column)[number]}
+    turn = Rotation.from_rotvec([row.get(f"rotation_{axis}_deg") or 0.0 for axis in "xyz"],
+                                degrees=True)
+    remanence = [row.get(column) or 0.0 for column in REMANENCE_VECTOR]
+    common = {"polarization": turn.inv().apply(remanence), "orientation": turn,
+              "position": [row[column] for column in ("x_m", "y_m", "z_m")],
+              "style_label": row["name"]}
+    shape, length = row["shape"], row["size_z_m"]
+    if shape == "cuboid":
+        return magpylib.magnet.Cuboid(
+            dimension=(row["size_x_m"], row["size_y_m"], length), **common)
+    if shape == "cylinder":
+        return magpylib.magnet.Cylinder(dimension=(2 * row["radius_m"], length), **common)
+    if shape == "sector":
+        half = row["angle_deg"] / 2
+        return magpylib.magnet.CylinderSegment(dimension=(
+            row["inner_radius_m"], row["outer_radius_m"], length, -half, half), **common)
+    corners = np.array([edge.start for edge in free_outline(table, number)])
+    if len(ConvexHull(corners).vertices) != len(corners):
+        raise StudyError(must_be(f"block {row['name']}", "to_magpylib", "a convex prism",
+                                 "one that is not"))
+    return magpylib.magnet.TriangularMesh.from_ConvexHull(points=np.vstack([
+        np.column_stack([corners, np.full(len(corners), z)]) for z in (-length / 2, length / 2)]),
+        **common)

@@ -1,0 +1,150 @@
+"""Magnets that are made in Python, against magpylib, and without any file."""
+
+from __future__ import annotations
+
+import tomllib
+
+import magpylib
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import halbach_fe as hf
+from halbach_fe.core.errors import StudyError
+from halbach_fe.core.versions import version
+from halbach_fe.study.reader import parse_study
+from tests.support.short_dipole import TEXT, measured, truth
+
+POINTS = np.array([[0.002, 0.001, 0.003], [-0.004, 0.003, -0.001], [0.0, -0.005, 0.002]])
+SLACK_T = 1e-8
+"""magpylib's own sectors are exact to 1e-9 of their remanence or so."""
+
+
+def test_a_ring_is_a_halbach_array():
+    """The field of many thin sectors is that of the continuous array, Br ln(b/a), for a dipole."""
+    magnet = hf.halbach_ring(blocks=64, inner_radius_m=0.02, outer_radius_m=0.04, remanence_T=1.2)
+    assert magnet.dimension == 2
+    field = magnet.field_T([0.0, 0.0, 0.0])
+    assert field == pytest.approx([1.2 * np.log(2), 0.0, 0.0], rel=2e-3)
+    quadrupole = magnet.with_(array__multipole_order=2)
+    gradient = (quadrupole.field_T([1e-3, 0, 0]) / 1e-3)[0]
+    assert gradient == pytest.approx(2 * 1.2 * (1 / 0.02 - 1 / 0.04), rel=4e-3)
+    assert quadrupole.field_T([1e-3, 0, 0])[0] != pytest.approx(field[0], rel=0.5)  # control
+
+
+def test_magnets_go_to_magpylib_and_back():
+    rings = hf.halbach_ring(order=2, blocks=8, rings=2, inner_radius_m=0.01, outer_radius_m=0.03,
+                            length_m=0.04, shape="trapezoid")
+    prism = hf.magnet_of_blocks({
+        "shape": ["prism", "polygon"], "x_m": [0.03, -0.03], "y_m": [0.0, 0.0],
+        "z_m": [0.0, 0.01], "rotation_x_deg": [10.0, 40.0], "size_z_m": [0.01, 0.02],
+        "outline_m": [((0.0, 0.0), (0.02, 0.0), (0.0, 0.01)), None], "sides": [None, 6],
+        "radius_m": [None, 0.008], "remanence_T": [1.3, 1.1]})
+    for magnet in (rings, prism):
+        there = hf.to_magpylib(magnet)
+        assert len(there) == len(magnet.blocks)
+        assert magnet.field_T(POINTS) == pytest.approx(there.getB(POINTS), abs=SLACK_T)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    sources = magpylib.Collection(
+        magpylib.magnet.Cuboid(dimension=(0.01, 0.02, 0.015), polarization=(0.3, 1.0, -0.2),
+                               position=(0.03, 0.0, 0.0), orientation=turn),
+        magpylib.Collection(magpylib.magnet.Cylinder(
+            dimension=(0.01, 0.02), polarization=(0.0, 0.1, 1.2), position=(-0.03, 0.01, 0.0),
+            orientation=turn)),
+        magpylib.magnet.CylinderSegment(
+            dimension=(0.01, 0.02, 0.01, 30, 80), polarization=(1.0, 0.4, 0.2),
+            position=(0.0, 0.02, 0.03), orientation=turn),
+        magpylib.magnet.CylinderSegment(dimension=(0.01, 0.02, 0.01, 0, 360),
+                                        polarization=(0, 0, 1.0), position=(0, 0, -0.04)))
+    magnet = hf.from_magpylib(sources)
+    assert magnet.field_T(POINTS) == pytest.approx(sources.getB(POINTS), abs=SLACK_T)
+    back = hf.to_magpylib(magnet)
+    assert back.getB(POINTS) == pytest.approx(sources.getB(POINTS), abs=SLACK_T)
+    # negative control: a source that is turned otherwise
+    sources[0].rotate_from_angax(5, "x")
+    assert magnet.field_T(POINTS) != pytest.approx(sources.getB(POINTS), abs=1e-4)
+
+
+@pytest.mark.parametrize(("sources", "said"), [
+    (magpylib.magnet.Sphere(diameter=0.01, polarization=(0, 0, 1)), "a Sphere"),
+    ([], "instead received none"),
+    (magpylib.magnet.Cuboid(dimension=(0.01, 0.01, 0.01), polarization=(0, 0, 1),
+                            position=[(0, 0, 0), (0, 0, 1)]), "at one place")])
+def test_what_magpylib_has_and_blocks_are_not(sources, said):
+    with pytest.raises(StudyError, match=said):
+        hf.from_magpylib(sources)
+
+
+def test_a_prism_that_is_not_convex_is_refused():
+    magnet = hf.magnet_of_blocks({
+        "shape": ["prism"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_z_m": [0.01],
+        "outline_m": [((0, 0), (0.02, 0), (0.002, 0.002), (0, 0.02))], "remanence_T": [1.3]})
+    with pytest.raises(StudyError, match="convex"):
+        hf.to_magpylib(magnet)
+    with pytest.raises(StudyError, match="cross-section"):
+        hf.to_magpylib(hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04))
+
+
+def test_a_study_is_written_and_read_back(tmp_path):
+    ring = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03,
+                           material="N42").with_(prior__magnitude_sd=0.02)
+    for name, magnet in (("ring", ring), ("free", hf.from_magpylib(hf.to_magpylib(ring)))):
+        hf.write_study(magnet, tmp_path / name / "study.toml")
+        assert hf.read_study(tmp_path / name / "study.toml") == magnet.study
+
+
+def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator):
+    """The truth is magpylib's: one block is 2 % weak. No file and no folder is named."""
+    monkeypatch.chdir(tmp_path)
+    magnet = hf.halbach_ring(order=2, blocks=8, inner_radius_m=0.015, outer_radius_m=0.03,
+                             length_m=0.03)
+    truth = hf.to_magpylib(magnet)
+    truth[2].polarization = 0.98 * truth[2].polarization
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    points = np.vstack([np.column_stack([0.01 * np.cos(angle), 0.01 * np.sin(angle),
+                                         np.full(24, z)]) for z in (-0.02, -0.01, 0.0, 0.01, 0.02)])
+    readings = truth.getB(points) + 2e-5 * generator.standard_normal(points.shape)
+    result = hf.infer(magnet, hf.field_map(points, readings, sigma_T=2e-5))
+    sizes = np.linalg.norm(result.posterior.mean.reshape(-1, 3), axis=1) / np.linalg.norm(
+        magnet.nominal_magnetization.reshape(-1, 3), axis=1)
+    assert sizes[2] == pytest.approx(0.98, abs=2e-3)
+    assert np.delete(sizes, 2) == pytest.approx(1.0, abs=3e-3)
+    assert not list(tmp_path.iterdir())
+    for one in (magnet, magnet.study, result, result.magnet):
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 500
+
+
+@pytest.mark.parametrize(("call", "said"), [
+    (lambda: hf.halbach_ring(inner_radius_m=0.04, outer_radius_m=0.02), "outer_radius_m"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, material="N42",
+                             remanence_T=1.2), "given alone"),
+    (lambda: hf.magnet_of_blocks({"shape": ["cuboid"], "x_m": [0.0]}), "y_m"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([1, 2]), "x, y, z"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([0.03, 0, 0]),
+     "in air"),
+    (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]]), "of shapes"),
+    (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]], components=["x", "Bz"]), "out of x, y, z")])
+def test_mistakes_get_a_sentence(call, said):
+    with pytest.raises(hf.HalbachError, match=said):
+        call()
+
+
+def test_the_version_is_that_of_the_package():
+    assert hf.__version__ == version("halbach-fe")
+
+
+def test_a_displaced_map_is_explained_in_python(generator):
+    """The map lies 1.5 mm off along z, which an update by itself does not explain."""
+    source = truth(generator, 0.005)
+    data = measured(source, generator, Rotation.identity(), np.array([0.0, 0.0, -0.0435]))
+    magnet = hf.build_magnet(parse_study(tomllib.loads(TEXT)).with_(instrument={
+        "translation_m": [0.0, 0.0, -0.045]}))
+    found = hf.explain(magnet, data)
+    assert list(found.answers) == ["check", "inferred", "registered", "updated"]
+    assert not found.answers["inferred"].sound
+    assert found.sound
+    assert found.diagnosis is None
+    z = found.inference.magnet.study.instrument.translation_m[2]
+    assert z == pytest.approx(-0.0435, abs=5 * found.poses[0].translation_sd_m[2])
+    assert "\n" not in repr(found)
