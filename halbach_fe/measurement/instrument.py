@@ -18,7 +18,6 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
@@ -230,6 +229,8 @@ def _filtered(
     values: Floats, time: Floats, numerator: list[float], denominator: list[float]
 ) -> Floats:
     """Return values (n, 3) after a filter along the time (n,), as if the first had always been."""
+    from scipy.signal import lfilter  # half a second of every start, which few commands need
+
     order = np.argsort(time, kind="stable")
     found = np.full(values.shape, np.nan)
     for axis, column in enumerate(values[order].T):

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -41,6 +41,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
+
+_AT_ONCE = 100_000
+"""Number of points at which blocks of the same shape are evaluated at once: some 10 MB."""
+
+_DIGITS = 13
+"""Of lengths in m, of blocks of the same shape: more than some rounding errors."""
 
 _RECTANGULAR = 1e-13
 """Largest deviation of a rectangle's corners, relative to its sides: some rounding errors."""
@@ -82,9 +88,17 @@ def _frame_field(block: MagnetBlock, points: Floats) -> Floats:
 
 
 def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Floats]:
-    """Yield `unit_field` of every block, in order."""
-    for block in blocks:
-        yield unit_field(block, points)
+    """Yield `unit_field` of every block, in order; blocks of one shape are evaluated at once."""
+    most = 1 + _AT_ONCE // max(1, len(points))
+    basis = matrix_of(np.eye(6))
+    for first in range(0, len(blocks), most):
+        some = blocks[first:first + most]
+        found = np.empty((len(some), len(points), 6))
+        for same in _alike(some):
+            fields, axes = _fields_of_alike([some[number] for number in same], points)
+            turned = axes[:, None] @ basis @ axes[:, None].transpose(0, 1, 3, 2)
+            found[same] = fields @ turned[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        yield from map(matrix_of, found)
 
 
 def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
@@ -144,31 +158,60 @@ def matrix_of(six: Floats) -> Floats:
 def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     """Return B (n, 3) in T of blocks with their nominal remanence in vacuum.
 
-    Blocks of the same shape are evaluated at once, each at the points of its frame. At points
-    inside a block the result lacks the block's own remanence, see `unit_field`.
+    Blocks of the same shape, such as those of a ring, are evaluated at once, each at the points of
+    its frame. At points inside a block the result lacks the block's own remanence, see
+    `unit_field`.
     """
-    alike: dict[object, list[MagnetBlock]] = defaultdict(list)
-    for block in blocks:
-        alike[block.outline, block.z_min, block.z_max, block.gradient, block.corner_loss].append(
-            block)
-    # number of points at which blocks of the same shape are evaluated at once: some 10 MB
-    points_at_once = 100_000
-    total, most = np.zeros((len(points), 3)), 1 + points_at_once // max(1, len(points))
-    for same in alike.values():
+    total, most = np.zeros((len(points), 3)), 1 + _AT_ONCE // max(1, len(points))
+    for same in _alike(blocks):
         for first in range(0, len(same), most):
-            total += _field_of_alike(same[first:first + most], points)
+            some = [blocks[number] for number in same[first:first + most]]
+            fields, axes = _fields_of_alike(some, points)
+            remanences = np.array([block.easy_axis for block in some]) * np.array(
+                [[block.remanence] for block in some])
+            sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
+            total += np.einsum("bnk,bki->ni", fields, sums, optimize=True)
     return total
 
 
-def _field_of_alike(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
-    """Return `field_of` of blocks of the same shape."""
+def _alike(blocks: Sequence[MagnetBlock]) -> list[list[int]]:
+    """Return the numbers of blocks of the same shape, but for turns and shifts in their frames."""
+    alike: dict[object, list[int]] = defaultdict(list)
+    for number, block in enumerate(blocks):
+        alike[_upright(block.outline, _turn_deg(block)), round(block.z_max - block.z_min, _DIGITS),
+              block.gradient, block.corner_loss].append(number)
+    return list(alike.values())
+
+
+def _turn_deg(block: MagnetBlock) -> float:
+    """Return the angle by which a block's outline is turned in its frame, in degrees."""
+    return 0.0 if any(block.origin_m) or any(block.orientation_rad) else block.angle_deg
+
+
+@lru_cache(maxsize=4096)
+def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
+    """Return what outlines have in common that are turned by different angles about z."""
+    corners = [corner for edge in outline for corner in (edge.start, edge.end)]
+    turned = np.round(corners @ rotation_about_z(np.radians(angle_deg))[:2, :2], _DIGITS)
+    return tuple(turned.ravel().tolist()), tuple(edge.arc for edge in outline)
+
+
+def _fields_of_alike(
+    blocks: Sequence[MagnetBlock], points: Floats
+) -> tuple[Floats, Floats]:
+    """Return the field matrices (blocks, n, 6) of `_alike` blocks along their axes, and the axes
+    (blocks, 3, 3) as columns, turned so that all outlines are that of the first block.
+    """
+    if len(blocks) == 1:
+        return _local_field(blocks[0], points)[None], blocks[0].axes[None]
     positions, axes = frames_of(blocks)
+    axes = axes @ np.array([rotation_about_z(np.radians(_turn_deg(block) - _turn_deg(blocks[0])))
+                            for block in blocks])
+    if np.isfinite(blocks[0].z_min):
+        z = np.array([block.z_min for block in blocks])
+        positions = positions + (z - z[0])[:, None] * axes[:, :, 2]
     places = (points - positions[:, None]) @ axes
-    fields = _frame_field(blocks[0], places.reshape(-1, 3)).reshape(len(blocks), -1, 6)
-    remanences = np.array([block.easy_axis for block in blocks]) * np.array(
-        [[block.remanence] for block in blocks])
-    sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
-    return np.einsum("bnk,bki->ni", fields, sums, optimize=True)
+    return _frame_field(blocks[0], places.reshape(-1, 3)).reshape(len(blocks), -1, 6), axes
 
 
 def _sums(polarization: Floats) -> Floats:
@@ -187,12 +230,13 @@ def field_on_circles(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
 
     Points (angles k, 3) at equidistant angles, angle by angle, are mapped onto each other by turns
     about z. Of blocks that such turns map onto each other, as those of a ring, one is evaluated.
-    Points elsewhere are evaluated for every block.
     """
     angles = _equidistant_angles(points)
+    if angles == 1:
+        return field_of(blocks, points)
     total = np.zeros((angles, len(points) // angles, 3))
     for members in _turned_blocks(blocks, points[[0, len(points) // 3, 2 * len(points) // 3]],
-                                  angles) if angles > 1 else [[(0, block)] for block in blocks]:
+                                  angles):
         first = members[0][1]
         local = _local_field(first, points)
         for steps, block in members:

@@ -198,18 +198,19 @@ WHOLE = ("missing", "displaced", "missing-permeable", "layers-missing", "free-tu
          "free-missing", "free-types", "flat-missing", "flat-layers", "losses", "varying")
 """Studies for every command, which among them have every kind of magnet."""
 
-BRIEF = ("infer-dry", "infer-blocks", "diagnose", "multipoles", "demagnetization", "export")
+BRIEF = ("infer-blocks", "diagnose", "multipoles", "demagnetization", "export")
 """Commands for every study: each has a way of its own from the keys to a field."""
 
-SLOW = ("iron-ring", "iron-curve", "iron-curve-free", "iron-prisms")
-"""Studies whose fields take seconds; they go through a single command. A diagnosis, of many fields,
-takes minutes with iron of any kind."""
+SLOW = {"iron-ring": "infer-blocks", "iron-curve": "infer-dry", "iron-curve-free": "infer-blocks",
+        "iron-prisms": "infer-blocks"}
+"""Studies whose fields take seconds, and the single command that they go through beside `solve`. A
+diagnosis, of many fields, takes minutes with iron of any kind."""
 
 # a simulated measurement of layers in a plane takes a minute of fine finite elements, for keys that
 # "layers-missing" tries in space
 PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
          if (name in WHOLE and (name, command) != ("flat-layers", "simulate-measurement"))
-         or command == "infer-blocks"
+         or command == SLOW.get(name)
          or (command in BRIEF and name not in SLOW
              and not (command == "diagnose" and name.startswith("iron")))]
 

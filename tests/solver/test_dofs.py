@@ -14,6 +14,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import magnetostatics
 from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.formulation_choice import finite_element_part
+from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.interpolation import coordinates, locate, probes_of, shape_functions
 from halbach_fe.solver.mesh import build_meridian, build_mesh, verify_mesh
 from halbach_fe.solver.session import Session
@@ -202,14 +203,17 @@ def test_damaged_lists_of_unknowns_are_refused(tmp_path, content):
 
 @pytest.fixture(scope="module")
 def accepted(request, short_dipole, getdp, tmp_path_factory):
-    """The study of a route and an order, and points: unknowns in GetDP's own order are accepted."""
+    """The study of a route and an order, points, and a session that keeps the run: unknowns in
+    GetDP's own order are accepted.
+    """
     route, order = request.param
     study = short_dipole(solver={"route": route, "edge_order": order},
                          mesh__block_size_m=0.06, mesh__meridian_size_m=0.03, mesh__growth=3.0)
     points = circle(0.05, 5, 0.013)
-    session = Session(getdp, tmp_path_factory.mktemp("accepted"), jobs=2)
+    folder = tmp_path_factory.mktemp("accepted")
+    session = Session(getdp, folder, jobs=2, cache=Cache(folder / "cache"))
     finite_element_part(build_magnet(study), points, session, columns=False)
-    return study, points
+    return study, points, session
 
 
 @pytest.mark.parametrize(("accepted", "part", "corners_only"), [
@@ -219,9 +223,9 @@ def accepted(request, short_dipole, getdp, tmp_path_factory):
     *((("edge_elements", 2), part, False) for part in range(3))],
     indirect=["accepted"], ids=lambda value: "-".join(map(str, value))
     if isinstance(value, tuple) else None)
-def test_other_numbering_is_noticed(accepted, session, monkeypatch, part, corners_only):
+def test_other_numbering_is_noticed(accepted, monkeypatch, part, corners_only):
     """Negative control of the comparison with GetDP's own print: unknowns in another order."""
-    study, points = accepted
+    study, points, session = accepted
     route = study.solver.route
     mesh = None if route == "azimuthal_modes" else verify_mesh(
         build_mesh(build_magnet(study), session.folder / "again"))
