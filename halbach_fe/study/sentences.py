@@ -75,8 +75,9 @@ WRONG_UNITS = (
     *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
     ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
     ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
-    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "the other sign", -1.0),
-    ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("coefficient_per_K", "the other sign", -1.0),
+    ("coefficient_per_K", "per cent per kelvin and with the other sign", -1e-2),
     *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
@@ -86,6 +87,9 @@ DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
 ZERO_C_IN_K = 273.15
+
+MOST_PER_K = 0.02
+"""Largest temperature coefficient of any material: what is larger is in per cent."""
 
 
 def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
@@ -101,6 +105,8 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
         return (f"It is the deviation from 1: if {value:.6g} is the whole factor, write "
                 f"{value - 1:.6g}; if per cent, {value / 100:.6g}.")
     for suffix, unit, factor in WRONG_UNITS:
+        if suffix == "coefficient_per_K" and (abs(factor) < 1) != (abs(value) > MOST_PER_K):
+            continue
         given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
         if factor < 0 and value < 0:  # no sign was lost
             continue

@@ -132,6 +132,11 @@ def test_values_that_no_magnet_has(campaign, tmp_path, capsys, arguments, code, 
 @pytest.mark.parametrize(("changes", "said"), [
     ({"demagnetization__remanence_coefficient_per_K": -0.12},
      "per cent per kelvin? Then write -0.0012."),
+    ({"demagnetization__remanence_coefficient_per_K": 0.12},
+     "per cent per kelvin and with the other sign? Then write -0.0012."),
+    ({"demagnetization__remanence_coefficient_per_K": 0.0012}, "other sign? Then write -0.0012."),
+    ({"demagnetization__coercivity_coefficient_per_K": 0.27},
+     "per cent per kelvin? Then write 0.0027."),  # of ferrite
     ({"demagnetization__reference_temperature_C": 293.15}, "in kelvin? Then write 20."),
     ({"demagnetization__squareness": 90.0}, "per cent? Then write 0.9."),
     ({"instrument__rotation_rad": [0, 0, 30]}, "in degrees? Then write 0.523599."),

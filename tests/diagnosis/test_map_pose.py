@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis import unknown_cause
+from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.map_pose import find_poses
