@@ -209,8 +209,8 @@ class FreeBlocks(StudyModel):
                          "area")
             sizes = np.ptp(np.array([self.outline_m[n] for n in members]), axis=1)
             wrong[members] = ((sizes < MIN_LENGTH_M) | (sizes >= MAX_LENGTH_M)).any(axis=1)
-            self._refuse(wrong, f"a prism, has an outline_m that is not from {MIN_LENGTH_M:g} to "
-                         f"less than {MAX_LENGTH_M:g} m wide; is it in mm? Then write 0.01 for 10 mm")
+            self._refuse(wrong, f"a prism, has an outline_m that is not {MIN_LENGTH_M:g} m to "
+                         f"{MAX_LENGTH_M:g} m wide; is it in mm? Then write 0.01 for 10 mm")
         has_four = (np.isin(shapes, ("cuboid", "trapezoid")) | (corners == 4)
                     | (self.numbers("sides", 0) == 4)
                     | (self.numbers("angle_deg", 360.0) < HALF_TURN_DEG))
