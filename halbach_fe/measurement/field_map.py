@@ -614,11 +614,17 @@ def check_magnitudes(data: xr.Dataset) -> None:
     values, sigmas = data["B_T"].values, data.get("sigma_T")
     if is_total_field(data):
         values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
-    largest = float(np.nanmax(np.abs(values)))
+    by_component = np.nan_to_num(np.abs(values)).max(axis=0).reshape(-1)
+    largest = float(by_component.max())
     if largest > MAX_FIELD_T:
         unit, factor = ("gauss", 1e-4) if largest > 2000 else ("millitesla", 1e-3)
+        beyond = by_component > MAX_FIELD_T
+        some = "" if (beyond | (by_component == 0)).all() else " and ".join(
+            column for column, wrong in zip(FIELD_COLUMNS, beyond, strict=True) if wrong)
         raise MeasurementError(must_be(
-            "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
+            some or "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
+            f"Is it in {unit}, unlike the rest, which is below {MAX_FIELD_T:g}? Then multiply "
+            f"this column of the file by {factor:g}." if some else
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
             "study, or convert the map by halbach-fe import-map."))
     elif TOTAL_COLUMN in data:

@@ -641,8 +641,8 @@ def _checkable(data: xr.Dataset) -> xr.Dataset:
     if missing:
         raise MeasurementError(must_be(
             _where(data), "Maxwell's check", "with all three components of B",
-            f"a map without {' and '.join(missing)}", "How B changes along the magnet is not in a "
-            "map of a cross-section: test that by the chi² of `halbach-fe infer`."))
+            f"a map without {' and '.join(missing)}", "What is left has no div B and no whole "
+            "curl B that could be tested: test it by the chi² of `halbach-fe infer`."))
     return data
 
 

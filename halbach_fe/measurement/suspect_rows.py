@@ -29,7 +29,9 @@ A single spike is 2 to 4 times as far off its own as off theirs."""
 OF_RANGE = 0.2
 """Smallest residual of such a row, relative to the range of its neighbours' field. At the corner of
 a map that ends 6 mm from the edges of magnets a quadratic function is off by 0.1 of it. Smaller
-spikes are left to the fit of a field without sources."""
+spikes are left to the fit of a field without sources. A row at the map's border has neighbours on
+one side only: there it is 1, as quadratic functions were off by up to 0.65 in clean maps that end
+12 mm from magnets."""
 
 CONTRADICTION = 1e-4
 """Smallest difference of |B| from that of the components that is a contradiction, in units of the
@@ -106,11 +108,19 @@ def rough_rows(
         size = np.linalg.norm(residual[rows], axis=1)
         worst = spikes(points, residual, usable & ~found, 1.0)
         around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
-        worst[rows] &= (size > ROUGH * size[near].max(axis=1)) & (size > OF_RANGE * around)
+        limit = np.where(_at_border(points[rows], near), 1.0, OF_RANGE)
+        worst[rows] &= (size > ROUGH * size[near].max(axis=1)) & (size > limit * around)
         if not worst.any():
             break
         found |= worst
     return found
+
+
+def _at_border(points: Floats, near: Ints) -> NDArray[np.bool_]:
+    """Tell which points (n, 3) have all their neighbours (n, k) on one side, along any axis."""
+    away = (points[near] - points[:, None]) / point_spacing(points)
+    low, high = away.min(axis=1), away.max(axis=1)
+    return np.asarray((((low > -0.5) | (high < 0.5)) & (high - low > 0.5)).any(axis=1))
 
 
 def quadratic_residual(points: Floats, field: Floats) -> tuple[Floats, Floats]:

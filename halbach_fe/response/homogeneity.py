@@ -109,8 +109,8 @@ class Region:
         if min(self.half_axes_m) <= 0:
             raise StudyError(must_be("half_axes_m", "a region", "above 0",
                                      f"{min(self.half_axes_m):g}"))
-        if max(self.half_axes_m) > MAX_LENGTH_M:
-            raise StudyError(must_be("half_axes_m", "a region", f"at most {MAX_LENGTH_M:g} m",
+        if max(self.half_axes_m) >= MAX_LENGTH_M:
+            raise StudyError(must_be("half_axes_m", "a region", f"below {MAX_LENGTH_M:g} m",
                                      f"{max(self.half_axes_m):g}", "Was it meant in millimetres?"))
         alike = {"sphere": 3, "cylinder": 2, "ellipsoid": 1}[self.shape]
         if len(set(self.half_axes_m[:alike])) > 1:

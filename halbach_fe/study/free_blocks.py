@@ -194,8 +194,8 @@ class FreeBlocks(StudyModel):
                 self._refuse((shapes == shape) & (given != (column in sizes)), (
                     f"a {shape}, needs {column}" if column in sizes
                     else f"a {shape}, has no {column}; leave the cell empty"))
-        self._refuse(np.hypot(self.numbers("x_m", 0.0), self.numbers("y_m", 0.0)) > MAX_LENGTH_M,
-                     f"is more than {MAX_LENGTH_M:g} m from the z axis; are x_m and y_m in mm? "
+        self._refuse(np.hypot(self.numbers("x_m", 0.0), self.numbers("y_m", 0.0)) >= MAX_LENGTH_M,
+                     f"is {MAX_LENGTH_M:g} m or more from the z axis; are x_m and y_m in mm? "
                      "Then write 0.01 for 10 mm")
         inner, outer = (self.numbers(f"{side}_radius_m", np.nan) for side in ("inner", "outer"))
         self._refuse(outer <= inner, "a sector, has an outer_radius_m that is not larger than its "
@@ -208,8 +208,8 @@ class FreeBlocks(StudyModel):
             self._refuse(wrong, "a prism, has an outline_m whose edges cross, or that has no "
                          "area")
             sizes = np.ptp(np.array([self.outline_m[n] for n in members]), axis=1)
-            wrong[members] = ((sizes < MIN_LENGTH_M) | (sizes > MAX_LENGTH_M)).any(axis=1)
-            self._refuse(wrong, f"a prism, has an outline_m that is not from {MIN_LENGTH_M:g} to "
+            wrong[members] = ((sizes < MIN_LENGTH_M) | (sizes >= MAX_LENGTH_M)).any(axis=1)
+            self._refuse(wrong, f"a prism, has an outline_m that is not {MIN_LENGTH_M:g} m to "
                          f"{MAX_LENGTH_M:g} m wide; is it in mm? Then write 0.01 for 10 mm")
         has_four = (np.isin(shapes, ("cuboid", "trapezoid")) | (corners == 4)
                     | (self.numbers("sides", 0) == 4)
@@ -301,7 +301,7 @@ class FreeBlocks(StudyModel):
                          centre - reach).min()
         outer = (centre + np.maximum(reach, radius)).max()
         inner = float(np.clip(inner, MIN_LENGTH_M, MAX_LENGTH_M / 2))
-        return inner, float(np.clip(outer, 1.01 * inner, MAX_LENGTH_M))
+        return inner, float(np.clip(outer, 1.01 * inner, 0.999 * MAX_LENGTH_M))
 
 
 COLUMNS = tuple(name for name in FreeBlocks.model_fields if name != "file")

@@ -161,7 +161,7 @@ class IronPrism(StudyModel):
     def _consistent(self) -> IronPrism:
         if crossing(np.array([self.outline_m]))[0]:
             raise ValueError("outline_m must have edges that do not cross, and some area")
-        if np.hypot(*np.array(self.outline_m).T).max() > MAX_LENGTH_M:
+        if np.hypot(*np.array(self.outline_m).T).max() >= MAX_LENGTH_M:
             raise ValueError(f"outline_m must be within {MAX_LENGTH_M:g} m of the axis; is it in "
                              "mm? Then write 0.01 for 10 mm")
         return self

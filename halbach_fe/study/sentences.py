@@ -71,12 +71,17 @@ def did_you_mean(near: str, given: str) -> str:
 MAX_WRONG_UNIT = 1e12
 """Values from this size on are not explained by a wrong unit."""
 
+KILOOERSTED, MOST_KILOOERSTED = 1e6 / (4 * math.pi), 45.0
+"""In A/m, and the largest intrinsic coercivity of magnets: a larger number is in kA/m."""
+
 WRONG_UNITS = (
     *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
+    ("coercivity_A_per_m", "kilooersted", KILOOERSTED),
     ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
     ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
-    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "the other sign", -1.0),
-    ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("coefficient_per_K", "the other sign", -1.0),
+    ("coefficient_per_K", "per cent per kelvin and with the other sign", -1e-2),
     *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
     ("_C", "kelvin", 1.0))
 """End of a key, a unit in which its value may have been given, and what that is in the right one.
@@ -86,6 +91,9 @@ DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
 ZERO_C_IN_K = 273.15
+
+MOST_PER_K = 0.02
+"""Largest temperature coefficient of any material: what is larger is in per cent."""
 
 
 def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
@@ -101,6 +109,10 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
         return (f"It is the deviation from 1: if {value:.6g} is the whole factor, write "
                 f"{value - 1:.6g}; if per cent, {value / 100:.6g}.")
     for suffix, unit, factor in WRONG_UNITS:
+        if suffix == "coefficient_per_K" and (abs(factor) < 1) != (abs(value) > MOST_PER_K):
+            continue
+        if factor == KILOOERSTED and value > MOST_KILOOERSTED:
+            continue
         given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
         if factor < 0 and value < 0:  # no sign was lost
             continue

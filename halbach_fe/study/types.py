@@ -33,9 +33,10 @@ MAX_POINTS = 1_000_000
 USUAL_REACH_M = 0.1
 """Distance in m from the middle to which magnets of permanent blocks reach, if no study says it."""
 
-# The limits are there to reveal a wrong unit (mm for m, mT for T); they are wider than is sensible.
-Length = Annotated[float, Field(ge=MIN_LENGTH_M, le=MAX_LENGTH_M, allow_inf_nan=False)]
-Gap = Annotated[float, Field(ge=0.0, le=MAX_LENGTH_M, allow_inf_nan=False)]
+# The limits are there to reveal a wrong unit (mm for m, mT for T); they are wider than is sensible,
+# and exclude the round numbers that are meant in mm: 10 for 10 mm.
+Length = Annotated[float, Field(ge=MIN_LENGTH_M, lt=MAX_LENGTH_M, allow_inf_nan=False)]
+Gap = Annotated[float, Field(ge=0.0, lt=MAX_LENGTH_M, allow_inf_nan=False)]
 Coordinate = Annotated[
     float, Field(ge=-10 * MAX_LENGTH_M, le=10 * MAX_LENGTH_M, allow_inf_nan=False)]
 Remanence = Annotated[float, Field(gt=0.0, le=2.0, allow_inf_nan=False)]

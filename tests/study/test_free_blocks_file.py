@@ -99,7 +99,7 @@ def test_hdf5_of_other_programs(tmp_path):
     (".02,0.03", "nan,0.03", "`size_y_m` in line 4 of .* a finite number"),
     (".02,0.03", "1e999,0.03", "`size_y_m` in line 4 of .* a finite number"),
     (".02,0.03", "0_2,0.03", "`size_y_m` in line 4 of .* a finite number"),
-    (".02,0.03", "20,0.03", "`size_y_m` in line 4 of .* less than or equal to 10; .* received 20. "
+    (".02,0.03", "20,0.03", "`size_y_m` in line 4 of .* less than 10; .* received 20. "
      "Was it meant in millimetres. Then write 0.02."),
     (".02,0.03", ",0.03", "line 4 of .* block a in row 1, a cuboid, needs size_y_m"),
     ("1.0,3,", "1.5,3,", "`ring` in line 7 of .* a whole number"),

@@ -49,6 +49,7 @@ HOT = DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955e3, "temperature_C":
     ({"array__dimension": 2}, "`dimension` stands at the top of the file"),
     ({"array__block": {"shape": "sector", "angular_gap": 1}}, "Did you mean `angular_gap_deg`?"),
     ({"array__inner_radius_m": 104}, "Was it meant in millimetres? Then write 0.104."),
+    ({"array__inner_radius_m": 10}, "Was it meant in millimetres? Then write 0.01."),
     ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),
     ({"array__remanence_T": 13000}, "Was it meant in gauss? Then write 1.3."),
     ({"array__remanence_T": 13}, "Was it meant in kilogauss? Then write 1.3."),
