@@ -495,21 +495,26 @@ def _execute(
         _save_log(folder, arguments, lines)
     if reason:
         raise _failure(reason, folder)
-    if process.returncode < 0:
-        name = signal.Signals(-process.returncode).name
+    _check_exit(process.returncode, arguments[0], lines, folder)
+    return lines
+
+
+def _check_exit(code: int, executable: str, lines: list[str], folder: Path) -> None:
+    """Raise GetDPError, with GetDP's own words, if a process ended with another code than 0."""
+    if code < 0:
+        name = signal.Signals(-code).name
         if name == "SIGXFSZ":
             raise _failure(f"{DISK_FULL}, or a file grew over its limit ({name})", folder)
         hint = {"SIGKILL": "; out of memory?"}
         raise _failure(f"it crashed ({name}{hint.get(name, '')})", folder)
-    if process.returncode in (126, 127) and not os.access(arguments[0], os.X_OK):
+    if code in (126, 127) and not os.access(executable, os.X_OK):
         raise _failure("it could not be started (No such file, or none that can be run)", folder)
-    if process.returncode:
+    if code:
         error_line = next((line for line in lines if re.match(r"\s*Error\s*:", line)), "")
         quoted = error_line.partition(":")[2].strip() or (
             lines[-1].strip() if lines else "nothing")
-        name = _name_of("\n".join(lines), f"exit code {process.returncode}")
+        name = _name_of("\n".join(lines), f"exit code {code}")
         raise _failure(f"{name}: '{quoted[:200]}'", folder)
-    return lines
 
 
 def _kill(process: subprocess.Popen[str]) -> None:
