@@ -427,13 +427,16 @@ def yes_beside_wrong(result: dict[str, Any]) -> bool:
 
 
 def is_promised(result: dict[str, Any]) -> bool:
-    """Whether the update after a diagnosis must be right: all that is hidden was named.
+    """Whether the update after a diagnosis must be right: its study has all that is hidden.
 
-    What no reading shows and no prior of the study allows, such as the zero of a sensor that blocks
-    imitate, makes an update wrong without a diagnosis, too.
+    That was named, or suspected of no single block or ring. What no reading shows and no prior of
+    the study allows, such as the zero of a sensor that blocks imitate, makes an update wrong
+    without a diagnosis, too.
     """
+    suspected = {name for names in result.get("suspected", []) for name in names}
     return "posterior_chi2" in result and not result["outside"] and not wrong(result) and all(
-        named(result, name) for name in result["hidden"])
+        named(result, name) or (suspected & set(known_as(name)) and not result["labels"].get(name))
+        for name in result["hidden"])
 
 
 def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]

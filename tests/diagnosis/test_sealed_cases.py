@@ -123,6 +123,16 @@ def test_a_name_is_right_at_its_place_only(study, found, right, first):
     assert not study.yes_beside_wrong(one | {"trust": "Only in part."})
 
 
+def test_updates_that_must_be_right(study):
+    """Those of studies with all that was hidden. The place of a suspected block may be wrong."""
+    one = result(["gain_z"]) | {"posterior_chi2": 1.0, "suspected": [["offset_z", "gain_z"]]}
+    assert study.is_promised(one)
+    assert not study.is_promised(one | {"suspected": [["offset_z"]]})
+    assert not study.is_promised(one | {"outside": "coil"})
+    assert not study.is_promised(one | {"labels": {"gain_z": ["r01s01"]}})
+    assert study.is_promised(one | {"suspected": [], "named": [["offset_z", "gain_z"]]})
+
+
 def test_amplitudes_are_compared_in_their_bars(study):
     """Of the right name at the right place, as the catalogue defines them."""
     truth = [{"name": "temperature", "parameters": [
