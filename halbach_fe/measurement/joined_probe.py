@@ -73,6 +73,11 @@ class PosedCharges(Charges):
 
     pose: Pose
 
+    @classmethod
+    def seen_from(cls, charges: Charges, pose: Pose) -> PosedCharges:
+        """Return charges in the coordinates of a stage."""
+        return cls(charges.places, charges.scale, pose)
+
     def fields(self, points: Floats) -> Floats:
         """Return B (n, 3, amplitudes) along the axes of the stage."""
         return np.einsum("ij,nik->njk", self.pose.turn, super().fields(self.pose.places(points)))
@@ -89,6 +94,21 @@ class PosedCharges(Charges):
         """Return the gradient (n, 3, 3) of B, both along the axes of the stage."""
         there = super().gradient(self.pose.places(points), amplitudes)
         return np.einsum("ij,nik,kl->njl", self.pose.turn, there, self.pose.turn)
+
+    def by_pose(
+        self, points: Floats, reads: Floats, arms: Floats, amplitudes: Floats
+    ) -> Floats:
+        """Return the derivatives (n, s, 6) of u . B by shift and turn of the stage.
+
+        ``reads`` (n, s, 3) are the directions u of s sensors at points (n, 3), which are ``arms``
+        (n, 3) away from the axis of turn. A turn d changes u . B by ``d . (u x B + r x grad(u .
+        B))``.
+        """
+        field = self.field(points, amplitudes)
+        gradient = np.einsum("nsc,ncj->nsj", reads, self.gradient(points, amplitudes))
+        turning = np.cross(reads, field[:, None]) + np.cross(arms[:, None], gradient)
+        return np.asarray(np.concatenate([gradient, turning], axis=2).reshape(
+            *reads.shape[:2], 2, 3) @ self.pose.turn.T).reshape(*reads.shape[:2], 6)
 
 
 class JoinedModel(ProbeModel):
@@ -140,7 +160,7 @@ class JoinedModel(ProbeModel):
     def _posed(self, at: ProbeFit, number: int) -> tuple[ProbeModel, ProbeFit, float]:
         """Return the model of a map by itself, its fit, and its gain."""
         value, one = at.instrument * self.prior_sd, copy(self.maps[number])
-        one.charges = PosedCharges(self.charges.places, self.charges.scale, self.pose(at, number))
+        one.charges = PosedCharges.seen_from(self.charges, self.pose(at, number))
         one.weights, one.prior_sd = self.weights[self.rows_of(number)], one.any_sd
         instrument = (value[:TERMS] + value[self.own(number)]) / one.any_sd
         lag = one.lag_shows(np.ones(len(one.points), bool))
@@ -191,22 +211,16 @@ class JoinedModel(ProbeModel):
     def _by_place(
         self, number: int, one: ProbeModel, fit: ProbeFit, rows: NDArray[np.bool_]
     ) -> Floats:
-        """Return the derivatives (n, 3, 7) in T by shift, turn and gain, for a gain of 1.
-
-        A turn d of the stage turns the axes u of a sensor and moves its place r, counted from the
-        middle of the map: ``u . B`` changes by ``d . (u x B + r x grad(u . B))``.
-        """
+        """Return the derivatives (n, 3, 7) in T by shift, turn and gain, for a gain of 1."""
         found = np.empty((int(rows.sum()), 3, len(PLACED_SD)))
         charges = one.charges
         assert isinstance(charges, PosedCharges)
-        turn = charges.pose.turn
         for sensor in range(3):
             places, reads = one.read_by(fit, rows, sensor)
-            field = charges.field(places, fit.amplitudes)
-            gradient = np.einsum("nc,ncj->nj", reads, charges.gradient(places, fit.amplitudes))
-            turning = np.cross(reads, field) + np.cross(places - self.middles[number], gradient)
-            found[:, sensor, SHIFT], found[:, sensor, TURN] = gradient @ turn.T, turning @ turn.T
-            found[:, sensor, GAIN] = np.sum(reads * field, axis=1)
+            found[:, sensor, :GAIN] = charges.by_pose(
+                places, reads[:, None], places - self.middles[number], fit.amplitudes)[:, 0]
+            found[:, sensor, GAIN] = np.sum(
+                reads * charges.field(places, fit.amplitudes), axis=1)
         return found
 
     def readings(self, at: ProbeFit, rows: NDArray[np.bool_] | None = None) -> Floats:

@@ -25,7 +25,14 @@ from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
-from halbach_fe.measurement.joined_probe import GAIN, PLACED_SD, TERMS, JoinedModel, Pose
+from halbach_fe.measurement.joined_probe import (
+    GAIN,
+    PLACED_SD,
+    TERMS,
+    JoinedModel,
+    Pose,
+    PosedCharges,
+)
 from halbach_fe.measurement.map_check import (
     FAR_OFF,
     GAPS,
@@ -67,6 +74,9 @@ MOST_CELLS = 30_000
 
 PLACES = 6
 """Number of shifts of best correlation from which poses are refined."""
+
+COMPARED = 200
+"""Largest number of points by which a pose is refined from the correlation."""
 
 CERTAIN = 30.0
 """Log odds of a place against chance: of some millions of shifts one has 15 by chance."""
@@ -415,8 +425,12 @@ def _match(one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]) -> 
         starts += [(odds, pose, sign) for odds, pose in _shifts(one, other, turn, sign)]
     starts.sort(key=lambda each: -each[0])
     nothing = _Match(Pose(np.eye(3), np.zeros(3)), 1, np.inf, np.nan, -np.inf)
-    return max((_refined(one, other, pose, sign) for _, pose, sign in starts[:PLACES]),
-               key=lambda match: (match.fits, match.odds), default=nothing)
+    found = [nothing]
+    for _, pose, sign in starts[:PLACES]:
+        found.append(_refined(one, other, pose, sign))
+        if found[-1].fits and found[-1].off <= AGREES:
+            break
+    return max(found, key=lambda match: (match.fits, match.odds))
 
 
 def _step(one: Checked, other: Checked) -> float:
@@ -480,17 +494,23 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
         rows = np.flatnonzero(one.holds(pose.places(other.points)))
         if len(rows) < FEWEST_SHARED:
             return _Match(pose, sign, np.inf, np.nan, -np.inf)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), SOME_POINTS)).astype(int)]
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), COMPARED)).astype(int)]
         points, read = other.points[rows], sign * other.ideal_T[rows]
 
-        def left(values: Floats, from_pose: Pose = pose, points: Floats = points,
+        def left(values: Floats, start: Pose = pose, at: Floats = points,
                  read: Floats = read) -> Floats:
-            at = from_pose.moved(middle, values[:3], values[3:])
-            return ((read - one.charges.field(at.places(points), one.amplitudes) @ at.turn)
-                    / noise).ravel()
+            posed = PosedCharges.seen_from(one.charges, start.moved(middle, values[:3], values[3:]))
+            return np.asarray((posed.field(at, one.amplitudes) - read).ravel() / noise)
 
-        found = least_squares(left, np.zeros(6), loss="soft_l1", f_scale=FAR_OFF, max_nfev=40,
-                              x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
+        def by_pose(values: Floats, start: Pose = pose, at: Floats = points,
+                    read: Floats = read) -> Floats:
+            posed = PosedCharges.seen_from(one.charges, start.moved(middle, values[:3], values[3:]))
+            found = posed.by_pose(at, np.broadcast_to(np.eye(3), (len(at), 3, 3)),
+                                  at - middle, one.amplitudes)
+            return found.reshape(-1, 6) / noise
+
+        found = least_squares(left, np.zeros(6), by_pose, loss="soft_l1", f_scale=FAR_OFF,
+                              max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
         pose = pose.moved(middle, found.x[:3], found.x[3:])
     off = float(np.sqrt(np.mean(found.fun**2)))
     size = float(np.sqrt(np.mean(read**2))) / noise
