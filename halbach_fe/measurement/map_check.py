@@ -299,6 +299,8 @@ class MapCheck:
         instrument that the lines show which are not held out.
     contradicted : tuple of int
         Numbers of the rows whose column of |B| is not that of their components, from 1.
+    gap_m : float
+        Distance of the charges from where the field was read, by the evidence of the readings.
     """
 
     readings: int
@@ -325,6 +327,7 @@ class MapCheck:
     position_noise_sd_m: float = 0.0
     position_noise_at_most: bool = False
     contradicted: tuple[int, ...] = ()
+    gap_m: float = 0.0
 
     @property
     def suffices(self) -> bool:
@@ -377,7 +380,7 @@ class MapCheck:
 
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON, without the arrays over rows."""
-        left_out = ("excluded", "residual_T", "unseen_T", "corrected_T")
+        left_out = ("excluded", "residual_T", "unseen_T", "corrected_T", "gap_m")
         return {name: value.tolist() if isinstance(value, np.ndarray) else value
                 for name, value in self.__dict__.items()
                 if name not in left_out and name not in ("terms", "reach")} | {
@@ -446,7 +449,8 @@ def check_map(
         size_T=float(np.linalg.norm(scan.field[rows.usable], axis=1).max()),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
-        corrected_T=fitted.model.ideal(fitted.at),
+        corrected_T=fitted.model.ideal(fitted.at), gap_m=float(np.min(
+            scan.points[rows.usable].min(axis=0) - fitted.model.charges.places.min(axis=0))),
         **_remaining(fitted, whole, scan.field, matrix, rows))
 
 

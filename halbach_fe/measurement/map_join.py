@@ -557,25 +557,20 @@ class _Joined:
             scans.append(scan)
         rows = np.concatenate(chosen)
 
-        def model(gap: float) -> JoinedModel:
-            places = np.vstack([start.places(scan.points)
-                                for start, scan in zip(starts, scans, strict=True)])
-            charges = Charges.around(places, gap)
-            made = JoinedModel(charges, [scan.model(charges) for scan in scans], starts)
-            joined = made.with_terms(_kept(maps, made))
-            assert isinstance(joined, JoinedModel)
-            return joined
-
-        best = model(_gap(maps, rows, model))
-        at, fit = best.perfect(), None
+        charges = Charges.around(*_around(maps, scans, starts))
+        model = JoinedModel(charges, [scan.model(charges) for scan in scans], starts)
+        best = model.with_terms(_kept(maps, model))
+        at = best.perfect()
+        fit = best.fit(at, rows)
         for number in range(1 + WEIGHTINGS):
-            fit = best.fit(at, rows)
-            width2 = fit.sigma**2 / fit.penalty
             at = fit_probe(best, rows, fit, best.allowed(replace(
                 at, amplitudes=fit.amplitudes, sigma=fit.sigma)))
             pace.advance(number + 1, 1 + WEIGHTINGS)
             if number < WEIGHTINGS:
-                best = best.weighted(at, rows, width2)
+                best = best.weighted(at, rows, fit.sigma**2 / fit.penalty)
+            if not number:  # the prior width of the field, now that the poses are known
+                fit = best.fit(at, rows)
+        width2 = fit.sigma**2 / fit.penalty
         return cls(maps, scans, best, at, rows, width2)
 
     def with_terms(self) -> tuple[tuple[InstrumentTerm, ...], _Joined]:
@@ -598,7 +593,6 @@ class _Joined:
     def _with(self, kept: NDArray[np.bool_]) -> _Joined:
         """Return the fit with other terms of the probe."""
         model = self.model.with_terms(kept)
-        assert isinstance(model, JoinedModel)
         fit = model.fit(self.at, self.rows)
         return replace(self, model=model, at=fit_probe(
             model, self.rows, fit, replace(self.at, prior_sd=model.prior_sd)))
@@ -717,20 +711,19 @@ def _scans(one: Checked) -> NDArray[np.str_]:
     return np.array([f"{one.name} {scan}" for scan in one.data["scan"].values])
 
 
-def _gap(
-    maps: Sequence[Checked], rows: NDArray[np.bool_], model: Callable[[float], JoinedModel]
-) -> float:
-    """Return the distance in m of the charges, by the evidence of some of the rows."""
-    spacing = min(one.check.spacing_m for one in maps)
-    some, chosen = np.zeros(len(rows), bool), np.flatnonzero(rows)
-    some[chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), SOME_POINTS)).astype(int)]] = True
-    found: list[tuple[float, float]] = []
-    for gap in (gap * spacing for gap in GAPS):
-        joined = model(gap)
-        near = spacing_of(joined.points, gap) <= TOO_FAR_APART * gap
-        if near or (not found and gap == GAPS[-1] * spacing):
-            found.append((joined.fit(joined.perfect(), some).log_evidence, gap))
-    return max(found)[1]
+def _around(
+    maps: Sequence[Checked], scans: Sequence[Scan], starts: Sequence[Pose]
+) -> tuple[Floats, float]:
+    """Return the points (n, 3) in m of all maps, and the distance in m of the charges from them.
+
+    It is that of the map which needs the nearest ones, or larger, until they are close together.
+    """
+    points = np.vstack([start.places(scan.points)
+                        for start, scan in zip(starts, scans, strict=True)])
+    gap = min(one.check.gap_m for one in maps)
+    while spacing_of(points, gap) > TOO_FAR_APART * gap:
+        gap *= 1.1
+    return points, gap
 
 
 COMMON = np.zeros(TERMS, bool)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,7 +156,7 @@ class ProbeModel:
         self.prior_sd = self.any_sd = sd
         self.scatter, self.weights = scatter, weights_of(scatter)
 
-    def with_terms(self, kept: NDArray[np.bool_]) -> ProbeModel:
+    def with_terms(self, kept: NDArray[np.bool_]) -> Self:
         """Return a model whose instrument has some of all parameters (p,) only."""
         other = copy(self)
         other.prior_sd = np.where(kept, self.any_sd, 0.0)
