@@ -35,7 +35,6 @@ from halbach_fe.measurement.joined_probe import (
 )
 from halbach_fe.measurement.map_check import (
     FAR_OFF,
-    GAPS,
     MOST_POINTS,
     SIGNIFICANT,
     SOME_POINTS,
@@ -69,6 +68,10 @@ from halbach_fe.study.types import COMPONENTS
 FEWEST_SHARED = 40
 """Smallest number of points of a map that another one has around them."""
 
+MARGIN = 0.25
+"""Distance outside of the box about a map, in units of its spacing, up to which it knows the field
+as well as inside."""
+
 MOST_CELLS = 30_000
 """Largest number of points of the grid on which the field of a map is compared with others."""
 
@@ -81,9 +84,10 @@ COMPARED = 200
 CERTAIN = 30.0
 """Log odds of a place against chance: of some millions of shifts one has 15 by chance."""
 
-AGREES = 2.0
-"""Rms difference in an overlap, in units of what the single maps leave, below which no other axes
-of a stage are tried."""
+NEARLY = 20.0
+"""Difference in an overlap, in units of what the single maps leave, above which a place is none.
+The field of a single map is known badly at its edge: 8 times what its held-out lines are off in a
+quadrupole. The field of all maps decides. Below `FAR_OFF`, axes are taken as they are stated."""
 
 DISAGREES = 2.0
 """chi2 per reading of an overlap from which maps contradict each other: errors of positions that
@@ -246,7 +250,7 @@ class Checked:
         kept = oriented(data, check) if within is None else within
         points, ideal = points_of(kept), check.corrected_T[rows]
         some = np.linspace(0, len(points) - 1, min(len(points), SOME_POINTS)).astype(int)
-        charges = Charges.around(points, GAPS[-2] * check.spacing_m)
+        charges = Charges.around(points, check.gap_m)
         (fit,) = fit_fields(charges, points[some], [ideal[some]])
         return cls(name, kept, check, ideal, floor, charges, fit.amplitudes)
 
@@ -263,7 +267,7 @@ class Checked:
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which of points (n, 3) are among those of the map."""
         low, high = self.box
-        margin = self.check.spacing_m / 2
+        margin = MARGIN * self.check.spacing_m
         return np.asarray(((points > low - margin) & (points < high + margin)).all(axis=1))
 
 
@@ -335,7 +339,7 @@ def _contradiction(name: str, off_T: float, noise_T: float, hint: str = "") -> M
     """Return the error for a map that is not of the same field."""
     return MeasurementError(must_be(
         f"map '{name}'", "the maps that are joined", "one that overlaps another one of the same "
-        "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT rms in "
+        "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT in "
         f"the place where they fit best, of which noise explains {1e3 * noise_T:.3g} mT",
         hint or "It is of another magnet, was changed, or no other map reaches into it: such maps "
         "can be joined by the magnet only, with `halbach-fe register`."))
@@ -348,8 +352,8 @@ def _contradiction(name: str, off_T: float, noise_T: float, hint: str = "") -> M
 class _Match:
     """A pose of a map on another one, and how well the readings agree there.
 
-    ``off`` is the rms difference in units of what both maps leave, ``odds`` the log odds against a
-    place where both have nothing to do with each other.
+    ``off`` is the difference, by its median, in units of what both maps leave, ``odds`` the log
+    odds against a place where both have nothing to do with each other.
     """
 
     pose: Pose
@@ -361,7 +365,7 @@ class _Match:
     @property
     def fits(self) -> bool:
         """Whether both may be of one field."""
-        return self.off <= FAR_OFF and self.odds > CERTAIN
+        return self.off <= NEARLY and self.odds > CERTAIN
 
     @property
     def is_mirrored(self) -> bool:
@@ -387,14 +391,15 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
     turned: dict[tuple[int, int], _Match] = {}
     while len(found) < len(maps):
         pairs = [pair for pair in as_stated if pair[0] in found and pair[1] not in found]
-        known = {pair: as_stated[pair] for pair in pairs if as_stated[pair].off <= AGREES
+        known = {pair: as_stated[pair] for pair in pairs if as_stated[pair].off <= FAR_OFF
                  and as_stated[pair].fits}
         if not known:
-            for pair in pairs:
-                if pair not in turned:
-                    turned[pair] = max((as_stated[pair], _match(
-                        maps[pair[0]], maps[pair[1]], list(_axes()))), key=lambda each: (
-                            each.fits, each.odds))
+            for one, other in pairs:
+                if (one, other) not in turned:
+                    stated = as_stated[one, other]
+                    best = _match(maps[one], maps[other], list(_axes()))
+                    better = best.fits and best.odds > stated.odds + CERTAIN
+                    turned[one, other] = best if better or not stated.fits else stated
             known = {pair: turned[pair] for pair in pairs}
         first, other = max(known, key=lambda pair: (
             known[pair].fits, not known[pair].is_mirrored, known[pair].odds))
@@ -428,7 +433,7 @@ def _match(one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]) -> 
     found = [nothing]
     for _, pose, sign in starts[:PLACES]:
         found.append(_refined(one, other, pose, sign))
-        if found[-1].fits and found[-1].off <= AGREES:
+        if found[-1].fits and found[-1].off <= FAR_OFF:
             break
     return max(found, key=lambda match: (match.fits, match.odds))
 
@@ -512,7 +517,8 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
         found = least_squares(left, np.zeros(6), by_pose, loss="soft_l1", f_scale=FAR_OFF,
                               max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
         pose = pose.moved(middle, found.x[:3], found.x[3:])
-    off = float(np.sqrt(np.mean(found.fun**2)))
+    # at the edge of the other map its field is not known as well as the noise is
+    off = float(1.4826 * np.median(np.abs(found.fun)))
     size = float(np.sqrt(np.mean(read**2))) / noise
     odds = float(3 * len(rows) * np.log(np.hypot(size, 1) / np.hypot(off, 1)))
     if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:]).max() > 0.3:

@@ -15,7 +15,7 @@ from tests.support.cube_dipole import cubes
 
 NOISE_T = 2e-5
 
-STEP_M = 0.006
+STEP_M = 0.005
 POINTS = np.stack(np.meshgrid(*(STEP_M * np.arange(n) for n in (4, 4, 7)), indexing="ij"),
                   axis=-1).reshape(-1, 3)
 """Of a stage, whose origin is at a corner; lines run along z."""
@@ -52,7 +52,7 @@ def campaign(
     found, poses = {}, []
     for number in range(maps):
         pose = (Rotation.from_rotvec(0.01 * generator.standard_normal(3)),
-                np.array([-0.009, -0.009, -0.045 + 0.024 * number])
+                np.array([-0.0075, -0.0075, -0.035 + 0.018 * number])
                 + 1e-3 * generator.standard_normal(3))
         found[f"part{number}"] = read(magnet, pose, generator, noise)
         poses.append(pose)
