@@ -295,6 +295,20 @@ def join_maps(
     MeasurementError
         If a map does not obey Maxwell's equations by itself, or there is no place where its
         readings are those of the others: it is mirrored, of another magnet, or overlaps none.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> from halbach_fe.measurement.field_map import field_map
+    >>> axis = 0.01 * np.arange(5)
+    >>> points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    >>> away = points - [0.1, 0.05, 0.08]  # from the pole of a long magnet
+    >>> there = away + [0.0, 0.0, 0.02]  # another stage, whose zero is 20 mm farther along z
+    >>> maps = {name: field_map(points, 1e-4 * each / np.linalg.norm(each, axis=1)[:, None]**3
+    ...                         + 1e-6 * np.random.default_rng(1).standard_normal(each.shape))
+    ...         for name, each in (("one", away), ("other", there))}
+    >>> (1e3 * hf.join_maps(maps).poses[0].shift_m).round(0) + 0.0
+    array([ 0.,  0., 20.])
     """
     if not isinstance(maps, Mapping) or len(maps) < 2:
         raise StudyError(must_be("`maps`", "join_maps", "two maps or more, by name",
