@@ -94,7 +94,11 @@ DISAGREES = 2.0
 scan lines have in common made 1.5 in maps of one magnet."""
 
 DIFFERS = FAR_OFF**2
-"""chi2 per reading of an overlap from which maps are not joined."""
+"""chi2 per reading of an overlap from which maps are not joined. If axes of a stage are not those
+that it states, `DISAGREES` is: a smooth field that is nearly symmetric is much like itself."""
+
+TURNED_RAD = 0.5
+"""Turn from which a stage has other axes than it states."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,11 @@ class MapPose:
         """Place (3,) in m of the origin of the map in the frame of the first one."""
         turn = Rotation.from_rotvec(self.rotation_rad).as_matrix()
         return np.asarray(self.middle_m + self.shift_m - turn @ self.middle_m)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the axes of the stage are not those that it states."""
+        return bool(np.linalg.norm(self.rotation_rad) > TURNED_RAD)
 
     @property
     def determined(self) -> NDArray[np.bool_]:
@@ -343,10 +352,12 @@ def join_checked(maps: Sequence[Checked], pace: Pace) -> JoinedMaps:
     joined = _Joined.of(maps, [pose for pose, _ in places], pace)
     terms, joined = joined.with_terms()
     overlaps = joined.overlaps()
+    result = joined.result([sign for _, sign in places], terms, overlaps)
+    limit = DISAGREES if any(one.is_turned for one in result.poses) else DIFFERS
     for one in overlaps:
-        if one.chi2 > DIFFERS:
+        if one.chi2 > limit:
             raise _contradiction(one.name, one.rms_T, one.alone_T)
-    return joined.result([sign for _, sign in places], terms, overlaps)
+    return result
 
 
 def _contradiction(name: str, off_T: float, noise_T: float, hint: str = "") -> MeasurementError:

@@ -16,7 +16,7 @@ from tests.support.cube_dipole import cubes
 NOISE_T = 2e-5
 
 STEP_M = 0.005
-POINTS = np.stack(np.meshgrid(*(STEP_M * np.arange(n) for n in (4, 4, 7)), indexing="ij"),
+POINTS = np.stack(np.meshgrid(*(STEP_M * np.arange(n) for n in (4, 4, 8)), indexing="ij"),
                   axis=-1).reshape(-1, 3)
 """Of a stage, whose origin is at a corner; lines run along z."""
 
@@ -43,7 +43,7 @@ MAGNETS = (quadrupole, cubes)
 def campaign(
     seed: int, maps: int = 3, noise: float = NOISE_T
 ) -> tuple[dict[str, xr.Dataset], list[Pose], magpylib.Collection]:
-    """Maps along the magnet that overlap by 12 mm, where their stages stand, and the magnet.
+    """Maps along the magnet that overlap by 20 mm, where their stages stand, and the magnet.
 
     A place p of a stage is turn p + shift: turns are some 10 mrad, shifts off by millimetres.
     """
@@ -52,7 +52,7 @@ def campaign(
     found, poses = {}, []
     for number in range(maps):
         pose = (Rotation.from_rotvec(0.01 * generator.standard_normal(3)),
-                np.array([-0.0075, -0.0075, -0.035 + 0.018 * number])
+                np.array([-0.0075, -0.0075, -0.035 + 0.015 * number])
                 + 1e-3 * generator.standard_normal(3))
         found[f"part{number}"] = read(magnet, pose, generator, noise)
         poses.append(pose)
