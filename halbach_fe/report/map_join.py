@@ -64,8 +64,8 @@ def sentences(joined: JoinedMaps) -> list[str]:
     found = [f"The readings of {pose.name} have the opposite sign of those of "
              f"{next(iter(joined.checks))}: the joined map has them reversed."
              for pose in joined.poses if pose.sign < 0]
-    found += [f"{pose.name} fits only with its stage turned by right angles (rotation_rad). If it did "
-              "not stand so, it does not overlap the other maps."
+    found += [f"{pose.name} fits only with its stage turned by right angles (rotation_rad). If it "
+              "did not stand so, it does not overlap the other maps."
               for pose in joined.poses if pose.is_turned]
     found += [f"{one.name} contradicts the other maps where they overlap: chi² is {one.chi2:.3g} "
               f"per reading, rms {flux_density(one.rms_T)} by one field for all, "
