@@ -658,8 +658,8 @@ class _Joined:
 
     def _stated(self, parameter: Parameter) -> InstrumentTerm:
         """Return a term of the probe as all maps show it."""
-        value = float(parameter.row @ self.at.instrument)
-        sd = float(np.sqrt(parameter.row @ self.at.covariance @ parameter.row))
+        row = np.where(self.model.prior_sd > 0, parameter.row, 0.0)  # without what is not fitted
+        value, sd = float(row @ self.at.instrument), float(np.sqrt(row @ self.at.covariance @ row))
         return InstrumentTerm(parameter.name, parameter.unit, value, sd, True, True)
 
     def overlaps(self) -> tuple[Overlap, ...]:
