@@ -93,9 +93,9 @@ def test_the_joined_map_is_that_of_one_stage(generator):
     turn, shift = poses[0]
     field = magnet.getB(points_of(joined.data) @ turn.as_matrix().T + shift) @ turn.as_matrix()
     left = np.asarray(joined.data["B_T"].values) - field
-    assert np.sqrt(np.mean(left**2)) < 2 * NOISE_T  # 1 % of the field is 100 times as much
+    assert np.sqrt(np.mean(left**2)) < 2 * NOISE_T  # 1 % of the field is 16 times as much
     assert np.sqrt(np.mean((np.asarray(maps["part1"]["B_T"].values)
-                            - field[len(points_of(maps["part0"])):])**2)) > 20 * NOISE_T
+                            - field[len(points_of(maps["part0"])):])**2)) > 10 * NOISE_T
 
 
 def mirrored(data):
@@ -109,10 +109,10 @@ def shuffled(data, generator):
 
 def test_maps_that_cannot_be_joined(generator):
     """A mirrored one is named; one of another magnet, and one that nobody reaches, are refused."""
-    maps, poses, _ = campaign(1, maps=2)
+    maps, poses, _ = campaign(0, maps=2)
     with pytest.raises(MeasurementError, match=r"whose mirror image fits.* reverse z and Bz"):
         joined_of(maps | {"part1": mirrored(maps["part1"])})
-    foreign = read(MAGNETS[1](np.random.default_rng(5)), poses[1], generator)
+    foreign = read(MAGNETS[0](np.random.default_rng(5)), poses[1], generator)
     with pytest.raises(MeasurementError, match="another magnet"):
         joined_of(maps | {"part1": foreign})
 
