@@ -360,14 +360,15 @@ def join_checked(maps: Sequence[Checked], pace: Pace) -> JoinedMaps:
     return result
 
 
-def _contradiction(name: str, off_T: float, noise_T: float, hint: str = "") -> MeasurementError:
+def _contradiction(name: str, off_T: float, noise_T: float) -> MeasurementError:
     """Return the error for a map that is not of the same field."""
     return MeasurementError(must_be(
         f"map '{name}'", "the maps that are joined", "one that overlaps another one of the same "
         "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT in "
         f"the place where they fit best, of which noise explains {1e3 * noise_T:.3g} mT",
-        hint or "It is of another magnet, was changed, or no other map reaches into it: such maps "
-        "can be joined by the magnet only, with `halbach-fe register`."))
+        "It is of another magnet, mirrored (a position axis counts backwards), was changed, or no "
+        "other map reaches into it: such maps can be joined by the magnet only, with `halbach-fe "
+        "register`."))
 
 
 # --- where maps overlap -------------------------------------------------------------------------

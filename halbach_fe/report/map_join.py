@@ -32,6 +32,12 @@ def answer(joined: JoinedMaps) -> Answer:
             f"chi² {worst.chi2:.3g} per reading. The bars are widened by its root.",
             "Look for what changed between the maps: temperature, gain, positions of the stage.",
             sound=False)
+    if turned := [pose.name for pose in joined.poses if pose.is_turned]:
+        return Answer(
+            question, f"{said[0].upper()}{said[1:]}.",
+            f"Only if the stage of {in_a_row(turned)} stood turned by right angles: with the axes "
+            "that it states, no place fits. A smooth field is much like itself elsewhere.",
+            "Look how the stage stood, or measure with a larger overlap.", sound=False)
     if _open(joined):
         return Answer(
             question, f"{said[0].upper()}{said[1:]}.",
