@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks.note import Note
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.measurement.map_check import check_map
+from halbach_fe.measurement.map_join import join_maps
+from tests.support import joined_campaigns
 from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 
 RESULTS = Path(__file__).parent.parent / "results" / "calibration" / "calibration.json"
@@ -58,3 +62,21 @@ def instrument(note: Note) -> None:
          f"{against}, with one error of usual size; asked: 0.9 at least")
     note("check.instrument_within_2sd", within / MAPS, "ratio",
          "the same maps: share whose error is within 2 sd, found or not")
+
+
+CAMPAIGNS = 30
+"""Number of campaigns of three overlapping maps that are joined without a magnet."""
+
+
+def joined(note: Note) -> None:
+    """Note how far the poses of maps that are joined are off, in units of their bars."""
+    off, refused = [], 0
+    for seed in range(CAMPAIGNS):
+        maps, poses, _ = joined_campaigns.campaign(seed)
+        try:
+            off.append(joined_campaigns.over_bars(join_maps(maps), poses))
+        except MeasurementError:
+            refused += 1
+    note("joined.pose_z_rms", float(np.sqrt(np.mean(np.square(off)))), "ratio",
+         f"errors over bars of {12 * len(off)} numbers of poses in campaigns by magpylib, a "
+         f"quadrupole and a dipole of cubes; {refused} of {CAMPAIGNS} refused; asked: 0.9 to 1.1")

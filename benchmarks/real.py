@@ -42,6 +42,20 @@ def emphatic(note: Note) -> None:
     _note_second(note, "real", "small_aperture_fringe.csv", folder / "fringe", inferred)
 
 
+def overlap(note: Note) -> None:
+    """Note where the second map of the dipole lies by the first one, without a magnet."""
+    maps = [_made("emphatic").joinpath(f"{name}.csv") for name in ("body", "fringe")]
+    with tempfile.TemporaryDirectory() as temporary:
+        _do("check", *maps, "-o", Path(temporary) / "joined")
+        found = json.loads((Path(temporary) / "joined" / "joined.json").read_text("utf-8"))
+    (pose,) = found["poses"]
+    note("real.overlap_z_mm", 1e3 * pose["shift_m"][2], "mm",
+         f"± {1e3 * pose['shift_sd_m'][2]:.3f}; one gain and 810 readings of the overlap alone "
+         "say 252.460 ± 0.002; asked: within 0.05")
+    note("real.overlap_chi2", max(one["chi2"] for one in found["overlaps"]), "ratio",
+         "per reading of the overlap, predicted by the other map; asked: 0.8 to 1.2")
+
+
 def mri(note: Note) -> None:
     """Note the figures of the magnet for MRI."""
     folder = _made("mri4all")

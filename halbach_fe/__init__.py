@@ -70,6 +70,8 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.field_map import write_map as write_map
     from halbach_fe.measurement.map_check import MapCheck as MapCheck
     from halbach_fe.measurement.map_check import check_map as check_map
+    from halbach_fe.measurement.map_join import JoinedMaps as JoinedMaps
+    from halbach_fe.measurement.map_join import join_maps as join_maps
     from halbach_fe.report.campaign_report import campaign_report as campaign_report
     from halbach_fe.report.result_files import write_report as write_report
     from halbach_fe.response.discretization_error import Verification as Verification
@@ -97,7 +99,8 @@ _HOME = {
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
     "read_map": "measurement.field_map", "read_maps": "measurement.campaign",
     "read_blocks": "measurement.block_table",
-    "check_map": "measurement.map_check", "Session": "solver.session",
+    "check_map": "measurement.map_check", "join_maps": "measurement.map_join",
+    "JoinedMaps": "measurement.map_join", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.discretization_error", "multipoles": "api", "homogeneity": "api",
     "stray_field": "response.stray_field", "StrayField": "response.stray_field",

@@ -67,7 +67,8 @@ WRITES = {
     "simulate-measurement": ("blocks.csv", "map.csv", "map.h5", "held-out.csv", "held-out.h5",
                              "truth/truth.json", "campaign.html", "campaign_*.png"),
     "check": ("check.*", "check_*.png", "oriented_map.csv", "inner_map.csv",
-              "corrected_map.csv"),
+              "corrected_map.csv", "joined.*", "*/check.*", "*/check_*.png", "*/*_map.csv",
+              "*/page.json"),
     "register": ("registration.*", "*/registration.*", "*/page.json", "study.registered.toml"),
     "report": ("report.html",)}
 """Names of the results of every command, beside page.json: what it must not find in its folder

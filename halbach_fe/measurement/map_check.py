@@ -299,6 +299,8 @@ class MapCheck:
         instrument that the lines show which are not held out.
     contradicted : tuple of int
         Numbers of the rows whose column of |B| is not that of their components, from 1.
+    gap_m : float
+        Distance of the charges from where the field was read, by the evidence of the readings.
     """
 
     readings: int
@@ -325,6 +327,7 @@ class MapCheck:
     position_noise_sd_m: float = 0.0
     position_noise_at_most: bool = False
     contradicted: tuple[int, ...] = ()
+    gap_m: float = 0.0
 
     @property
     def suffices(self) -> bool:
@@ -377,7 +380,7 @@ class MapCheck:
 
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON, without the arrays over rows."""
-        left_out = ("excluded", "residual_T", "unseen_T", "corrected_T")
+        left_out = ("excluded", "residual_T", "unseen_T", "corrected_T", "gap_m")
         return {name: value.tolist() if isinstance(value, np.ndarray) else value
                 for name, value in self.__dict__.items()
                 if name not in left_out and name not in ("terms", "reach")} | {
@@ -428,9 +431,9 @@ def check_map(
     True
     """
     data = _checkable(data)
-    scan, usable, broken = _scan_of(data)
+    scan, usable, broken = scan_of(data)
     lines = scan_lines(scan.points)
-    rows = _Rows(lines, usable, usable & _some_lines(lines, usable))
+    rows = _Rows(lines, usable, usable & some_lines(lines, usable))
     pace = Pace(say, progress)
     _begin(pace, 1, "comparing the orientations of the probe")
     matrix, alike = _orientation(scan.of(rows.train), pace)
@@ -446,8 +449,29 @@ def check_map(
         size_T=float(np.linalg.norm(scan.field[rows.usable], axis=1).max()),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
-        corrected_T=fitted.model.ideal(fitted.at),
+        corrected_T=fitted.model.ideal(fitted.at), gap_m=float(np.min(
+            scan.points[rows.usable].min(axis=0) - fitted.model.charges.places.min(axis=0))),
         **_remaining(fitted, whole, scan.field, matrix, rows))
+
+
+def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
+    """Return the map without broken rows, with its columns along the axes that they belong to."""
+    kept = data.isel(point=np.flatnonzero(~check.excluded))
+    turned = kept.copy(deep=True)
+    for column, name in enumerate(check.orientation):
+        axis, sign = COMPONENTS.index(name[-1]), -1.0 if name.startswith("-") else 1.0
+        turned["B_T"][:, axis] = sign * kept["B_T"].values[:, column]
+        if "sigma_T" in kept:
+            turned["sigma_T"][:, axis] = kept["sigma_T"].values[:, column]
+    return turned
+
+
+def inner(data: xr.Dataset, check: MapCheck) -> xr.Dataset | None:
+    """Return the oriented map in the region that a field without sources describes, if not all."""
+    if check.reach is None or not np.isfinite(check.reach.limit_m):
+        return None
+    return oriented(data, check).isel(point=np.flatnonzero(
+        check.reach.holds(points_of(data))[~check.excluded]))
 
 
 def _remaining(
@@ -509,9 +533,11 @@ def _held_out(lines: Ints, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(found)
 
 
-def _some_lines(lines: Ints, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether a row is in one of the scan lines that are fitted, see `MOST_POINTS`."""
-    every = max(1, round(int(usable.sum()) / MOST_POINTS))
+def some_lines(
+    lines: Ints, usable: NDArray[np.bool_], most: int = MOST_POINTS
+) -> NDArray[np.bool_]:
+    """Return whether a row is in one of the scan lines that are fitted, of ``most`` rows."""
+    every = max(1, round(int(usable.sum()) / most))
     # a step that has no factor with HELD_OUT_EVERY, so that held-out lines remain
     while every > 1 and every % HELD_OUT_EVERY == 0:
         every += 1
@@ -522,7 +548,7 @@ def _some_lines(lines: Ints, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class _Scan:
+class Scan:
     """Readings (n, 3) in T at points (n, 3) in m.
 
     ``scatter`` (n,) in T is by how much readings around are off functions through neighbours,
@@ -535,11 +561,11 @@ class _Scan:
     directions: Floats
     scatter: Floats
 
-    def of(self, rows: NDArray[np.bool_] | Ints) -> _Scan:
+    def of(self, rows: NDArray[np.bool_] | Ints) -> Scan:
         """Return some of the rows."""
-        return _Scan(*(values[rows] for values in self.__dict__.values()))
+        return Scan(*(values[rows] for values in self.__dict__.values()))
 
-    def turned(self, matrix: Floats) -> _Scan:
+    def turned(self, matrix: Floats) -> Scan:
         """Return the components that a matrix (3, 3) makes of the columns."""
         return replace(self, field=self.field @ matrix.T)
 
@@ -605,7 +631,7 @@ class _Rows:
         return self.chosen & ~self.held_out
 
 
-def _first_fit(scan: _Scan, rows: _Rows, pace: Pace) -> _Fitted:
+def _first_fit(scan: Scan, rows: _Rows, pace: Pace) -> _Fitted:
     """Return the fit of the field and of all parameters of the instrument."""
     gap, sensors, fit = _gap(scan.of(rows.train), pace)
     # around all rows, of which those that are not fitted are read too
@@ -651,9 +677,9 @@ def _where(data: xr.Dataset) -> str:
     return f"map {data.encoding['source']}" if "source" in data.encoding else "map"
 
 
-def _scan_of(
+def scan_of(
     data: xr.Dataset
-) -> tuple[_Scan, NDArray[np.bool_], dict[str, list[int]]]:
+) -> tuple[Scan, NDArray[np.bool_], dict[str, list[int]]]:
     """Return the readings, which of them are usable, and the rows that are broken.
 
     MeasurementError if too few are usable, see `check_map`.
@@ -682,7 +708,7 @@ def _scan_of(
     usable &= ~rough
     off, sd = quadratic_residual(points[usable], field[usable])
     scatter = scatter_around(points, points[usable], off / sd[:, None])
-    return _Scan(points, field, _time(data, len(points)), motion(points), scatter), usable, broken
+    return Scan(points, field, _time(data, len(points)), motion(points), scatter), usable, broken
 
 
 # --- orientation --------------------------------------------------------------------------------
@@ -703,7 +729,7 @@ def _named(matrix: Floats) -> tuple[str, str, str]:
 
 
 def _orientation(
-    scan: _Scan, pace: Pace
+    scan: Scan, pace: Pace
 ) -> tuple[Floats, tuple[tuple[str, str, str], ...]]:
     """Return the matrix of the orientation, and others that fit as well.
 
@@ -734,7 +760,7 @@ def _orientation(
     return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
 
 
-def _gap(scan: _Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
+def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
     """Return the distance in m of the charges, where the sensors are, and the fit of the field.
 
     The distance is that from where sensors at (3, 3) in m read the field. The instrument is
@@ -781,7 +807,7 @@ CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
 
 
 @dataclass(frozen=True)
-class _Parameter:
+class Parameter:
     """A parameter in the unit of people: the product of ``row`` (p,) and `ProbeFit.instrument`.
 
     It is left out of a model without the parameters ``own`` of a `ProbeFit`.
@@ -793,7 +819,7 @@ class _Parameter:
     own: tuple[int, ...]
 
 
-def _parameters(prior_sd: Floats, shares: Floats) -> list[_Parameter]:
+def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     """Return all parameters of the instrument.
 
     ``shares`` (3, 3) is how much each element of the matrix of gains and crosstalk changes |B|, see
@@ -805,7 +831,7 @@ def _parameters(prior_sd: Floats, shares: Floats) -> list[_Parameter]:
             own: tuple[int, ...] = ()) -> None:
         row = np.zeros(len(prior_sd))
         row[list(weights)] = factor * np.array(list(weights.values()))
-        found.append(_Parameter(name, unit, row * prior_sd, own or tuple(weights)))
+        found.append(Parameter(name, unit, row * prior_sd, own or tuple(weights)))
 
     for sensor, along in product(range(3), repeat=2):
         add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",
@@ -853,33 +879,33 @@ def _stated(
         for part in pairs:
             told.append(Evidence.of(model, part, fitted.at, fitted.width2))
             pace.advance(number * len(pairs) + len(told), ROUNDS * len(pairs))
-        parameters = _parameters(model.prior_sd, model.shares(fitted.at))
-        kept, terms = _selected(parameters, told)
+        parameters = all_parameters(model.prior_sd, model.shares(fitted.at))
+        kept, terms = selected(parameters, told)
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
     return fitted, tuple(
         replace(term, value=float(parameter.row @ fitted.at.instrument)) if term.found else term
         for parameter, term in zip(parameters, terms, strict=True))
 
 
-def _selected(
-    parameters: list[_Parameter], told: list[Evidence]
+def selected(
+    parameters: list[Parameter], told: list[Evidence], known: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
     """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
 
     ``told`` is what the whole map tells, and what its halves do. In a field along one axis, a turn
     of the probe and an angle between its sensors differ by little: of what explains the map, it is
-    what is certain, and near to 0 by what instruments do.
+    what is certain, and near to 0 by what instruments do. ``known`` (p,) are kept already.
     """
-    kept = np.zeros(len(told[0].sums), bool)
+    kept = np.zeros(len(told[0].sums), bool) if known is None else known.copy()
     while True:
         terms, away = zip(*(_term(parameter, kept, told) for parameter in parameters), strict=True)
-        known = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
+        there = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
         new = [(abs(term.value) / term.sd / (1 + far), parameter.own)
-               for parameter, term, far, old in zip(parameters, terms, away, known, strict=True)
+               for parameter, term, far, old in zip(parameters, terms, away, there, strict=True)
                if term.found and not old]
         if not new:
             return kept, tuple(replace(term, predictive=term.predictive and (not term.found or old))
-                               for term, old in zip(terms, known, strict=True))
+                               for term, old in zip(terms, there, strict=True))
         kept[list(max(new)[1])] = True
 
 
@@ -897,7 +923,7 @@ def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDA
 
 
 def _term(
-    parameter: _Parameter, kept: NDArray[np.bool_], told: list[Evidence]
+    parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence]
 ) -> tuple[InstrumentTerm, float]:
     """Return what the whole map and its halves show of a parameter, besides those that are kept.
 

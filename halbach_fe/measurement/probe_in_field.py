@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,7 +156,7 @@ class ProbeModel:
         self.prior_sd = self.any_sd = sd
         self.scatter, self.weights = scatter, weights_of(scatter)
 
-    def with_terms(self, kept: NDArray[np.bool_]) -> ProbeModel:
+    def with_terms(self, kept: NDArray[np.bool_]) -> Self:
         """Return a model whose instrument has some of all parameters (p,) only."""
         other = copy(self)
         other.prior_sd = np.where(kept, self.any_sd, 0.0)
@@ -186,7 +187,7 @@ class ProbeModel:
 
     def start(self, fit: HarmonicFit) -> ProbeFit:
         """Return the fit of a perfect instrument."""
-        count = len(PRIOR_SD)
+        count = len(self.prior_sd)
         return ProbeFit(fit.amplitudes, np.zeros(count), np.eye(count), fit.sigma, fit.used,
                        self.prior_sd, False)
 
@@ -204,7 +205,7 @@ class ProbeModel:
         """Return the change (n, 3) in T of the sensors' offsets."""
         return np.asarray(self.time[rows, None] * (at.instrument * self.prior_sd)[OFFSETS])
 
-    def _sensor(
+    def read_by(
         self, at: ProbeFit, rows: NDArray[np.bool_], sensor: int
     ) -> tuple[Floats, Floats]:
         """Return the places (n, 3) in m of a sensor and the directions (n, 3) that it reads."""
@@ -218,7 +219,7 @@ class ProbeModel:
         """Return the weighted readings (n, 3, k) per amplitude."""
         found = np.empty((int(rows.sum()), 3, len(self.charges)))
         for sensor in range(3):
-            places, reads = self._sensor(at, rows, sensor)
+            places, reads = self.read_by(at, rows, sensor)
             found[:, sensor] = self.charges.fields_along(
                 places, self.weights[rows, sensor, None] * reads)
         return found
@@ -227,7 +228,7 @@ class ProbeModel:
         """Return the weighted derivatives (n, 3, p) in T by the parameters / `PRIOR_SD`."""
         found = np.zeros((int(rows.sum()), 3, len(PRIOR_SD)))
         for sensor in range(3):
-            places, reads = self._sensor(at, rows, sensor)
+            places, reads = self.read_by(at, rows, sensor)
             field = self.charges.field(places, at.amplitudes)
             gradient = np.einsum("nc,ncj->nj", reads,
                                  self.charges.gradient(places, at.amplitudes))
@@ -251,7 +252,7 @@ class ProbeModel:
         some = np.zeros(len(self.points), bool)
         some[chosen] = True
         for sensor in range(3):
-            places, reads = self._sensor(at, some, sensor)
+            places, reads = self.read_by(at, some, sensor)
             found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
 
@@ -276,7 +277,7 @@ class ProbeModel:
         that of the readings, because no map can show a common gain.
         """
         every = np.ones(len(self.points), bool)
-        reads = np.stack([self._sensor(at, every, sensor)[1] for sensor in range(3)], axis=1)
+        reads = np.stack([self.read_by(at, every, sensor)[1] for sensor in range(3)], axis=1)
         read, field = self.readings(at), self.charges.field(self.points, at.amplitudes)
         gain = 1 + float(np.sum(self.shares(at) * at.mixing))
         return np.asarray(gain * (field + np.linalg.solve(
@@ -301,12 +302,12 @@ def fit_probe(
     """
     at = replace(start or model.start(fit), lag=model.lag_shows(rows))
     width2 = fit.sigma**2 / fit.penalty
-    state = _State.of(model, at, rows, width2)
+    state = State.of(model, at, rows, width2)
     for _ in range(iterations):
         design, by_field, covariance = state.normal()
         step, used = state.step(design, covariance), state.used(design, by_field, covariance)
         for halving in range(HALVINGS):
-            after = _State.of(model, replace(
+            after = State.of(model, replace(
                 state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
             if after.chi2 <= state.chi2:
                 break
@@ -400,7 +401,7 @@ class Evidence:
         cls, model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, width2: float
     ) -> Evidence:
         """Return what some rows tell, near a fit, for the prior variance of amplitudes in T^2."""
-        state = _State.of(model, at, rows, width2)
+        state = State.of(model, at, rows, width2)
         design, left, _ = state.normal()
         information = design.T @ left / at.sigma**2
         return cls(information, design.T @ state.left / at.sigma**2
@@ -413,7 +414,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class _State:
+class State:
     """The field of largest probability for an instrument and a noise.
 
     Attributes
@@ -436,7 +437,7 @@ class _State:
     free: FreeField
 
     @classmethod
-    def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> _State:
+    def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> State:
         """Fit the field for the instrument and the noise of ``at``."""
         by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
         return cls._solved(model, rows, width2, at, model.target(at, rows),
@@ -446,7 +447,7 @@ class _State:
     def _solved(
         cls, model: ProbeModel, rows: NDArray[np.bool_], width2: float, at: ProbeFit,
         target: Floats, free: FreeField,
-    ) -> _State:
+    ) -> State:
         """Solve for the amplitudes."""
         amplitudes = free.amplitudes(target)
         left = target - free.by_amplitude @ amplitudes
@@ -455,7 +456,7 @@ class _State:
         return cls(model, rows, width2, replace(at, amplitudes=amplitudes), chi2, left, target,
                    free)
 
-    def with_noise(self, sigma: float, at: ProbeFit) -> _State:
+    def with_noise(self, sigma: float, at: ProbeFit) -> State:
         """Return the state of the same instrument for another noise in T."""
         return self._solved(self.model, self.rows, self.width2, replace(at, sigma=sigma),
                             self.target, self.free.of_noise(sigma**2 / self.width2))
@@ -466,7 +467,7 @@ class _State:
         The amplitudes, which are the best for the present instrument, are eliminated from the
         normal equations. The covariance (p, p) is relative to sigma^2.
         """
-        count = len(PRIOR_SD)
+        count = len(self.at.instrument)
         design = self.model.by_parameter(self.at, self.rows).reshape(-1, count)
         left = self.free.left(design)
         return design, left, np.asarray(np.linalg.inv(

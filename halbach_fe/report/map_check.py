@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
-from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach
+from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach, inner, oriented
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
@@ -438,26 +438,6 @@ def check_summary(data: xr.Dataset, check: MapCheck) -> dict[str, object]:
         maps["corrected_map"] = corrected(data, check)
     return check.plain() | {
         "maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}}
-
-
-def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
-    """Return the map without broken rows, with its columns along the axes that they belong to."""
-    kept = data.isel(point=np.flatnonzero(~check.excluded))
-    turned = kept.copy(deep=True)
-    for column, name in enumerate(check.orientation):
-        axis, sign = COMPONENTS.index(name[-1]), -1.0 if name.startswith("-") else 1.0
-        turned["B_T"][:, axis] = sign * kept["B_T"].values[:, column]
-        if "sigma_T" in kept:
-            turned["sigma_T"][:, axis] = kept["sigma_T"].values[:, column]
-    return turned
-
-
-def inner(data: xr.Dataset, check: MapCheck) -> xr.Dataset | None:
-    """Return the oriented map in the region that a field without sources describes, if not all."""
-    if check.reach is None or not np.isfinite(check.reach.limit_m):
-        return None
-    return oriented(data, check).isel(point=np.flatnonzero(
-        check.reach.holds(points_of(data))[~check.excluded]))
 
 
 def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:

@@ -206,8 +206,8 @@ def trust_white_noise(monkeypatch):
     """Let the check believe that whatever the charges do not follow is white noise: the parts of
     the map tell what the whole map does.
     """
-    selected = map_check._selected
-    monkeypatch.setattr(map_check, "_selected", lambda parameters, told: selected(
+    selected = map_check.selected
+    monkeypatch.setattr(map_check, "selected", lambda parameters, told: selected(
         parameters, [told[0]] * 3))
 
 

@@ -1,0 +1,826 @@
+"""Several maps of one magnet, joined without a model of it: their poses by where they overlap.
+
+Each map is checked by itself first (`halbach_fe.measurement.map_check`). Where the field of one map
+is that of another one is searched over all shifts at once, by correlations. From there one field
+without sources is fitted to all maps, together with their poses and with what the probes have in
+common. Terms of the probe that only one map has are added if all parts of the overlaps show them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import least_squares
+from scipy.signal import correlate
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.pace import Pace, Progress
+from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
+from halbach_fe.measurement.joined_probe import (
+    GAIN,
+    PLACED_SD,
+    TERMS,
+    JoinedModel,
+    Pose,
+    PosedCharges,
+)
+from halbach_fe.measurement.map_check import (
+    FAR_OFF,
+    MOST_POINTS,
+    SIGNIFICANT,
+    SOME_POINTS,
+    TOO_FAR_APART,
+    WEIGHTINGS,
+    InstrumentTerm,
+    MapCheck,
+    Parameter,
+    Scan,
+    all_parameters,
+    check_map,
+    inner,
+    oriented,
+    scan_of,
+    selected,
+    some_lines,
+)
+from halbach_fe.measurement.probe_in_field import (
+    LAG,
+    MIXING,
+    PRIOR_SD,
+    SENSORS,
+    Evidence,
+    ProbeFit,
+    State,
+    fit_probe,
+)
+from halbach_fe.measurement.scan_lines import scan_lines
+from halbach_fe.study.types import COMPONENTS
+
+FEWEST_SHARED = 40
+"""Smallest number of points of a map that another one has around them."""
+
+MARGIN = 0.25
+"""Distance outside of the box about a map, in units of its spacing, up to which it knows the field
+as well as inside."""
+
+MOST_CELLS = 30_000
+"""Largest number of points of the grid on which the field of a map is compared with others."""
+
+PLACES = 6
+"""Number of shifts of best correlation from which poses are refined."""
+
+COMPARED = 200
+"""Largest number of points by which a pose is refined from the correlation."""
+
+CERTAIN = 30.0
+"""Log odds of a place against chance: of some millions of shifts one has 15 by chance."""
+
+NEARLY = 20.0
+"""Difference in an overlap, in units of what the single maps leave, above which a place is none.
+The field of a single map is known badly at its edge: 8 times what its held-out lines are off in a
+quadrupole. The field of all maps decides. Below `FAR_OFF`, axes are taken as they are stated."""
+
+DISAGREES = 2.0
+"""chi2 per reading of an overlap from which maps contradict each other: errors of positions that
+scan lines have in common made 1.5 in maps of one magnet."""
+
+DIFFERS = FAR_OFF**2
+"""chi2 per reading of an overlap from which maps are not joined. If axes of a stage are not those
+that it states, `DISAGREES` is: a smooth field that is nearly symmetric is much like itself."""
+
+TURNED_RAD = 0.5
+"""Turn from which a stage has other axes than it states."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What the readings of a map say that others have around them.
+
+    Attributes
+    ----------
+    name : str
+    readings : int
+    chi2 : float
+        Per reading, with the covariance of the field that the other maps predict: 1 if they agree.
+    rms_T : float
+        Rms of what the joined field leaves of them.
+    alone_T : float
+        Rms of what a field of the map alone leaves of them.
+    """
+
+    name: str
+    readings: int
+    chi2: float
+    rms_T: float
+    alone_T: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether what differs may be noise."""
+        return self.chi2 <= DISAGREES
+
+
+@dataclass(frozen=True)
+class MapPose:
+    """Where a map lies in the frame of the first one.
+
+    A place p of the map is ``turn p + translation_m``, for the turn of ``rotation_rad``: these are
+    keys of an `[instrument]`.
+
+    Attributes
+    ----------
+    name : str
+    middle_m : ndarray, shape (3,)
+        The middle of the map's points, in its own coordinates.
+    shift_m, shift_sd_m : ndarray, shape (3,)
+        Place of that middle in the frame of the first map, less ``middle_m``.
+    rotation_rad, rotation_sd_rad : ndarray, shape (3,)
+    sign : int
+        -1 if the readings have the opposite sign of those of the first map.
+    """
+
+    name: str
+    middle_m: Floats
+    shift_m: Floats
+    shift_sd_m: Floats
+    rotation_rad: Floats
+    rotation_sd_rad: Floats
+    sign: int
+
+    @property
+    def translation_m(self) -> Floats:
+        """Place (3,) in m of the origin of the map in the frame of the first one."""
+        turn = Rotation.from_rotvec(self.rotation_rad).as_matrix()
+        return np.asarray(self.middle_m + self.shift_m - turn @ self.middle_m)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the axes of the stage are not those that it states."""
+        return bool(np.linalg.norm(self.rotation_rad) > TURNED_RAD)
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """Whether the overlap says more (6,) of shift and turn than what a stage may be off."""
+        sd = np.concatenate([self.shift_sd_m, self.rotation_sd_rad])
+        return np.asarray(sd < np.array(PLACED_SD[:6]) / 2)
+
+
+@dataclass(frozen=True)
+class JoinedMaps:
+    """Maps of one magnet in the frame of the first one.
+
+    Attributes
+    ----------
+    checks : dict of str to MapCheck
+        Maxwell's check of each map by itself.
+    poses : tuple of MapPose
+        Of all maps but the first.
+    covariance : ndarray, shape (6 k, 6 k)
+        Of shift in m and turn in rad of these poses, one after the other.
+    terms : tuple of InstrumentTerm
+        What the probe has in common in all maps, and what single maps have in addition.
+    overlaps : tuple of Overlap
+    data : Dataset
+        The joined map: the rows of all maps that were fitted or could be, in the frame of the first
+        one, as the common probe reads there. ``scan`` has the name of the map, and its own scans.
+    """
+
+    checks: dict[str, MapCheck]
+    poses: tuple[MapPose, ...]
+    covariance: Floats
+    terms: tuple[InstrumentTerm, ...]
+    overlaps: tuple[Overlap, ...]
+    data: xr.Dataset
+
+    @property
+    def agree(self) -> bool:
+        """Whether no map contradicts the others."""
+        return all(one.agrees for one in self.overlaps)
+
+    def plain(self) -> dict[str, object]:
+        """Return the results as plain data for JSON."""
+        poses = [{name: value.tolist() if isinstance(value, np.ndarray) else value
+                  for name, value in (vars(one) | {"translation_m": one.translation_m,
+                                                   "determined": one.determined}).items()}
+                 for one in self.poses]
+        return {"frame": next(iter(self.checks)), "poses": poses,
+                "covariance_of": [f"{one.name} {what} {axis}" for one in self.poses
+                                  for what in ("shift_m", "rotation_rad") for axis in COMPONENTS],
+                "covariance": self.covariance.tolist(), "agree": self.agree,
+                "overlaps": [asdict(one) | {"agrees": one.agrees} for one in self.overlaps],
+                "terms": [asdict(one) | {"found": one.found} for one in self.terms],
+                "maps": {name: {"floor_rms_T": one.floor_rms_T, "noise_T": one.noise_T,
+                                "points": one.points} for name, one in self.checks.items()}}
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A map after its check: the rows that obey, and the field alone that fits them.
+
+    Attributes
+    ----------
+    name : str
+    data : Dataset
+        The map with its columns along the right axes, without rows that were left out.
+    check : MapCheck
+    ideal_T : ndarray, shape (n, 3)
+        What a probe without the errors that were found would have read.
+    floor_T : float
+        Rms of what the field alone predicts badly.
+    charges : Charges
+    amplitudes : ndarray, shape (k,)
+    """
+
+    name: str
+    data: xr.Dataset
+    check: MapCheck
+    ideal_T: Floats
+    floor_T: float
+    charges: Charges
+    amplitudes: Floats
+
+    @classmethod
+    def of(cls, name: str, data: xr.Dataset, check: MapCheck) -> Checked:
+        """Take the part of a map that obeys Maxwell's equations."""
+        rows = ~check.excluded
+        floor, within = check.floor_rms_T, inner(data, check)
+        if within is not None and check.reach is not None:
+            rows = rows & check.reach.holds(points_of(data))
+            floor = check.reach.inside_T
+        kept = oriented(data, check) if within is None else within
+        points, ideal = points_of(kept), check.corrected_T[rows]
+        some = np.linspace(0, len(points) - 1, min(len(points), SOME_POINTS)).astype(int)
+        charges = Charges.around(points, check.gap_m)
+        (fit,) = fit_fields(charges, points[some], [ideal[some]])
+        return cls(name, kept, check, ideal, floor, charges, fit.amplitudes)
+
+    @property
+    def points(self) -> Floats:
+        """The points (n, 3) in m."""
+        return points_of(self.data)
+
+    @property
+    def box(self) -> tuple[Floats, Floats]:
+        """The corners (3,) of the box about the points."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Tell which of points (n, 3) are among those of the map."""
+        low, high = self.box
+        margin = MARGIN * self.check.spacing_m
+        return np.asarray(((points > low - margin) & (points < high + margin)).all(axis=1))
+
+
+def join_maps(
+    maps: Mapping[str, xr.Dataset], say: Callable[[str], None] = lambda _: None,
+    progress: Progress | None = None,
+) -> JoinedMaps:
+    """Find where maps of one magnet lie to each other, without a model of the magnet.
+
+    Parameters
+    ----------
+    maps : dict of str to Dataset
+        The maps by name; the first one is the frame of the others.
+    say : callable, optional
+        Called with a description of each step before it starts.
+    progress : callable, optional
+        Called with the numbers of finished and of all parts of a step.
+
+    Returns
+    -------
+    JoinedMaps
+
+    Raises
+    ------
+    MeasurementError
+        If a map does not obey Maxwell's equations by itself, or there is no place where its
+        readings are those of the others: it is mirrored, of another magnet, or overlaps none.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> from halbach_fe.measurement.field_map import field_map
+    >>> axis = 0.01 * np.arange(5)
+    >>> points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    >>> away = points - [0.1, 0.05, 0.08]  # from the pole of a long magnet
+    >>> there = away + [0.0, 0.0, 0.02]  # another stage, whose zero is 20 mm farther along z
+    >>> maps = {name: field_map(points, 1e-4 * each / np.linalg.norm(each, axis=1)[:, None]**3
+    ...                         + 1e-6 * np.random.default_rng(1).standard_normal(each.shape))
+    ...         for name, each in (("one", away), ("other", there))}
+    >>> (1e3 * hf.join_maps(maps).poses[0].shift_m).round(0) + 0.0
+    array([ 0.,  0., 20.])
+    """
+    if not isinstance(maps, Mapping) or len(maps) < 2:
+        raise StudyError(must_be("`maps`", "join_maps", "two maps or more, by name",
+                                 "fewer", "check_map checks a single one."))
+    checked = []
+    for name, data in maps.items():
+        say(f"checking {name}")
+        check = check_map(data, say, progress)
+        _refuse_disobedient(name, check)
+        checked.append(Checked.of(name, data, check))
+    return join_checked(checked, Pace(say, progress))
+
+
+def _refuse_disobedient(name: str, check: MapCheck) -> None:
+    """Raise a MeasurementError if a map is none by itself."""
+    if not check.suffices or not check.obeys or check.is_displaced:
+        raise MeasurementError(must_be(
+            f"map '{name}'", "the maps that are joined", "one that obeys Maxwell's equations by "
+            "itself", f"one of which held-out lines are off by {1e3 * check.floor_rms_T:.3g} mT rms"
+            if check.suffices else "one with too few readings to tell",
+            "Look at `halbach-fe check` of this map alone: rows that were shuffled, or columns "
+            "that are not what they say."))
+
+
+def join_checked(maps: Sequence[Checked], pace: Pace) -> JoinedMaps:
+    """Join maps that were checked, see `join_maps`."""
+    pace.say("searching the places where the maps overlap")
+    places = _places(maps)
+    maps = [replace(one, data=one.data.assign(B_T=sign * one.data["B_T"]))
+            for one, (_, sign) in zip(maps, places, strict=True)]
+    pace.say("fitting one field and all poses")
+    joined = _Joined.of(maps, [pose for pose, _ in places], pace)
+    terms, joined = joined.with_terms()
+    overlaps = joined.overlaps()
+    result = joined.result([sign for _, sign in places], terms, overlaps)
+    limit = DISAGREES if any(one.is_turned for one in result.poses) else DIFFERS
+    for one in overlaps:
+        if one.chi2 > limit:
+            raise _contradiction(one.name, one.rms_T, one.alone_T)
+    return result
+
+
+def _contradiction(name: str, off_T: float, noise_T: float) -> MeasurementError:
+    """Return the error for a map that is not of the same field."""
+    return MeasurementError(must_be(
+        f"map '{name}'", "the maps that are joined", "one that overlaps another one of the same "
+        "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT in "
+        f"the place where they fit best, of which noise explains {1e3 * noise_T:.3g} mT",
+        "It is of another magnet, mirrored (a position axis counts backwards), was changed, or no "
+        "other map reaches into it: such maps can be joined by the magnet only, with `halbach-fe "
+        "register`."))
+
+
+# --- where maps overlap -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Match:
+    """A pose of a map on another one, and how well the readings agree there.
+
+    ``off`` is the difference, by its median, in units of what both maps leave, ``odds`` the log
+    odds against a place where both have nothing to do with each other.
+    """
+
+    pose: Pose
+    sign: int
+    off: float
+    rms_T: float
+    odds: float
+
+    @property
+    def fits(self) -> bool:
+        """Whether both may be of one field."""
+        return self.off <= NEARLY and self.odds > CERTAIN
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether it is the mirror image of the map that fits."""
+        return bool(np.linalg.det(self.pose.turn) < 0)
+
+
+def _axes() -> Iterator[tuple[Floats, int]]:
+    """Yield the ways, with the sign of the readings, in which axes of two stages may be named."""
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            yield from ((np.eye(3)[list(order)] * signs, sign) for sign in (1, -1))
+
+
+def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
+    """Return the pose of each map in the frame of the first one, and the sign of its readings.
+
+    MeasurementError if one has no place.
+    """
+    found: dict[int, tuple[Pose, int]] = {0: (Pose(np.eye(3), np.zeros(3)), 1)}
+    as_stated = {(one, other): _match(maps[one], maps[other], [(np.eye(3), 1)])
+                 for one in range(len(maps)) for other in range(1, len(maps)) if one != other}
+    turned: dict[tuple[int, int], _Match] = {}
+    while len(found) < len(maps):
+        pairs = [pair for pair in as_stated if pair[0] in found and pair[1] not in found]
+        known = {pair: as_stated[pair] for pair in pairs if as_stated[pair].off <= FAR_OFF
+                 and as_stated[pair].fits}
+        if not known:
+            for one, other in pairs:
+                if (one, other) not in turned:
+                    stated = as_stated[one, other]
+                    best = _match(maps[one], maps[other], list(_axes()))
+                    better = best.fits and best.odds > stated.odds + CERTAIN
+                    turned[one, other] = best if better or not stated.fits else stated
+            known = {pair: turned[pair] for pair in pairs}
+        first, other = max(known, key=lambda pair: (
+            known[pair].fits, not known[pair].is_mirrored, known[pair].odds))
+        best = known[first, other]
+        if not best.fits or best.is_mirrored:
+            raise _refused(maps[first], maps[other], best)
+        pose, sign = found[first]
+        found[other] = (pose.of(best.pose), sign * best.sign)
+    return [found[number] for number in range(len(maps))]
+
+
+def _refused(one: Checked, other: Checked, best: _Match) -> MeasurementError:
+    """Return the error for a map that has no place on another one."""
+    noise = float(np.hypot(one.floor_T, other.floor_T))
+    if not best.fits:
+        return _contradiction(other.name, best.rms_T, noise)
+    axis = COMPONENTS[int(np.argmin(np.diag(best.pose.turn)))]
+    return MeasurementError(must_be(
+        f"map '{other.name}'", "the maps that are joined", "one that fits where it overlaps "
+        f"'{one.name}'", "one whose mirror image fits", f"One of the two counts a position axis "
+        f"backwards, {axis} for example: reverse {axis} and B{axis} in the one that is wrong."))
+
+
+def _match(one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]) -> _Match:
+    """Return the best place of a map on another one, for some axes of its stage."""
+    starts: list[tuple[float, Pose, int]] = []
+    for turn, sign in axes:
+        starts += [(odds, pose, sign) for odds, pose in _shifts(one, other, turn, sign)]
+    starts.sort(key=lambda each: -each[0])
+    nothing = _Match(Pose(np.eye(3), np.zeros(3)), 1, np.inf, np.nan, -np.inf)
+    found = [nothing]
+    for _, pose, sign in starts[:PLACES]:
+        found.append(_refined(one, other, pose, sign))
+        if found[-1].fits and found[-1].off <= FAR_OFF:
+            break
+    return max(found, key=lambda match: (match.fits, match.odds))
+
+
+def _step(one: Checked, other: Checked) -> float:
+    """Return the step in m of the grids on which two maps are compared."""
+    step = min(one.check.spacing_m, other.check.spacing_m)
+    for each in (one, other):
+        sides = np.maximum(np.ptp(each.points, axis=0), step)
+        step = max(step, float((np.prod(sides) / MOST_CELLS) ** (1 / 3)))
+    return step
+
+
+def _gridded(one: Checked, turn: Floats, sign: int, step: float) -> tuple[Floats, Floats]:
+    """Return the first point (3,) of a grid over a map that is turned, and B (3, a, b, c) there."""
+    low, high = (np.sort(np.array(one.box) @ turn.T, axis=0))
+    axes = [low[axis] + step * np.arange(1 + int((high - low)[axis] / step + 1e-6))
+            for axis in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    field = sign * one.charges.field(points.reshape(-1, 3) @ turn, one.amplitudes) @ turn.T
+    return low, np.moveaxis(field.reshape(points.shape), -1, 0)
+
+
+def _shifts(
+    one: Checked, other: Checked, turn: Floats, sign: int
+) -> list[tuple[float, Pose]]:
+    """Return the shifts of a map that is turned for which it is most like another one.
+
+    Correlations of both fields give, for all shifts by whole steps, the mean square of their
+    difference in the overlap. The odds are those of normal readings with that variance against
+    those with the mean square of the fields.
+    """
+    step = _step(one, other)
+    (low, field), (start, moved) = (_gridded(one, np.eye(3), 1, step),
+                                    _gridded(other, turn, sign, step))
+
+    def over(first: Floats, second: Floats) -> Floats:
+        return np.asarray(correlate(first, second, "full", "fft"))
+
+    here, there = np.ones(field.shape[1:]), np.ones(moved.shape[1:])
+    count = np.maximum(over(here, there), 0.5)
+    size = over(np.sum(field**2, axis=0), there) + over(here, np.sum(moved**2, axis=0))
+    left = size - 2 * sum(over(first, second) for first, second in zip(field, moved, strict=True))
+    noise = 3 * count * (one.floor_T**2 + other.floor_T**2)
+    readings = count * len(other.points) / there.size
+    odds = 1.5 * readings * np.log((np.maximum(size, 0) / 2 + noise) / (
+        np.maximum(left, 0) + noise))
+    odds[readings < FEWEST_SHARED] = -np.inf
+    peaks = np.argwhere((odds == maximum_filter(odds, 5)) & np.isfinite(odds))
+    best = sorted(peaks.tolist(), key=lambda place: -odds[tuple(place)])[:PLACES]
+    return [(float(odds[tuple(place)]), Pose(turn, low + step * (
+        np.array(place) - np.array(there.shape) + 1) - start)) for place in best]
+
+
+def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
+    """Return the pose, from a first one, by which the readings of a map are those of another one.
+
+    Readings that are far off count less, by their first power.
+    """
+    middle, noise = np.mean(other.box, axis=0), float(np.hypot(one.floor_T, other.floor_T))
+    noise = noise or 1e-6 * other.check.size_T
+    for _ in range(2):  # with the readings of the overlap that the first pose has, then the second
+        rows = np.flatnonzero(one.holds(pose.places(other.points)))
+        if len(rows) < FEWEST_SHARED:
+            return _Match(pose, sign, np.inf, np.nan, -np.inf)
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), COMPARED)).astype(int)]
+        points, read = other.points[rows], sign * other.ideal_T[rows]
+
+        def left(values: Floats, start: Pose = pose, at: Floats = points,
+                 read: Floats = read) -> Floats:
+            posed = PosedCharges.seen_from(one.charges, start.moved(middle, values[:3], values[3:]))
+            return np.asarray((posed.field(at, one.amplitudes) - read).ravel() / noise)
+
+        def by_pose(values: Floats, start: Pose = pose, at: Floats = points,
+                    read: Floats = read) -> Floats:
+            posed = PosedCharges.seen_from(one.charges, start.moved(middle, values[:3], values[3:]))
+            found = posed.by_pose(at, np.broadcast_to(np.eye(3), (len(at), 3, 3)),
+                                  at - middle, one.amplitudes)
+            return found.reshape(-1, 6) / noise
+
+        found = least_squares(left, np.zeros(6), by_pose, loss="soft_l1", f_scale=FAR_OFF,
+                              max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
+        pose = pose.moved(middle, found.x[:3], found.x[3:])
+    # at the edge of the other map its field is not known as well as the noise is
+    off = float(1.4826 * np.median(np.abs(found.fun)))
+    size = float(np.sqrt(np.mean(read**2))) / noise
+    odds = float(3 * len(rows) * np.log(np.hypot(size, 1) / np.hypot(off, 1)))
+    if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:]).max() > 0.3:
+        odds = -np.inf  # it has left the place
+    return _Match(pose, sign, off, off * noise, odds)
+
+
+# --- one field for all --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """Maps in one field, with their fit.
+
+    Attributes
+    ----------
+    maps : sequence of Checked
+    scans : sequence of Scan
+    model : JoinedModel
+    at : ProbeFit
+    rows : ndarray of bool, shape (n,)
+        Rows that are fitted.
+    width2 : float
+        Prior variance of the amplitudes in T^2.
+    """
+
+    maps: Sequence[Checked]
+    scans: Sequence[Scan]
+    model: JoinedModel
+    at: ProbeFit
+    rows: NDArray[np.bool_]
+    width2: float
+
+    @classmethod
+    def of(cls, maps: Sequence[Checked], starts: Sequence[Pose], pace: Pace) -> _Joined:
+        """Fit the poses, and what the probes have in common by the checks of the single maps."""
+        scans, chosen = [], []
+        for one in maps:
+            scan, usable, _ = scan_of(one.data)
+            chosen.append(usable & some_lines(scan_lines(scan.points), usable,
+                                              max(1, MOST_POINTS // len(maps))))
+            scans.append(scan)
+        rows = np.concatenate(chosen)
+
+        charges = Charges.around(*_around(maps, scans, starts))
+        model = JoinedModel(charges, [scan.model(charges) for scan in scans], starts)
+        best = model.with_terms(_kept(maps, model))
+        at = best.perfect()
+        fit = best.fit(at, rows)
+        for number in range(1 + WEIGHTINGS):
+            at = fit_probe(best, rows, fit, best.allowed(replace(
+                at, amplitudes=fit.amplitudes, sigma=fit.sigma)))
+            pace.advance(number + 1, 1 + WEIGHTINGS)
+            if number < WEIGHTINGS:
+                best = best.weighted(at, rows, fit.sigma**2 / fit.penalty)
+            if not number:  # the prior width of the field, now that the poses are known
+                fit = best.fit(at, rows)
+        width2 = fit.sigma**2 / fit.penalty
+        return cls(maps, scans, best, at, rows, width2)
+
+    def with_terms(self) -> tuple[tuple[InstrumentTerm, ...], _Joined]:
+        """Return the terms of the probe that are common, or of one map, and the fit with these."""
+        open_terms, parameters = _own_terms(self.maps, self.model)
+        told = [self._evidence(open_terms, self.rows)]
+        kept = self.model.prior_sd > 0
+        found = self
+        at = np.flatnonzero(kept)
+        if any(_stands_out(parameter, told[0], at) for parameter in parameters):
+            told += [self._evidence(open_terms, half) for half in self._halves()]
+            new, _ = selected(parameters, told, kept)
+            if (new & ~kept).any():
+                found = self._with(new)
+        common = [found._stated(parameter) for parameter in _common_terms(self.model)]
+        own = [found._stated(parameter) for parameter in parameters
+               if found.model.prior_sd[list(parameter.own)].all()]
+        return (*common, *own), found
+
+    def _with(self, kept: NDArray[np.bool_]) -> _Joined:
+        """Return the fit with other terms of the probe."""
+        model = self.model.with_terms(kept)
+        fit = model.fit(self.at, self.rows)
+        return replace(self, model=model, at=fit_probe(
+            model, self.rows, fit, replace(self.at, prior_sd=model.prior_sd)))
+
+    def _evidence(self, open_terms: NDArray[np.bool_], rows: NDArray[np.bool_]) -> Evidence:
+        """Return what some rows tell of some terms of the probe."""
+        return Evidence.of(self.model.with_terms(open_terms), rows, self.at, self.width2)
+
+    def _halves(self) -> list[NDArray[np.bool_]]:
+        """Return halves of the rows along x, y and z, which halve the overlaps."""
+        shared = np.concatenate([self._shared(number) for number in range(len(self.maps))])
+        places, found = self._points(), []
+        for column in places.T:
+            middle = float(np.median(column[shared & self.rows]))
+            found += [self.rows & (column <= middle), self.rows & (column > middle)]
+        return found
+
+    def _points(self) -> Floats:
+        """Return all points (n, 3) in the frame of the first map."""
+        return np.vstack([self.model.pose(self.at, number).places(scan.points)
+                          for number, scan in enumerate(self.scans)])
+
+    def _shared(self, number: int) -> NDArray[np.bool_]:
+        """Return which points of a map any other map has around them."""
+        there = self.model.pose(self.at, number).places(self.scans[number].points)
+        found = np.zeros(len(there), bool)
+        for other, one in enumerate(self.maps):
+            if other != number:
+                pose = self.model.pose(self.at, other)
+                found |= one.holds((there - pose.shift_m) @ pose.turn)
+        return found
+
+    def _stated(self, parameter: Parameter) -> InstrumentTerm:
+        """Return a term of the probe as all maps show it."""
+        row = np.where(self.model.prior_sd > 0, parameter.row, 0.0)  # without what is not fitted
+        value, sd = float(row @ self.at.instrument), float(np.sqrt(row @ self.at.covariance @ row))
+        return InstrumentTerm(parameter.name, parameter.unit, value, sd, True, True)
+
+    def overlaps(self) -> tuple[Overlap, ...]:
+        """Compare the readings of each map in its overlaps with what the other maps predict."""
+        sigma = self._noise()
+        at, found = replace(self.at, sigma=sigma), []
+        for number, one in enumerate(self.maps):
+            own = self.model.only(number, self.rows)
+            shared = own.copy()
+            shared[self.model.rows_of(number)] &= self._shared(number)
+            rest = State.of(self.model, at, self.rows & ~own, self.width2)
+            both = State.of(self.model, at, (self.rows & ~own) | shared, self.width2)
+            alone = self.model.alone(at, number, self.rows, self.width2)
+            count = 3 * int(shared.sum())
+            left, left_alone = (
+                float(np.sqrt(np.mean((self.model.field - self.model.readings(fit))[shared]**2)))
+                for fit in (self.at, alone.at))
+            found.append(Overlap(one.name, count, (both.chi2 - rest.chi2) / max(count, 1),
+                                 left, left_alone))
+        return tuple(found)
+
+    def _noise(self) -> float:
+        """Return the noise in T of a reading of mean weight that fields of each map alone leave."""
+        squares = count = 0.0
+        for number in range(len(self.maps)):
+            alone = self.model.alone(self.at, number, self.rows, self.width2)
+            squares += float(alone.left @ alone.left)
+            count += alone.free.trace
+        return float(np.sqrt(squares / max(count, 1.0)))
+
+    def result(
+        self, signs: Sequence[int], terms: tuple[InstrumentTerm, ...],
+        overlaps: tuple[Overlap, ...],
+    ) -> JoinedMaps:
+        """Return the poses with their covariance, which the largest chi2 of an overlap widens."""
+        wider = max(1.0, *(one.chi2 for one in overlaps))
+        model, numbers = self.model, range(1, len(self.maps))
+        places = np.concatenate([np.arange(len(model.any_sd))[model.placed(number)][:6]
+                                 for number in numbers])
+        sd = model.prior_sd[places]
+        covariance = wider * self.at.covariance[np.ix_(places, places)] * np.outer(sd, sd)
+        poses = []
+        for number in numbers:
+            pose, middle = model.pose(self.at, number), model.middles[number]
+            bars = np.sqrt(np.diag(covariance))[6 * (number - 1):6 * number]
+            poses.append(MapPose(
+                self.maps[number].name, middle, pose.places(middle) - middle, bars[:3],
+                Rotation.from_matrix(pose.turn).as_rotvec(), bars[3:], signs[number]))
+        widened = tuple(replace(term, sd=float(np.sqrt(wider)) * term.sd) for term in terms)
+        return JoinedMaps({one.name: one.check for one in self.maps}, tuple(poses), covariance,
+                          widened, overlaps, self._data())
+
+    def _data(self) -> xr.Dataset:
+        """Return the joined map, see `JoinedMaps`.
+
+        What the common probe reads at the place follows from the field, what the fit leaves of a
+        reading from the map.
+        """
+        there = [self.model.pose(self.at, number).places(scan.points)
+                 for number, scan in enumerate(self.scans)]
+        first = JoinedModel(self.model.charges, [replace(scan, points=points).model(
+            self.model.charges) for scan, points in zip(self.scans, there, strict=True)],
+            [Pose(np.eye(3), np.zeros(3))] * len(there))
+        value = self.at.instrument * self.model.prior_sd
+        value[TERMS:] = 0.0
+        common = replace(self.at, instrument=value / first.prior_sd)
+        left, read = self.model.field - self.model.readings(self.at), first.readings(common)
+        for number in range(len(there)):
+            part = self.model.rows_of(number)
+            read[part] += left[part] @ self.model.pose(self.at, number).turn.T
+        data = field_map(np.vstack(there), read)
+        return data.assign_coords(scan=("point", np.concatenate(
+            [_scans(one) for one in self.maps])))
+
+
+def _scans(one: Checked) -> NDArray[np.str_]:
+    """Return the names (n,) of the scans of a joined map."""
+    if "scan" not in one.data:
+        return np.full(len(one.points), one.name)
+    return np.array([f"{one.name} {scan}" for scan in one.data["scan"].values])
+
+
+def _around(
+    maps: Sequence[Checked], scans: Sequence[Scan], starts: Sequence[Pose]
+) -> tuple[Floats, float]:
+    """Return the points (n, 3) in m of all maps, and the distance in m of the charges from them.
+
+    It is that of the map which needs the nearest ones, or larger, until they are close together.
+    """
+    points = np.vstack([start.places(scan.points)
+                        for start, scan in zip(starts, scans, strict=True)])
+    gap = min(one.check.gap_m for one in maps)
+    while spacing_of(points, gap) > TOO_FAR_APART * gap:
+        gap *= 1.1
+    return points, gap
+
+
+COMMON = np.zeros(TERMS, bool)
+"""Terms that a probe has in every map; turns, drifts and offsets are of one scan."""
+COMMON[[*range(TERMS)[SENSORS], *range(TERMS)[MIXING], LAG]] = True
+
+
+def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
+    """Return which terms are fitted: those that the checks have found, and the poses.
+
+    The first map has none of its own but what changes during its scan.
+    """
+    kept = np.zeros(len(model.any_sd), bool)
+    for number, one in enumerate(maps):
+        for parameter in all_parameters(np.array(PRIOR_SD), np.eye(3) / 3):
+            if any(term.found and term.name == parameter.name for term in one.check.terms):
+                mask = np.zeros(TERMS, bool)
+                mask[list(parameter.own)] = True
+                kept[:TERMS] |= mask & COMMON
+                kept[model.own(number)] |= mask & ~COMMON
+        if number:
+            kept[np.arange(len(kept))[model.placed(number)][:6]] = True
+    return kept
+
+
+def _own_terms(
+    maps: Sequence[Checked], model: JoinedModel
+) -> tuple[NDArray[np.bool_], list[Parameter]]:
+    """Return the terms that may be of one map only, as parameters, and with all that are kept."""
+    open_terms, found = model.prior_sd > 0, []
+    for number, one in enumerate(maps):
+        if not number:
+            continue
+        gain = model.placed(number).start + GAIN
+        row = np.zeros(len(open_terms))
+        row[gain] = 100 * model.any_sd[gain]
+        found.append(Parameter(f"gain of {one.name} relative to {maps[0].name}", "%", row, (gain,)))
+        open_terms[gain] = True
+        first = model.own(number).start
+        for parameter in all_parameters(model.any_sd[model.own(number)], np.eye(3) / 3):
+            if set(parameter.own) <= set(range(TERMS)[MIXING]):
+                row = np.zeros(len(open_terms))
+                row[model.own(number)] = parameter.row
+                own = tuple(first + each for each in parameter.own)
+                found.append(Parameter(f"{parameter.name}, in {one.name} only", parameter.unit,
+                                       row, own))
+                open_terms[list(own)] = True
+    return open_terms, found
+
+
+def _common_terms(model: JoinedModel) -> list[Parameter]:
+    """Return the terms that all maps have in common, as parameters."""
+    found = []
+    for parameter in all_parameters(model.any_sd[:TERMS], np.eye(3) / 3):
+        if COMMON[list(parameter.own)].all() and (model.prior_sd[list(parameter.own)] > 0).all():
+            row = np.zeros(len(model.any_sd))
+            row[:TERMS] = parameter.row
+            found.append(Parameter(f"{parameter.name}, in all maps", parameter.unit, row,
+                                   parameter.own))
+    return found
+
+
+def _stands_out(parameter: Parameter, told: Evidence, kept: NDArray[np.intp]) -> bool:
+    """Tell whether a term differs from 0 by the readings of all maps."""
+    used = np.union1d(kept, parameter.own)
+    mean, covariance = told.estimate(used)
+    row = parameter.row[used]
+    return bool(abs(row @ mean) > SIGNIFICANT * np.sqrt(row @ covariance @ row))

@@ -1,0 +1,180 @@
+"""Maps of one magnet that are joined without a model of it, and maps that cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.core.pace import Pace
+from halbach_fe.measurement import map_join
+from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.measurement.harmonic_field import Charges
+from halbach_fe.measurement.joined_probe import JoinedModel, Pose
+from halbach_fe.measurement.map_check import scan_of
+from halbach_fe.measurement.map_join import join_checked, join_maps
+from halbach_fe.report.map_join import answer, sentences
+from tests.support.joined_campaigns import (
+    MAGNETS,
+    NOISE_T,
+    as_checked,
+    campaign,
+    errors,
+    over_bars,
+    read,
+)
+
+QUIET = Pace(lambda _: None)
+
+
+def joined_of(maps):
+    return join_checked(as_checked(maps), QUIET)
+
+
+def test_derivatives_of_joined_readings(generator):
+    """By all numbers of poses and probes, beside differences."""
+    maps, _, _ = campaign(0, maps=2)
+    scans = [scan_of(data)[0] for data in maps.values()]
+    starts = [Pose(np.eye(3), np.zeros(3)), Pose(
+        Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.001, 0.002, 0.02]))]
+    charges = Charges.around(np.vstack([start.places(scan.points) for start, scan in zip(
+        starts, scans, strict=True)]), 0.03)
+    model = JoinedModel(charges, [scan.model(charges) for scan in scans], starts)
+    rows = np.arange(len(model.points)) % 5 == 0
+    at = model.perfect()
+    at = replace(at, amplitudes=generator.standard_normal(len(charges)),
+                 # the derivative by a turn is that at a small one, which poses start from
+                 instrument=0.01 * generator.standard_normal(len(at.instrument)))
+    by_parameter = model.by_parameter(at, rows)
+    for number in [*range(0, len(at.instrument), 7), *range(len(at.instrument) - 7,
+                                                            len(at.instrument))]:
+        step = 1e-4 * np.eye(len(at.instrument))[number]
+        there, before = (model.readings(replace(at, instrument=at.instrument + sign * step), rows)
+                         for sign in (1, -1))
+        difference = (there - before) / 2e-4 * model.weights[rows]
+        # the turn of 0.5 mrad from which it is taken
+        np.testing.assert_allclose(by_parameter[..., number], difference,
+                                   atol=2e-3 * max(np.abs(difference).max(), 1e-9))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_three_maps_lie_where_they_were_made(seed):
+    """A quadrupole and a dipole of cubes; errors are as large as their bars."""
+    maps, poses, _ = campaign(seed)
+    joined = joined_of(maps)
+    # 12 numbers have an rms of 0.5 to 1.6 in 99.9 % of all draws; the benchmark has 360
+    assert 0.4 < np.sqrt(np.mean(over_bars(joined, poses)**2)) < 1.6
+    assert joined.agree
+    assert not joined.terms
+    assert all(one.determined.all() for one in joined.poses)
+    assert (np.abs(errors(joined, poses)[:3]) < 3e-4).all()  # stages were 1 mm off
+    assert [(one.chi2 < 1.5, one.readings > 100) for one in joined.overlaps] == [(True, True)] * 3
+    assert answer(joined).sound
+    assert sentences(joined) == []
+    first = points_of(joined.data)[:len(points_of(maps["part0"]))]
+    np.testing.assert_allclose(first, points_of(maps["part0"]))
+    assert sorted(set(joined.data["scan"].values.tolist())) == list(maps)
+
+
+def test_the_joined_map_is_that_of_one_stage(generator):
+    """A gain that only one map has is found, and taken out of the joined map."""
+    maps, poses, magnet = campaign(1, maps=2)
+    maps["part1"] = read(magnet, poses[1], generator, gain=1.01)
+    joined = joined_of(maps)
+    (term,) = joined.terms
+    assert term.name == "gain of part1 relative to part0"
+    assert abs(term.value - 1) < 4 * term.sd
+    assert term.sd < 0.1
+    turn, shift = poses[0]
+    field = magnet.getB(points_of(joined.data) @ turn.as_matrix().T + shift) @ turn.as_matrix()
+    left = np.asarray(joined.data["B_T"].values) - field
+    assert np.sqrt(np.mean(left**2)) < 2 * NOISE_T  # 1 % of the field is 16 times as much
+    assert np.sqrt(np.mean((np.asarray(maps["part1"]["B_T"].values)
+                            - field[len(points_of(maps["part0"])):])**2)) > 10 * NOISE_T
+
+
+def mirrored(data):
+    """A map whose z axis counts backwards: a map too, of a mirrored magnet."""
+    return field_map(points_of(data) * [1, 1, -1], np.asarray(data["B_T"].values) * [1, 1, -1])
+
+
+def shuffled(data, generator):
+    return field_map(points_of(data), generator.permutation(np.asarray(data["B_T"].values)))
+
+
+def test_maps_that_cannot_be_joined(generator):
+    """A mirrored one, and one of another magnet of the same design."""
+    maps, poses, _ = campaign(0, maps=2)
+    with pytest.raises(MeasurementError, match=r"mirror.*backwards"):
+        joined_of(maps | {"part1": mirrored(maps["part1"])})
+    foreign = read(MAGNETS[0](np.random.default_rng(5)), poses[1], generator)
+    with pytest.raises(MeasurementError, match="another magnet"):
+        joined_of(maps | {"part1": foreign})
+
+
+def test_the_sign_that_no_single_map_shows():
+    maps, poses, _ = campaign(1, maps=2)
+    opposite = maps["part1"].assign(B_T=-maps["part1"]["B_T"])
+    joined = joined_of(maps | {"part1": opposite})
+    assert joined.poses[0].sign == -1
+    assert (np.abs(errors(joined, poses)[:3]) < 3e-4).all()
+    assert "opposite sign" in sentences(joined)[0]
+
+
+def test_contradictions_are_refused_or_named(monkeypatch):
+    """A sextupole that was there for one map only, and obeys Maxwell; the bars are widened."""
+    maps, _, _ = campaign(0, maps=2)
+    points = points_of(maps["part1"])
+    x, y = points[:, 0] - 0.0075, points[:, 1] - 0.0075
+    more = 2.5 * np.column_stack([x**2 - y**2, -2 * x * y, 0 * x])  # 0.1 mT, 5 times noise
+    torn = field_map(points, maps["part1"]["B_T"].values + more)
+    plain = joined_of(maps)
+    monkeypatch.setattr(map_join, "DIFFERS", np.inf)
+    joined = joined_of(maps | {"part1": torn})
+    assert not joined.agree
+    assert not answer(joined).sound
+    assert "contradict" in answer(joined).trust
+    assert "contradicts" in sentences(joined)[0]
+    assert (joined.poses[0].shift_sd_m > 1.3 * plain.poses[0].shift_sd_m).all()
+    monkeypatch.setattr(map_join, "DIFFERS", 1.0)
+    with pytest.raises(MeasurementError, match="noise explains"):
+        joined_of(maps | {"part1": torn})
+
+
+def test_check_of_several_maps(tmp_path, monkeypatch, capsys, generator):
+    """The command, from files to the page; a shuffled map is refused by its own check."""
+    maps, _, _ = campaign(1, maps=2)
+    checked = {id(one.data): one.check for one in as_checked(maps)}
+    checks = iter(checked.values())
+    monkeypatch.setattr(map_join, "check_map", lambda *_: next(checks))
+    for name, data in maps.items():
+        write_map(data, tmp_path / f"{name}.csv")
+    out = tmp_path / "out"
+    assert main(["check", *(str(tmp_path / f"{name}.csv") for name in maps), "-o", str(out)]) == 0
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "Yes: where part0 and part1 overlap" in said
+    summary = json.loads((out / "joined.json").read_text())
+    assert summary["frame"] == "part0"
+    assert summary["agree"]
+    assert np.array(summary["covariance"]).shape == (6, 6)
+    (pose,) = summary["poses"]
+    turn = Rotation.from_rotvec(pose["rotation_rad"]).as_matrix()
+    written = read_map(out / "joined.csv")
+    count = maps["part0"].sizes["point"]
+    np.testing.assert_allclose(  # as the `[instrument]` of a study places a map
+        points_of(written)[count:], points_of(maps["part1"]) @ turn.T + pose["translation_m"],
+        atol=1e-9)
+    assert (out / "joined.html").exists()
+    assert (out / "part1" / "check.json").exists()
+    assert main(["check", str(tmp_path / "part0.csv"), str(tmp_path / "part0.csv")]) == 2
+    with pytest.raises(StudyError, match="two maps or more"):
+        join_maps({"part0": maps["part0"]})
+    monkeypatch.undo()
+    small = shuffled(maps["part0"], generator)
+    with pytest.raises(MeasurementError, match=r"'wrong'.*obeys Maxwell's equations"):
+        join_maps({"wrong": small, "part1": maps["part1"]})
