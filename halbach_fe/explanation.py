@@ -22,11 +22,10 @@ from halbach_fe.inference.registration import register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import directed, is_undirected
-from halbach_fe.measurement.map_check import MapCheck, check_map
+from halbach_fe.measurement.map_check import MapCheck, check_map, oriented
 from halbach_fe.report import diagnosis_answer, inference_answer, registration
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.map_check import answer as answer_of_check
-from halbach_fe.report.map_check import oriented
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 
 
