@@ -21,6 +21,7 @@ from halbach_fe.diagnosis.model_selection import (
     PINNED_SD,
     Candidate,
     SelectedEffect,
+    log_evidence,
     prior_log_odds,
     select_effects,
     with_wide_priors,
@@ -583,13 +584,14 @@ def with_rivals(
 ) -> tuple[IdentifiedEffect, ...]:
     """Return identified effects with their alternatives, each fitted in place of its effect.
 
-    The error bars of all other amplitudes are those of not knowing which of both it is.
-    Alternatives that this search does not compare are left out.
+    The error bars of all other amplitudes are those of not knowing which of both it is, nor whether
+    amplitudes outside the likeliest parts are 0. Alternatives that this search does not compare are
+    left out.
     """
     own = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     prior = prior_log_odds(search.candidates)
     numbers = {(one.effect, one.place): k for k, one in enumerate(search.candidates)}
-    variances = [effect.sd**2 for effect in identified]
+    variances = _of_all_parts(search, identified, own)
     every = []
     for number, effect in enumerate(identified):
         others = [k for k in range(len(own)) if k != number]
@@ -606,10 +608,36 @@ def with_rivals(
             more = [fit[place].sd**2 + (fit[place].values - known.values)**2 for fit in fits
                     if len(fit[place].values) == len(known.values)]
             if len(more) == len(odds) and more:
-                variances[k] = np.maximum(variances[k], (
-                    known.sd**2 + odds @ np.array(more)) / (1 + odds.sum()))
+                variances[k] = np.where(known.sd > 0, np.maximum(variances[k], (
+                    known.sd**2 + odds @ np.array(more)) / (1 + odds.sum())), 0.0)
     return tuple(replace(effect, sd=np.sqrt(variance), rivals=rivals)
                  for effect, variance, rivals in zip(identified, variances, every, strict=True))
+
+
+def _of_all_parts(
+    search: Search, identified: Sequence[IdentifiedEffect], own: Sequence[int]
+) -> list[Floats]:
+    """Return the variances of the amplitudes of effects, whose candidates have the numbers ``own``,
+    if those outside of the likeliest parts may be free as well. Of these they stay 0.
+    """
+    chosen = [search.candidates[number] for number in own]
+    whole = replace(search, candidates=tuple(
+        replace(one, parts=()) for one in search.candidates))
+    free = [whole.candidates[number] for number in own]
+    gain = (log_evidence(search.evidence, chosen) - log_evidence(search.evidence, free)
+            + sum(float(np.log(max(1, len(one.parts)))) for one in chosen))
+    share = 1 / (1 + np.exp(gain))  # all parts are equally probable before
+    found = []
+    for effect, other in zip(identified, amplitudes(whole, [
+            replace(effect.selection, candidate=one)
+            for effect, one in zip(identified, free, strict=True)]), strict=True):
+        if len(other.values) != len(effect.values):  # refinements are not fitted yet
+            found.append(effect.sd**2)
+            continue
+        wider = (1 - share) * effect.sd**2 + share * (
+            other.sd**2 + (other.values - effect.values)**2)
+        found.append(np.where(effect.sd > 0, np.maximum(effect.sd**2, wider), 0.0))
+    return found
 
 
 def with_short_steps(

@@ -10,6 +10,11 @@ import pytest
 from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
+from halbach_fe.diagnosis.search import Search, amplitudes, with_rivals
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -157,3 +162,26 @@ def test_an_effect_that_predicts_worse_than_none_is_no_answer(
     assert names_of(found) == ["gain_x"] * there  # the negative control
     assert (found.answer == found.rounds) == there
     assert ("Nothing in the catalogue explains the map" in told.said) != there
+
+
+def test_bars_contain_that_a_part_may_not_be_zero():
+    """Amplitude y shows little and looks like x: it is 0 in the likeliest part of half of the draws
+    in which it is not, and then x is wrong by 25 of the bars of that part, which are the control.
+    """
+    generator = np.random.default_rng(1)
+    columns = np.array([[100.0, 50.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 100.0]])
+    effect = next(one for one in catalogue() if one.name == "sensor_position_x")
+    candidate = Candidate(effect.name, "", (0, 1, 2), parts=((0, 2), (0, 1, 2)))
+    found = []
+    for draw in range(1000):
+        true = generator.standard_normal(3) * [1, draw % 2, 1]  # both parts are equally probable
+        residual = columns @ true + generator.standard_normal(3)
+        search = Search((Hypothesis(effect, Place()),), (candidate,), Evidence.of(
+            columns.T @ columns, columns.T @ residual, residual @ residual, 3), *[None] * 7)
+        first = amplitudes(search, [SelectedEffect(candidate, 9.0, 9.0, ())])
+        off = first[0].values[0] / effect.parameters[0].sd - true[0]
+        found.append([off / (each[0].sd[0] / effect.parameters[0].sd)
+                      for each in (first, with_rivals(search, first))])
+    likeliest, every = np.sqrt(np.mean(np.square(found), axis=0))
+    assert 0.85 < every < 1.15  # 0.02 by chance, and half of the prior is that of large amplitudes
+    assert likeliest > 5
