@@ -209,8 +209,8 @@ def shared_doubts(magnet: Magnet, mean: Floats, prior: Gaussian, model_error: fl
         reversed block is no common deviation) unless most are.
     """
     of = _Changes.of(magnet, mean - prior.mean, prior.sd)
-    near = (of.away <= doubted_from(of.sd.size)).all(axis=1)
-    near |= 2 * near.sum() <= len(near)
+    near = np.asarray((of.away <= doubted_from(of.sd.size)).all(axis=1))
+    near |= 2 * int(near.sum()) <= near.size
     axes, size = of.axes[near], magnet.dimension
     moves = {ALL_BLOCKS: ("", axes)}
     for axis in range(0 if size == 3 else 2, 3):
