@@ -79,7 +79,9 @@ def read_study(path: str | Path) -> Study:
                          ) from None
     except ValueError as error:  # a syntax error, or an integer with thousands of digits
         raise StudyError(
-            must_be("syntax", where, "complete TOML", f"'{error}'", "Correct that line.")
+            must_be("syntax", where, "complete TOML", f"'{error}'", "Is it a map or a table of "
+                    "blocks? Commands take the study file first." if path.suffix == ".csv"
+                    else "Correct that line.")
         ) from None
     document = with_free_blocks(document, path.parent, where)
     return _with_table(parse_study(document, where), path.parent, where)

@@ -406,3 +406,11 @@ def test_with_refuses_keys_and_tables_that_are_not_there(change, said):
         study.with_(**change)
     assert said in str(caught.value)
     assert study.with_(array__remanence_T=1.2).array.remanence_T == 1.2  # the control
+
+
+def test_a_map_in_place_of_the_study(tmp_path):
+    """Of the two files of most commands, the study comes first. Control: a line of a study."""
+    for name, said in (("map.csv", "take the study file first"), ("s.toml", "Correct that line")):
+        (tmp_path / name).write_text("x_m,y_m,z_m,Bx_T\n0,0,0,1\n")
+        with pytest.raises(StudyError, match=said):
+            read_study(tmp_path / name)
