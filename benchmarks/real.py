@@ -52,7 +52,7 @@ def overlap(note: Note) -> None:
     note("real.overlap_z_mm", 1e3 * pose["shift_m"][2], "mm",
          f"± {1e3 * pose['shift_sd_m'][2]:.3f}; one gain and 810 readings of the overlap alone "
          "say 252.460 ± 0.002; asked: within 0.05")
-    note("real.overlap_chi2", max(one["chi2"] for one in found["overlaps"]), "ratio",
+    note("real.joined_chi2", max(one["chi2"] for one in found["overlaps"]), "ratio",
          "per reading of the overlap, predicted by the other map; asked: 0.8 to 1.2")
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.files import InputFile
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class _Explanation:
 
         try:
             found = self.run("register", "registered", self.study)
-        except MeasurementError as error:  # diagnose may know why no pose explains the map
+        except (MeasurementError, StudyError) as error:  # of a plane; or diagnose knows why
             common.say(f"The map cannot be registered: {error}")
             return False
         if STUDY_FILE in found.command:

@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
 import xarray as xr
 
 from halbach_fe.api import diagnose
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
@@ -21,8 +22,9 @@ from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.field_map import directed, is_undirected
+from halbach_fe.measurement.field_map import directed, is_total_field, is_undirected
 from halbach_fe.measurement.map_check import MapCheck, check_map, oriented
+from halbach_fe.measurement.total_check import check_total
 from halbach_fe.report import diagnosis_answer, inference_answer, registration
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.map_check import answer as answer_of_check
@@ -60,11 +62,11 @@ class Explanation:
     Attributes
     ----------
     magnet : Magnet
-        The magnet of the last step, with all that was found.
+        The magnet of the last update, with what was found before it.
     inference : InferenceResult
-        Its update by the map.
+        That update by the map.
     sound : bool
-        Whether this may be used.
+        Whether it may be used.
     answers : dict of str to Answer
         What each step says (``said``), how far to trust it (``trust``) and what to do next
         (``next``), by the name of the step.
@@ -128,8 +130,7 @@ def explain(
     steps = _InMemory(magnet, data, session, blocks, say)
     follow(steps)
     assert steps.result is not None  # every way begins with an update
-    last = list(steps.answers.values())[-1]
-    return Explanation(steps.magnet, steps.result, last.sound, steps.answers, steps.checked,
+    return Explanation(steps.updated, steps.result, steps.sound, steps.answers, steps.checked,
                        steps.poses, steps.diagnosis)
 
 
@@ -147,6 +148,10 @@ class _InMemory:
     result: InferenceResult | None = None
     poses: list[Registration] = field(default_factory=list)
     diagnosis: Diagnosis | None = None
+    sound: bool = False
+
+    def __post_init__(self) -> None:
+        self.updated = self.magnet
 
     def _answered(self, name: str, answer: Answer) -> bool:
         self.answers[name] = answer
@@ -154,6 +159,9 @@ class _InMemory:
         return answer.sound
 
     def check(self) -> None:
+        if is_total_field(self.data):  # which has no Maxwell's equations, but broken rows
+            self.data = self.data.isel(point=np.flatnonzero(~check_total(self.data).excluded))
+            return
         try:
             self.checked = check_map(self.data, self.say)
         except MeasurementError as error:
@@ -166,13 +174,15 @@ class _InMemory:
     def infer(self, name: str) -> bool:
         self.result = infer(self.magnet, self.data, self.session.within(name), self.blocks,
                             say=self.say)
-        return self._answered(name, inference_answer.answer(self.result))
+        self.updated = self.magnet
+        self.sound = self._answered(name, inference_answer.answer(self.result))
+        return self.sound
 
     def register(self) -> bool:
         try:
             self.poses = register(self.magnet, self.data, self.session.within("registered"),
                                   say=self.say)
-        except MeasurementError as error:  # diagnose may know why no pose explains the map
+        except (MeasurementError, StudyError) as error:  # of a plane; or diagnose knows why
             self.say(f"The map cannot be registered: {error}")
             return False
         best = self.poses[0]

@@ -22,7 +22,7 @@ from halbach_fe.geometry.free_blocks import blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
-from halbach_fe.study.edit_file import FREE_BLOCKS_FILE, study_text
+from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
 from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
 from halbach_fe.study.model import Study
@@ -188,7 +188,7 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     ----------
     magnet : Magnet or Study
     path : str or Path
-        Free blocks are written beside it, as ``free_blocks.csv``.
+        Free blocks are written beside it, as ``STEM.blocks.csv``.
 
     Returns
     -------
@@ -209,9 +209,10 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     """
     study = magnet.study if isinstance(magnet, Magnet) else magnet
     path, table = Path(path), study.array.free_blocks
-    write_text(path, study_text(study))
+    blocks = f"{path.stem}.blocks.csv"
     if table is not None:
-        write_free_blocks(table, path.with_name(FREE_BLOCKS_FILE))
+        write_free_blocks(table, path.with_name(blocks))
+    write_text(path, study_text(study, blocks))
 
 
 def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:
@@ -305,7 +306,8 @@ def to_magpylib(magnet: Magnet) -> Any:
     Raises
     ------
     StudyError
-        If a block is a prism that is not convex, or the magnet is a cross-section.
+        If a block is a prism that is not convex, or not magnetized uniformly, or the magnet is a
+        cross-section.
 
     Examples
     --------
@@ -324,6 +326,10 @@ def to_magpylib(magnet: Magnet) -> Any:
 
 def _source(magpylib: Any, table: FreeBlocks, number: int) -> Any:
     """Return the source of magpylib that a row of a table of blocks describes."""
+    if any(table.given(column)[number] and getattr(table, column)[number]
+           for column in ("magnetization_gradient", "inner_corner_loss")):
+        raise StudyError(must_be(f"block {table.name[number]}", "to_magpylib",
+                                 "magnetized uniformly", "one that is not"))
     row = {column: getattr(table, column)[number] for column in COLUMNS
            if table.given(column)[number]}
     turn = Rotation.from_rotvec([row.get(f"rotation_{axis}_deg") or 0.0 for axis in "xyz"],

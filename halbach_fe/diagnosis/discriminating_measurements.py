@@ -428,8 +428,10 @@ class _Readings:
         for name, sd in zip(terms.names, terms.prior_sd, strict=True) if terms else ():
             owner, _, term = name.rpartition(".")
             effect, number = _effect_of(term)
-            maps = tuple(one.name for one in self.magnet.nominal.study.maps
-                         if owner in (one.name, one.probe, one.stage))
+            listed = self.magnet.nominal.study.maps
+            maps = tuple(one.name for one in listed if owner in (one.name, one.probe, one.stage))
+            if listed and not maps:  # of a map that is only predicted
+                continue
             found.append(sd * self.of(Hypothesis(effects[effect], Place(maps=maps)))[:, number])
         return np.array(found).T.reshape(self.scan.analysis.shape[0], len(found))
 

@@ -7,7 +7,7 @@ of units or axes, reaches so far, and so such maps are registered before anythin
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from halbach_fe.core.errors import MeasurementError
@@ -78,12 +78,14 @@ class FoundPose:
         return (f"the middle of {f'map {self.map}' if self.map else 'the map'} lies at ({place}) "
                 f"mm in the magnet, with its axis {axes} of the magnet")
 
-    def apply(self, study: Study) -> Study:
-        """Return the study with the map in this pose."""
-        tables = {"instrument": self.instrument, "instrument_sd": self.open}
-        if self.map is None:
-            return study.with_(**tables)
-        return study.with_tables({self.map: tables})
+
+def with_poses(study: Study, poses: Sequence[FoundPose]) -> Study:
+    """Return the study with its maps in these poses, all at once: they may share probe and stage,
+    whose terms must agree.
+    """
+    tables = {one.map or "": {"instrument": one.instrument, "instrument_sd": one.open}
+              for one in poses}
+    return study.with_(**tables[""]) if "" in tables else study.with_tables(tables)
 
 
 def misfits_of(study: Study, data: Data) -> dict[str, float]:
@@ -146,6 +148,4 @@ def find_poses(
         tuple(float(each) for each in odds(found[one.name])[1:] if each > POSSIBLE),
         before[one.name], after[one.name], one.name if several else None)
         for one in maps_of(registered, data)]
-    for pose in poses:
-        study = pose.apply(study)
-    return tuple(poses), study
+    return tuple(poses), with_poses(study, poses)

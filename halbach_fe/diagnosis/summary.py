@@ -22,7 +22,7 @@ from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.map_conventions import MapConvention
-from halbach_fe.diagnosis.map_pose import FoundPose
+from halbach_fe.diagnosis.map_pose import FoundPose, with_poses
 from halbach_fe.diagnosis.model_selection import Candidate
 from halbach_fe.diagnosis.position_noise import PositionNoise
 from halbach_fe.diagnosis.result import (
@@ -192,9 +192,9 @@ def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     for error in diagnosis.gross_errors:
         study = error.apply(study)
         yield study, f"gross error: {error.text}"
-    for pose in diagnosis.poses:
-        study = pose.apply(study)
-        yield study, f"registered: {pose.text}"
+    if diagnosis.poses:
+        study = with_poses(study, diagnosis.poses)
+        yield study, f"registered: {'; '.join(pose.text for pose in diagnosis.poses)}"
     study = diagnosis.corrected_study
     yield study, f"outliers: {len(diagnosis.outliers)}" if diagnosis.outliers else ""
     for effect in diagnosis.identified:

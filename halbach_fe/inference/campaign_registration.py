@@ -72,11 +72,20 @@ def register_maps(
             stage=_stage_pose(one, first, found[first.name][0]))
         found[one.name] = register(
             magnet.with_study(study), one.data, session.within(one.name),
-            None if known is None else replace(known.probe, offset_T=ProbePrior.offset_T),
+            None if known is None else _of_known_probe(known, study.instrument_sd),
             () if found else open_keys, say, blocks, pose)
         blocks = found[one.name][0].blocks
         probes.setdefault(one.probe, found[one.name][0])
     return found
+
+
+def _of_known_probe(first: Registration, stated: InstrumentSd) -> ProbePrior:
+    """Return what is open of a probe that another map has found, but for its offsets, which change
+    from map to map. Of a probe of |B| neither axes nor sensors were found.
+    """
+    usual = ProbePrior.of(stated)
+    return replace(usual, gain=first.probe.gain) if first.total else replace(
+        first.probe, offset_T=usual.offset_T)
 
 
 def registered_study(

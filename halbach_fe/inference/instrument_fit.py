@@ -19,13 +19,14 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.inference.readings import Readings
 from halbach_fe.measurement.campaign import ONLY_MAP, Map, with_pivots
-from halbach_fe.measurement.field_map import is_total_field, points_of, refuse_total_field
+from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     map_time,
     remove_nonlinear_part,
     sensor_matrix,
     sensor_positions,
+    total_without_nonlinear_part,
     turn_of,
 )
 from halbach_fe.measurement.instrument_terms import (
@@ -217,8 +218,6 @@ def amplitude_columns(
              for one in uncertain]
     found = []
     for number, one in enumerate(maps):
-        if uncertain:
-            refuse_total_field(one.data, "`uncertain` of an instrument")
         data = in_si_and_magnet_axes(one.study.instrument, one.data)
         points = points_of(data)
         if one.is_validation:
@@ -229,12 +228,18 @@ def amplitude_columns(
 
         def off(other: Study, number: int = number, data: xr.Dataset = data,
                 points: Floats = points, before: Floats = before,
-                at_sensors: Floats = at_sensors, gradient: Floats = gradient) -> Floats:
+                at_sensors: Floats = at_sensors, gradient: Floats = gradient,
+                name: str = one.name) -> Floats:
             """Return what the sensors show, less the values that are read."""
             own = other.of_map(number).instrument if other.maps else other.instrument
             away = sensor_positions(own, points) - before
-            return seen(sensor_matrix(own), at_sensors + np.einsum(
-                "nscj,nsj->nsc", gradient, away)) - np.nan_to_num(remove_nonlinear_part(own, data))
+            shown = seen(sensor_matrix(own), at_sensors + np.einsum(
+                "nscj,nsj->nsc", gradient, away))
+            if not is_total_field(data):
+                return shown - np.nan_to_num(remove_nonlinear_part(own, data))
+            along = readings.directions[name]
+            return along * (np.sum(along * shown, axis=1) - np.nan_to_num(
+                total_without_nonlinear_part(own, data)))[:, None]
 
         found.append(np.array([(off(more) - off(less)) / (2 * AMPLITUDE_STEP)
                                for more, less in sides]).reshape(-1, len(points), 3))

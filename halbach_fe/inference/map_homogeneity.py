@@ -225,10 +225,11 @@ def _fitted(
         return known, noise, ""
     has = " and ".join(f"B{name}" for name in COMPONENTS if f"B{name}" not in lacking)
     size, whole = (np.linalg.norm(each, axis=1) for each in (nominal @ told, nominal))
+    across = np.sqrt(np.maximum(whole**2 / size**2 - 1, 0.0))
     differs = _differs(np.linalg.norm(fields[..., 0], axis=1), size, model.weights)
     return replace(known, components=has), noise, (
         f"has no {lacking}. What is said of it is the size of {has} alone, as the main field is "
-        f"along it. {_to_first_order(np.sqrt(whole**2 / size**2 - 1) + np.sqrt(2) * differs)}")
+        f"along it. {_to_first_order(across + np.sqrt(2) * differs)}")
 
 
 def _to_first_order(across: Floats) -> str:

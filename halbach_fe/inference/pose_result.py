@@ -62,7 +62,7 @@ class ProbePrior:
         Parameters
         ----------
         known : InstrumentSd
-            What the study states. A pose that it leaves open remains as open as that.
+            What the study states. A pose that it leaves more open remains so.
         pose_sd, pose_prior_sd : ndarray, shape (6,)
             Standard deviations of the pose after the registration and before it, in m and rad.
             What the map does not determine is opened like what it does.
@@ -71,10 +71,13 @@ class ProbePrior:
         """
         sd = np.where(pose_sd < UNDETERMINED * pose_prior_sd, pose_sd, 0.0).reshape(2, 3)
         shift, turn = np.clip(WIDER * sd.max(axis=1), NARROWEST_POSE, WIDEST_POSE).tolist()
+        most_m, most = WIDEST_POSE.tolist()  # of every key of `InstrumentSd`
         return known.with_(
-            translation_m=known.translation_m or shift, rotation_rad=known.rotation_rad or turn,
-            gain=self.gain, offset_T=self.offset_T,
-            **({} if total else {"crosstalk": self.crosstalk, "sensor_position_m": self.sensor_m}))
+            translation_m=max(known.translation_m, shift),
+            rotation_rad=max(known.rotation_rad, turn),
+            gain=min(self.gain, most), offset_T=min(self.offset_T, most),
+            **({} if total else {"crosstalk": min(self.crosstalk, most),
+                                 "sensor_position_m": min(self.sensor_m, most_m)}))
 
 
 SEARCHED_M = 1e-3

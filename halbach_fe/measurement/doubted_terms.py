@@ -240,6 +240,8 @@ def shared_doubts(magnet: Magnet, mean: Floats, prior: Gaussian, model_error: fl
         reversed block is no common deviation) unless most are.
     """
     of = _Changes.of(magnet, mean - prior.mean, prior.sd)
+    if not len(of.numbers):
+        return ()
     near = (of.away <= doubted_from(of.sd.size)).all(axis=1)
     near = near if 2 * near.sum() > near.size else np.ones(near.size, bool)
     axes, size = of.axes[near], magnet.dimension

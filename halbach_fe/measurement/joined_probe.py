@@ -66,6 +66,11 @@ class Pose:
         """Return where a stage stands that has the pose ``other`` on this stage."""
         return Pose(self.turn @ other.turn, self.places(other.shift_m))
 
+    @property
+    def inverse(self) -> Pose:
+        """The pose of these coordinates on the stage."""
+        return Pose(self.turn.T, -self.turn.T @ self.shift_m)
+
 
 @dataclass(frozen=True)
 class PosedCharges(Charges):

@@ -15,6 +15,7 @@ from itertools import permutations, product
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import special
 from scipy.ndimage import maximum_filter
 from scipy.optimize import least_squares
 from scipy.signal import correlate
@@ -93,6 +94,9 @@ DISAGREES = 2.0
 """chi2 per reading of an overlap from which maps contradict each other: errors of positions that
 scan lines have in common made 1.5 in maps of one magnet."""
 
+BY_CHANCE = 1e-3
+"""Probability of a larger chi2 in an overlap of few readings, up to which maps still agree."""
+
 DIFFERS = FAR_OFF**2
 """chi2 per reading of an overlap from which maps are not joined. If axes of a stage are not those
 that it states, `DISAGREES` is: a smooth field that is nearly symmetric is much like itself."""
@@ -111,6 +115,8 @@ class Overlap:
     readings : int
     chi2 : float
         Per reading, with the covariance of the field that the other maps predict: 1 if they agree.
+    limit : float
+        Largest chi2 of maps that agree, the larger the fewer readings there are.
     rms_T : float
         Rms of what the joined field leaves of them.
     alone_T : float
@@ -120,13 +126,14 @@ class Overlap:
     name: str
     readings: int
     chi2: float
+    limit: float
     rms_T: float
     alone_T: float
 
     @property
     def agrees(self) -> bool:
         """Whether what differs may be noise."""
-        return self.chi2 <= DISAGREES
+        return self.chi2 <= self.limit
 
 
 @dataclass(frozen=True)
@@ -353,15 +360,20 @@ def join_checked(maps: Sequence[Checked], pace: Pace) -> JoinedMaps:
     terms, joined = joined.with_terms()
     overlaps = joined.overlaps()
     result = joined.result([sign for _, sign in places], terms, overlaps)
-    limit = DISAGREES if any(one.is_turned for one in result.poses) else DIFFERS
+    turned = any(one.is_turned for one in result.poses)
     for one in overlaps:
-        if one.chi2 > limit:
+        if one.chi2 > (one.limit if turned else max(one.limit, DIFFERS)):
             raise _contradiction(one.name, one.rms_T, one.alone_T)
     return result
 
 
 def _contradiction(name: str, off_T: float, noise_T: float) -> MeasurementError:
     """Return the error for a map that is not of the same field."""
+    if not np.isfinite(off_T):
+        return MeasurementError(must_be(
+            f"map '{name}'", "the maps that are joined", f"one that shares {FEWEST_SHARED} points "
+            "or more with another one", "fewer, in every place", "Measure more of the overlap, or "
+            "find the map's place in the magnet by `halbach-fe register`."))
     return MeasurementError(must_be(
         f"map '{name}'", "the maps that are joined", "one that overlaps another one of the same "
         "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT in "
@@ -412,7 +424,7 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
     MeasurementError if one has no place.
     """
     found: dict[int, tuple[Pose, int]] = {0: (Pose(np.eye(3), np.zeros(3)), 1)}
-    as_stated = {(one, other): _match(maps[one], maps[other], [(np.eye(3), 1)])
+    as_stated = {(one, other): _match_of(maps[one], maps[other], [(np.eye(3), 1)])
                  for one in range(len(maps)) for other in range(1, len(maps)) if one != other}
     turned: dict[tuple[int, int], _Match] = {}
     while len(found) < len(maps):
@@ -423,7 +435,7 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
             for one, other in pairs:
                 if (one, other) not in turned:
                     stated = as_stated[one, other]
-                    best = _match(maps[one], maps[other], list(_axes()))
+                    best = _match_of(maps[one], maps[other], list(_axes()))
                     better = best.fits and best.odds > stated.odds + CERTAIN
                     turned[one, other] = best if better or not stated.fits else stated
             known = {pair: turned[pair] for pair in pairs}
@@ -447,6 +459,20 @@ def _refused(one: Checked, other: Checked, best: _Match) -> MeasurementError:
         f"map '{other.name}'", "the maps that are joined", "one that fits where it overlaps "
         f"'{one.name}'", "one whose mirror image fits", f"One of the two counts a position axis "
         f"backwards, {axis} for example: reverse {axis} and B{axis} in the one that is wrong."))
+
+
+def _match_of(
+    one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]
+) -> _Match:
+    """Return the best place of a map on another one, by the points of either in the other's box: a
+    coarse map may have few in that of a fine one.
+    """
+    found = _match(one, other, axes)
+    if found.fits:
+        return found
+    back = _match(other, one, axes)
+    back = replace(back, pose=back.pose.inverse)
+    return max(found, back, key=lambda match: (match.fits, match.odds))
 
 
 def _match(one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]) -> _Match:
@@ -582,10 +608,14 @@ class _Joined:
     def of(cls, maps: Sequence[Checked], starts: Sequence[Pose], pace: Pace) -> _Joined:
         """Fit the poses, and what the probes have in common by the checks of the single maps."""
         scans, chosen = [], []
-        for one in maps:
+        for number, one in enumerate(maps):
             scan, usable, _ = scan_of(one.data)
-            chosen.append(usable & some_lines(scan_lines(scan.points), usable,
-                                              max(1, MOST_POINTS // len(maps))))
+            lines, most = scan_lines(scan.points), max(1, MOST_POINTS // len(maps))
+            shared = usable & _within_others(maps, starts, number, scan.points)
+            # lines that are left out regularly may be just those that other maps reach
+            chosen.append(usable & some_lines(lines, usable, most)
+                          | shared & some_lines(np.unique(lines, return_inverse=True)[1], shared,
+                                                most))
             scans.append(scan)
         rows = np.concatenate(chosen)
 
@@ -607,7 +637,7 @@ class _Joined:
 
     def with_terms(self) -> tuple[tuple[InstrumentTerm, ...], _Joined]:
         """Return the terms of the probe that are common, or of one map, and the fit with these."""
-        open_terms, parameters = _own_terms(self.maps, self.model)
+        open_terms, parameters = _own_terms(self.maps, self.model, self._shares())
         told = [self._evidence(open_terms, self.rows)]
         kept = self.model.prior_sd > 0
         found = self
@@ -617,7 +647,8 @@ class _Joined:
             new, _ = selected(parameters, told, kept)
             if (new & ~kept).any():
                 found = self._with(new)
-        common = [found._stated(parameter) for parameter in _common_terms(self.model)]
+        common = [found._stated(parameter) for parameter in _common_terms(
+            self.model, self._shares())]
         own = [found._stated(parameter) for parameter in parameters
                if found.model.prior_sd[list(parameter.own)].all()]
         return (*common, *own), found
@@ -642,6 +673,11 @@ class _Joined:
             found += [self.rows & (column <= middle), self.rows & (column > middle)]
         return found
 
+    def _shares(self) -> Floats:
+        """Return how much gains and crosstalk change |B|, see `ProbeModel.shares`."""
+        field = self.model.charges.field(self._points(), self.at.amplitudes)
+        return np.asarray(field.T @ field / np.sum(field**2))
+
     def _points(self) -> Floats:
         """Return all points (n, 3) in the frame of the first map."""
         return np.vstack([self.model.pose(self.at, number).places(scan.points)
@@ -649,13 +685,8 @@ class _Joined:
 
     def _shared(self, number: int) -> NDArray[np.bool_]:
         """Return which points of a map any other map has around them."""
-        there = self.model.pose(self.at, number).places(self.scans[number].points)
-        found = np.zeros(len(there), bool)
-        for other, one in enumerate(self.maps):
-            if other != number:
-                pose = self.model.pose(self.at, other)
-                found |= one.holds((there - pose.shift_m) @ pose.turn)
-        return found
+        poses = [self.model.pose(self.at, one) for one in range(len(self.maps))]
+        return _within_others(self.maps, poses, number, self.scans[number].points)
 
     def _stated(self, parameter: Parameter) -> InstrumentTerm:
         """Return a term of the probe as all maps show it."""
@@ -671,14 +702,17 @@ class _Joined:
             own = self.model.only(number, self.rows)
             shared = own.copy()
             shared[self.model.rows_of(number)] &= self._shared(number)
+            if not shared.any():  # it may reach around a map between its own points
+                continue
             rest = State.of(self.model, at, self.rows & ~own, self.width2)
             both = State.of(self.model, at, (self.rows & ~own) | shared, self.width2)
             alone = self.model.alone(at, number, self.rows, self.width2)
             count = 3 * int(shared.sum())
+            limit = max(DISAGREES, float(special.chdtri(count, BY_CHANCE)) / count)
             left, left_alone = (
                 float(np.sqrt(np.mean((self.model.field - self.model.readings(fit))[shared]**2)))
                 for fit in (self.at, alone.at))
-            found.append(Overlap(one.name, count, (both.chi2 - rest.chi2) / max(count, 1),
+            found.append(Overlap(one.name, count, (both.chi2 - rest.chi2) / count, limit,
                                  left, left_alone))
         return tuple(found)
 
@@ -736,6 +770,18 @@ class _Joined:
             [_scans(one) for one in self.maps])))
 
 
+def _within_others(
+    maps: Sequence[Checked], poses: Sequence[Pose], number: int, points: Floats
+) -> NDArray[np.bool_]:
+    """Return which points (n, 3) of a map, in its coordinates, any other map has around them."""
+    there = poses[number].places(points)
+    found = np.zeros(len(there), bool)
+    for other, (one, pose) in enumerate(zip(maps, poses, strict=True)):
+        if other != number:
+            found |= one.holds(pose.inverse.places(there))
+    return found
+
+
 def _scans(one: Checked) -> NDArray[np.str_]:
     """Return the names (n,) of the scans of a joined map."""
     if "scan" not in one.data:
@@ -782,7 +828,7 @@ def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
 
 
 def _own_terms(
-    maps: Sequence[Checked], model: JoinedModel
+    maps: Sequence[Checked], model: JoinedModel, shares: Floats
 ) -> tuple[NDArray[np.bool_], list[Parameter]]:
     """Return the terms that may be of one map only, as parameters, and with all that are kept."""
     open_terms, found = model.prior_sd > 0, []
@@ -795,7 +841,7 @@ def _own_terms(
         found.append(Parameter(f"gain of {one.name} relative to {maps[0].name}", "%", row, (gain,)))
         open_terms[gain] = True
         first = model.own(number).start
-        for parameter in all_parameters(model.any_sd[model.own(number)], np.eye(3) / 3):
+        for parameter in all_parameters(model.any_sd[model.own(number)], shares):
             if set(parameter.own) <= set(range(TERMS)[MIXING]):
                 row = np.zeros(len(open_terms))
                 row[model.own(number)] = parameter.row
@@ -806,10 +852,10 @@ def _own_terms(
     return open_terms, found
 
 
-def _common_terms(model: JoinedModel) -> list[Parameter]:
+def _common_terms(model: JoinedModel, shares: Floats) -> list[Parameter]:
     """Return the terms that all maps have in common, as parameters."""
     found = []
-    for parameter in all_parameters(model.any_sd[:TERMS], np.eye(3) / 3):
+    for parameter in all_parameters(model.any_sd[:TERMS], shares):
         if COMMON[list(parameter.own)].all() and (model.prior_sd[list(parameter.own)] > 0).all():
             row = np.zeros(len(model.any_sd))
             row[:TERMS] = parameter.row

@@ -186,8 +186,6 @@ def write_diagnosis_report(
                 "discoveries": DISCOVERIES},
         advice=unknown_advice(diagnosis.unknown) if diagnosis.unknown else
         " ".join(map(more_readings, diagnosis.suspected)) if diagnosis.suspected else
-        "Further measurements are not compared, because the study leaves terms of instruments open "
-        "(`instrument_sd`)." if diagnosis.before.terms is not None else
         "None of the candidate measurements would distinguish the effects from their alternatives."
         if any(rivals(effect) for effect in diagnosis.identified) else "",
         in_words=BAYES_FACTOR_IN_WORDS, study_file=STUDY_FILE, summary_file=SUMMARY_FILE)

@@ -151,8 +151,10 @@ def _beside(diagnosis: Diagnosis) -> str:
     """Say which of the causes that explain the map equally well the diagnosed study has, too."""
     titles = catalogue_titles(diagnosis)
     others = [one for effect in diagnosis.identified for one in effect.rivals]
+    present = {effect.hypothesis.effect.name for effect in diagnosis.identified}
     exact = dict.fromkeys(title_of(one.hypothesis.effect.name, titles) for one in others
-                          if not is_uncertain(diagnosis.study, one))
+                          if not is_uncertain(diagnosis.study, one)
+                          and one.hypothesis.effect.name not in present)
     inside = any(is_uncertain(diagnosis.study, one) for one in others)
     return (", and beside it the others with uncertain amplitudes about 0, so that an update is "
             "right whichever it is" if inside else "") + (

@@ -66,8 +66,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
         f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
-        *(LOOK if single else AGAIN if shared else _after_agreement(result)),
-        sound=not single)
+        *(LOOK if single or (shared and "update again" not in shared) else
+          AGAIN if shared else _after_agreement(result)), sound=not (single or shared))
 
 
 def _after_agreement(result: InferenceResult) -> tuple[str, str]:
@@ -100,7 +100,8 @@ def _of_all_blocks(result: InferenceResult) -> str:
             f"deviations of what their prior allows ({each.known}). "
             f"{'A turn of the map' if turn else 'A gain of the instrument'} does the same, and the "
             "readings cannot tell which it is" + (
-                f": state how far either may be off ({' and '.join(keys)}), and update again."
+                f": state how far {'either' if len(keys) > 1 else 'the latter'} may be off "
+                f"({' and '.join(keys)}), and update again."
                 if keys else "."))
     return " ".join(said)
 
@@ -114,11 +115,14 @@ def _of_single_blocks(result: InferenceResult) -> str:
     named = in_a_row([each.name.removeprefix("block ") for each in blocks[:MOST_NAMED]])
     more = f" and {len(blocks) - MOST_NAMED} more" if len(blocks) > MOST_NAMED else ""
     return (f"{'Block' if one else 'Blocks'} {named}{more} {'is' if one else 'are'} up to "
-            f"{decimals(first.distance, 2)} standard deviations away from what the study says, "
+            f"{decimals(first.distance, 2)} standard deviations away from what "
+            f"{'was measured of single blocks' if result.measured_blocks else 'the study says'}, "
             f"which still draws {'it' if one else 'them'} back: the error bars of "
             f"{'this block and its' if one else 'these blocks and their'} neighbours are too "
-            "short. Find out what is the matter (diagnose), or state it in the study "
-            "([[array.exceptions]], or a wider [prior]), and update again.")
+            "short. Find out what is the matter (diagnose), or " + (
+                "look whether it stands in that slot, " if result.measured_blocks else
+                "state it in the study ([[array.exceptions]], or a wider [prior]), ")
+            + "and update again.")
 
 
 def _of_the_probe(result: InferenceResult) -> str:

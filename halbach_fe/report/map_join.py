@@ -49,7 +49,7 @@ def answer(joined: JoinedMaps) -> Answer:
         f"Yes: where {in_a_row([first, *others])} overlap, chi² is at most "
         f"{max(one.chi2 for one in joined.overlaps):.2f} per reading; no magnet is assumed.",
         f"Find where the joined map, in the frame of {first}, lies in the magnet.",
-        "halbach-fe register STUDY --measurements DIR/joined.csv -o DIR2")
+        "halbach-fe register STUDY --measurements DIR/joined.csv -o DIR")
 
 
 def _shift(pose: MapPose) -> str:
@@ -113,8 +113,9 @@ def write_joined(
         write_map_check(data, joined.checks[name], make_folder(folder / name),
                         {"map": provenance[f"map {name}"]})
     write_map(joined.data, folder / "joined.csv")
-    summary = joined.plain() | {"maps_sha256": {
-        name: readings_sha256(data) for name, data in {**maps, "joined": joined.data}.items()}}
+    summary = joined.plain() | {
+        "maps_sha256": {name: readings_sha256(data) for name, data in maps.items()},
+        "joined_sha256": readings_sha256(joined.data)}
     write_text(folder / "joined.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     write_page(folder / "joined.html", "map_join.html.j2", [], provenance=provenance,
                answer=answer(joined), rows=pose_table(joined), found=sentences(joined),

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -183,10 +184,16 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
     points = np.asarray(points_m, float)
     if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
-        raise StudyError(must_be("points_m", magnet.name, "numbers x, y, z in m: an array (..., 3)",
+        raise StudyError(must_be("points_m", magnet.name, "finite x, y, z in m: an array (..., 3)",
                                  f"one of shape {points.shape}"))
-    field = field_function(magnet, Session.temporary())(points.reshape(-1, 3))
-    return field.reshape(points.shape)
+    return field_function(magnet, _session_until_exit())(points.reshape(-1, 3)).reshape(
+        points.shape)
+
+
+@cache
+def _session_until_exit() -> Session:
+    """Return the session of all fields of this process whose files nobody keeps."""
+    return Session.temporary()
 
 
 def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:

@@ -256,12 +256,12 @@ def _rewritten(study: Study, notes: list[str]) -> str:
     return f"{lines}\n{study_text(study)}"
 
 
-def study_text(study: Study) -> str:
+def study_text(study: Study, blocks: str = FREE_BLOCKS_FILE) -> str:
     """Return a study file with all keys of a study that are not defaults.
 
-    It refers to a table of free blocks beside it, see `write_edited`.
+    It refers to a table of free blocks beside it, the file ``blocks``, see `write_edited`.
     """
     keys = study.model_dump(mode="json", exclude_defaults=True)
     if study.array.free_blocks is not None:
-        keys["array"]["free_blocks"] = {"file": FREE_BLOCKS_FILE}
+        keys["array"]["free_blocks"] = {"file": blocks}
     return tomlkit.dumps(keys)

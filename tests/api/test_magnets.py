@@ -81,6 +81,10 @@ def test_a_prism_that_is_not_convex_is_refused():
         "outline_m": [((0, 0), (0.02, 0), (0.002, 0.002), (0, 0.02))], "remanence_T": [1.3]})
     with pytest.raises(StudyError, match="convex"):
         hf.to_magpylib(magnet)
+    with pytest.raises(StudyError, match="uniformly"):
+        hf.to_magpylib(hf.halbach_ring(
+            inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03).with_(
+                array__exceptions=[{"ring": 1, "slot": 1, "inner_corner_loss": 0.5}]))
     with pytest.raises(StudyError, match="cross-section"):
         hf.to_magpylib(hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04))
 
@@ -89,8 +93,12 @@ def test_a_study_is_written_and_read_back(tmp_path):
     ring = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03,
                            material="N42").with_(prior__magnitude_sd=0.02)
     for name, magnet in (("ring", ring), ("free", hf.from_magpylib(hf.to_magpylib(ring)))):
-        hf.write_study(magnet, tmp_path / name / "study.toml")
-        assert hf.read_study(tmp_path / name / "study.toml") == magnet.study
+        hf.write_study(magnet, tmp_path / f"{name}.toml")
+        assert hf.read_study(tmp_path / f"{name}.toml") == magnet.study
+    other = hf.from_magpylib(list(hf.to_magpylib(ring))[:3])
+    hf.write_study(other, tmp_path / "few.toml")  # another table beside the same folder's
+    assert hf.read_study(tmp_path / "free.toml") == magnet.study
+    assert hf.read_study(tmp_path / "few.toml") == other.study
 
 
 def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 
 import magpylib
 import numpy as np
@@ -11,14 +12,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.diagnosis import unknown_cause
 from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.map_pose import find_poses
+from halbach_fe.diagnosis.map_pose import FoundPose, find_poses, with_poses
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.solver.session import Session
+from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
 
@@ -149,3 +152,19 @@ def test_a_shift_that_is_far_from_linear_is_named(generator, tmp_path, monkeypat
     assert other.unknown is not None
     assert other.unknown.alone
     assert max(other.probabilities, key=other.probabilities.get) == "unknown"
+
+
+def test_poses_of_maps_that_share_stage_and_probe_are_stated_together():
+    """Stated one after the other, they contradict each other: the negative control."""
+    maps = [{"name": name, "file": f"{name}.csv", "stage": "table", "probe": "hall",
+             "stage_shift_sd_m": [0, 0, 1e-3]} for name in ("body", "fringe")]
+    study = parse_study(tomllib.loads(TEXT) | {"maps": maps})
+    poses = [FoundPose(None, Instrument(translation_m=(0.0, 0.0, z), rotation_rad=(0, 0, 0.01)),
+                       InstrumentSd(translation_m=1e-3, gain=3e-3), (), 1.0, 0.1, name)
+             for name, z in (("body", 0.1), ("fringe", 0.2))]
+    found = with_poses(study, poses)
+    assert [one.instrument.translation_m[2] for one in found.maps] == [0.1, 0.2]
+    with pytest.raises(StudyError, match="maps of one"):
+        with_poses(study, poses[:1])
+    alone = with_poses(parse_study(tomllib.loads(TEXT)), [replace(poses[0], map=None)])
+    assert alone.instrument_sd.gain == 3e-3

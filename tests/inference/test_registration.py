@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.campaign_registration import _of_known_probe
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_result import OpenKey, ProbePrior
 from halbach_fe.inference.pose_search import _after_no_pose, coarse_poses, right_angles
@@ -269,9 +270,12 @@ def test_what_is_open_after_a_registration():
     assert opened == InstrumentSd(
         translation_m=2e-3, rotation_rad=0.03, crosstalk=0.03, gain=0.01, offset_T=1e-3,
         sensor_position_m=1e-4, drift_T=1e-4)
-    stated = InstrumentSd(translation_m=5e-3, rotation_rad=0.02)
+    stated = InstrumentSd(translation_m=5e-3, rotation_rad=0.04)
     assert probe.opened(stated, sd, prior_sd, total=True) == stated.with_(
         gain=0.01, offset_T=1e-3)
+    # what is stated is known about another place: that of the map itself needs ten of its bars
+    near = probe.opened(InstrumentSd(translation_m=1e-4), sd, prior_sd, total=False)
+    assert near.translation_m == 2e-3
     narrow = probe.opened(InstrumentSd(), 1e-3 * sd, prior_sd, total=False)
     assert (narrow.translation_m, narrow.rotation_rad) == (1e-3, 0.01)
     wide = probe.opened(InstrumentSd(), 30 * sd, 1e3 * prior_sd, total=False)
@@ -371,3 +375,12 @@ def test_what_to_do_with_a_map_that_no_pose_explains(components, total, said):
     advice = _after_no_pose(components, total)
     assert said in advice
     assert "another magnet" in advice
+
+
+def test_a_probe_that_another_map_has_found_keeps_what_changes_from_map_to_map():
+    first = SimpleNamespace(total=False, probe=ProbePrior(1e-3, 2e-4, 1e-5, 2e-5))
+    stated = InstrumentSd(offset_T=5e-3)
+    assert _of_known_probe(first, stated) == ProbePrior(1e-3, 2e-4, 5e-3, 2e-5)
+    of_magnitude = SimpleNamespace(total=True, probe=ProbePrior(0.0, 2e-4, 1e-5, 0.0))
+    found = _of_known_probe(of_magnitude, InstrumentSd())
+    assert found == ProbePrior(gain=2e-4)  # no term without any freedom

@@ -109,6 +109,22 @@ def test_blocks_are_learnt_from_the_magnitude(order, generator, session):
     assert "strongest component" not in answer(update).said
 
 
+def test_an_uncertain_gain_of_the_magnitude_is_an_open_gain(generator, session):
+    """Stated as [instrument_sd] or as [[uncertain]]. Control: a gain that is exact."""
+    data = total_map(2, 1, generator, gain=0.01)
+    uncertain = {"name": "gain", "sd": 0.01, "change": {
+        f"instrument.gain[{axis}]": 1.0 for axis in (1, 2, 3)}}
+    opened, stated, exact = (
+        infer(build_magnet(study_of(2, **keys)), data, session.within(name)).posterior
+        for name, keys in (("open", {"instrument_sd": {"gain": 0.01}}),
+                           ("stated", {"uncertain": [uncertain]}), ("exact", {})))
+    count = len(exact.mean)
+    off = np.abs(stated.mean[:count] - opened.mean[:count]) / opened.sd[:count]
+    assert off.max() < 0.3  # at the middle of a change of 1 % it is linear to that
+    assert np.abs(exact.mean - opened.mean[:count]).max() > 3 * exact.sd.max()
+    np.testing.assert_allclose(stated.sd[:count], opened.sd[:count], rtol=0.05)
+
+
 def test_the_nominal_direction_does_not_suffice(generator, session):
     """Negative control: lengths along the nominal field are off |B| by up to 9 µT, those along the
     updated one by less than 0.5 µT.

@@ -175,3 +175,41 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(map_join, "check_map", lambda *_: disobedient)
     with pytest.raises(MeasurementError, match=r"'part0'.*obeys Maxwell's equations"):
         join_maps(maps)
+
+
+def pole_maps(generator, *grids):
+    """Maps of the field of a pole, each with a floor and the spacing of its own grid."""
+    found = []
+    for number, (points, step, shift) in enumerate(grids):
+        away = points + shift - [0.1, 0.05, 0.08]
+        field = 1e-4 * away / np.linalg.norm(away, axis=1)[:, None]**3
+        data = field_map(points, field + 1e-6 * generator.standard_normal(field.shape))
+        (one,) = as_checked({f"part{number}": data}, 1.6e-6)
+        found.append(map_join.Checked.of(one.name, data, replace(
+            one.check, spacing_m=step, gap_m=max(2.5 * step, 0.03), noise_T=1e-6)))
+    return found
+
+
+def lattice(count, step, start):
+    return np.stack(np.meshgrid(*3 * [step * np.arange(count)], indexing="ij"),
+                    axis=-1).reshape(-1, 3) + start
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_fine_map_between_the_points_of_a_coarse_one(generator, order):
+    """The coarse one has no point in the fine one, which has all of its own in the coarse one."""
+    shift = np.array([0.0, 0.0, 0.003])
+    maps = pole_maps(generator, (lattice(6, 0.01, 0.0), 0.01, 0 * shift),
+                     (lattice(5, 0.0018, [0.021, 0.021, 0.018]), 0.0018, shift))[::order]
+    joined = join_checked(maps, QUIET)
+    (pose,) = joined.poses
+    assert order * pose.shift_m == pytest.approx(shift, abs=max(5 * pose.shift_sd_m.max(), 1e-6))
+    assert [one.name for one in joined.overlaps] == ["part1"]
+    json.dumps(joined.plain(), allow_nan=False)
+
+
+def test_too_few_points_in_common_are_said(generator):
+    maps = pole_maps(generator, (lattice(3, 0.01, 0.0), 0.01, np.zeros(3)),
+                     (lattice(3, 0.01, 0.0), 0.01, np.zeros(3)))
+    with pytest.raises(MeasurementError, match="shares 40 points"):
+        join_checked(maps, QUIET)

@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import exact_block_field, prism_kernel
-from halbach_fe.solver.exact_block_field import field_of, field_on_circles, gradient_of, unit_field
+from halbach_fe.solver.exact_block_field import (
+    field_of,
+    field_on_circles,
+    gradient_of,
+    unit_field,
+    unit_fields,
+)
 from halbach_fe.solver.prism_kernel import arc_table
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.study.reader import parse_study
@@ -218,10 +224,33 @@ def test_blocks_of_a_ring_are_evaluated_once_on_circles(
     assert len(calls) == evaluated
     assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
     elsewhere = points + generator.uniform(-1e-3, 1e-3, points.shape)
-    np.testing.assert_allclose(field_on_circles(blocks, elsewhere), field_of(blocks, elsewhere),
-                               rtol=1e-12, atol=1e-14)
+    one_by_one = sum(unit_field(block, elsewhere) @ (block.remanence * np.array(block.easy_axis))
+                     for block in blocks)
+    np.testing.assert_allclose(field_on_circles(blocks, elsewhere), one_by_one,
+                               rtol=1e-12, atol=1e-13)
     in_place = build_magnet(short_dipole(array__block={"shape": shape})).blocks  # control
     assert np.abs(field_of(in_place, points) - exact).max() > 1e-7 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("shape", [
+    {"shape": "sector"}, {"shape": "trapezoid", "side_gap_m": 0.001},
+    {"shape": "cuboid", "width_m": 0.02, "orientation": "magnetization"}],
+    ids=lambda shape: shape["shape"])
+def test_blocks_at_once_are_those_one_by_one(short_dipole, generator, monkeypatch, shape):
+    """Blocks that are turned, moved or not uniform share the evaluation of a shape, or do not."""
+    study = short_dipole(array__block=shape, array__outer_radius_m=0.1265, array__exceptions=[
+        {"ring": 1, "slot": 2, "displacement_m": [1e-3, 2e-3, -1e-3]},
+        {"ring": 1, "slot": 3, "rotation_deg": [1.0, -2.0, 3.0]},
+        {"ring": 1, "slot": 4, "magnetization_gradient": 0.1},
+        {"ring": 1, "slot": 5, "inner_corner_loss": 0.5}])
+    blocks, points = build_magnet(study).blocks, scattered(study, generator, 30)
+    for found, block in zip(unit_fields(blocks, points), blocks, strict=True):
+        np.testing.assert_allclose(found, unit_field(block, points), rtol=1e-12, atol=1e-13)
+    # negative control: outlines are not turned onto each other
+    monkeypatch.setattr(exact_block_field, "_turn_deg", lambda block: 0.0)
+    monkeypatch.setattr(exact_block_field, "_upright", lambda outline, angle: outline is None)
+    wrong = next(iter(list(unit_fields(blocks, points))[1:2]))
+    assert np.abs(wrong - unit_field(blocks[1], points)).max() > 1e-4
 
 
 def test_scaling(short_dipole, generator):

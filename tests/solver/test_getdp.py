@@ -336,8 +336,8 @@ def test_getdp_is_found_as_named_then_by_environment_then_on_path(tmp_path, monk
     one = fake(tmp_path, answer)
     assert find_getdp(one.executable).version == "9.9.9"
     assert find_getdp(one.executable).build_options == ("64Bit", "PETSc")
-    assert fake(tmp_path, answer.replace("9.9.9", "9.9.8")).executable == one.executable
-    assert find_getdp(one.executable).version == "9.9.8"  # another file of the same name
+    assert fake(tmp_path, answer.replace("9.9.9", "9.9.80")).executable == one.executable
+    assert find_getdp(one.executable).version == "9.9.80"  # another file of the same name
     fake(tmp_path, answer)
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(one.executable))
     assert find_getdp().version == "9.9.9"
