@@ -623,10 +623,10 @@ def check_magnitudes(data: xr.Dataset) -> None:
             column for column, wrong in zip(FIELD_COLUMNS, beyond, strict=True) if wrong)
         raise MeasurementError(must_be(
             some or "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
-            f"Is it in {unit}, unlike the rest, which is below {MAX_FIELD_T:g}? Then multiply "
-            f"this column of the file by {factor:g}." if some else
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
-            "study, or convert the map by halbach-fe import-map."))
+            "study, or convert the map by halbach-fe import-map." + (
+                f" If only {some} is in {unit}, multiply this column of the file by {factor:g}."
+                if some else "")))
     elif TOTAL_COLUMN in data:
         _check_length(data, where)
     if sigmas is not None:

@@ -315,14 +315,12 @@ def join_maps(
     Examples
     --------
     >>> import halbach_fe as hf
-    >>> from halbach_fe.measurement.field_map import field_map
+    >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
     >>> axis = 0.01 * np.arange(5)
     >>> points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    >>> away = points - [0.1, 0.05, 0.08]  # from the pole of a long magnet
-    >>> there = away + [0.0, 0.0, 0.02]  # another stage, whose zero is 20 mm farther along z
-    >>> maps = {name: field_map(points, 1e-4 * each / np.linalg.norm(each, axis=1)[:, None]**3
-    ...                         + 1e-6 * np.random.default_rng(1).standard_normal(each.shape))
-    ...         for name, each in (("one", away), ("other", there))}
+    >>> maps = {name: hf.field_map(points, magnet.field_T(points + [0.02, 0.02, place])
+    ...                            + 1e-6 * np.random.default_rng(1).standard_normal(points.shape))
+    ...         for name, place in (("one", 0.03), ("other", 0.05))}  # the zero of the stage
     >>> (1e3 * hf.join_maps(maps).poses[0].shift_m).round(0) + 0.0
     array([ 0.,  0., 20.])
     """

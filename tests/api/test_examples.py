@@ -182,7 +182,7 @@ SEEDS = "seed .* a whole number of at least 0; instead received -1"
     (lambda magnet, session: hf.Region.sphere(float("nan")), "half_axes_m .* received nan"),
     (lambda magnet, session: hf.Region.sphere("0.1"), "half_axes_m .* received 0.1"),
     (lambda magnet, session: hf.Region.sphere(-0.1), "half_axes_m .* above 0"),
-    (lambda magnet, session: hf.Region.sphere(100), "at most 10 m; .* in millimetres"),
+    (lambda magnet, session: hf.Region.sphere(100), "below 10 m; .* in millimetres"),
     (lambda magnet, session: hf.Region("cube", (0.01,) * 3), "one of sphere"),
     (lambda magnet, session: hf.Region("cylinder", (0.01, 0.01)), "three numbers"),
     (lambda magnet, session: hf.Region("sphere", (0.01, 0.02, 0.01)), "equal along x, y and z"),

@@ -233,7 +233,7 @@ def test_blocks_of_a_ring_are_evaluated_once_on_circles(
 
 
 @pytest.mark.parametrize("shape", [
-    {"shape": "sector"}, {"shape": "trapezoid", "side_gap_m": 0.001},
+    {"shape": "sector", "angular_gap_deg": 4.0}, {"shape": "trapezoid", "side_gap_m": 0.005},
     {"shape": "cuboid", "width_m": 0.02, "orientation": "magnetization"}],
     ids=lambda shape: shape["shape"])
 def test_blocks_at_once_are_those_one_by_one(short_dipole, generator, monkeypatch, shape):
