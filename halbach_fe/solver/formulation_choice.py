@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,7 +44,7 @@ from halbach_fe.solver.separate_blocks import (
     separate_columns,
     solve_separate,
 )
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
@@ -186,14 +185,8 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
         raise StudyError(must_be("points_m", magnet.name, "finite x, y, z in m: an array (..., 3)",
                                  f"one of shape {points.shape}"))
-    return field_function(magnet, _session_until_exit())(points.reshape(-1, 3)).reshape(
-        points.shape)
-
-
-@cache
-def _session_until_exit() -> Session:
-    """Return the session of all fields of this process whose files nobody keeps."""
-    return Session.temporary()
+    session = NOT_KEPT if magnet.is_vacuum else Session.temporary()  # closed forms write no file
+    return field_function(magnet, session)(points.reshape(-1, 3)).reshape(points.shape)
 
 
 def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:
