@@ -149,6 +149,7 @@ class _InMemory:
     poses: list[Registration] = field(default_factory=list)
     diagnosis: Diagnosis | None = None
     sound: bool = False
+    updated: Magnet = field(init=False)
 
     def __post_init__(self) -> None:
         self.updated = self.magnet

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import write_text
+from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
@@ -94,6 +95,7 @@ def halbach_ring(
     if material is not None and (remanence_T, recoil_permeability) != (None, None):
         raise StudyError(must_be("material", "halbach_ring", "given alone, as it has a remanence "
                                  "and a recoil permeability", "both"))
+    check_number("rings", "halbach_ring", rings, 1, whole=True)
     ring_length = None if length_m is None else length_m / rings
     magnet = new_magnet(MagnetTemplate(
         order, blocks, rings, inner_radius_m, outer_radius_m, ring_length,
@@ -101,7 +103,8 @@ def halbach_ring(
         material=material), name)[0]
     if material is not None:
         return magnet
-    return magnet.with_(array__recoil_permeability=recoil_permeability or 1.0)
+    return magnet.with_(array__recoil_permeability=1.0 if recoil_permeability is None
+                        else recoil_permeability)
 
 
 def magnet_of_blocks(

@@ -205,7 +205,8 @@ def held_back(magnet: Magnet, mean: Floats, sd: Floats, prior: Gaussian) -> tupl
         Of each such block the direction that is farthest off, the farthest block first.
     """
     of = _Changes.of(magnet, mean - prior.mean, prior.sd)
-    after = _Changes.of(magnet, mean - prior.mean, sd).sd if len(of.numbers) else of.sd
+    after = sd[:magnet.dimension * len(magnet.blocks)].reshape(
+        len(magnet.blocks), -1)[of.numbers] / of.size[:, None]
     ratio = np.minimum(after / np.where(of.sd > 0, of.sd, np.inf), np.sqrt(0.5))
     held = (of.away > doubted_from(of.sd.size)) & (of.away * ratio / (1 - ratio**2) > 1)
     found = []

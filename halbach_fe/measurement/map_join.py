@@ -318,10 +318,10 @@ def join_maps(
     >>> magnet = hf.build_magnet(hf.read_study("mri.toml"))
     >>> axis = 0.01 * np.arange(5)
     >>> points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    >>> maps = {name: hf.field_map(points, magnet.field_T(points + [0.02, 0.02, place])
+    >>> maps = {name: hf.field_map(points, magnet.field_T(points + [-0.01, -0.02, place])
     ...                            + 1e-6 * np.random.default_rng(1).standard_normal(points.shape))
     ...         for name, place in (("one", 0.03), ("other", 0.05))}  # the zero of the stage
-    >>> (1e3 * hf.join_maps(maps).poses[0].shift_m).round(0) + 0.0  # doctest: +SKIP
+    >>> (1e3 * hf.join_maps(maps).poses[0].shift_m).round(0) + 0.0
     array([ 0.,  0., 20.])
     """
     if not isinstance(maps, Mapping) or len(maps) < 2:
@@ -370,8 +370,10 @@ def _contradiction(name: str, off_T: float, noise_T: float) -> MeasurementError:
     if not np.isfinite(off_T):
         return MeasurementError(must_be(
             f"map '{name}'", "the maps that are joined", f"one that shares {FEWEST_SHARED} points "
-            "or more with another one", "fewer, in every place", "Measure more of the overlap, or "
-            "find the map's place in the magnet by `halbach-fe register`."))
+            "or more with another one", "fewer, in every place, of those that obey Maxwell's "
+            "equations by themselves", "Measure more of the overlap, or with a smaller spacing "
+            "(`halbach-fe check` of each map names the part that obeys), or find the map's place "
+            "in the magnet by `halbach-fe register`."))
     return MeasurementError(must_be(
         f"map '{name}'", "the maps that are joined", "one that overlaps another one of the same "
         "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT in "

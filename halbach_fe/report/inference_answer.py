@@ -140,7 +140,7 @@ def _of_the_probe(result: InferenceResult) -> str:
                   if not known.offset_T), default=0.0)
     if offset:
         said += (f" They take its offset of {flux_density(offset, 2)} as exact, too. If that was "
-                 "found from the map (by register, say), a magnet's uniform field may be in it: "
+                 "found from the map itself, a magnet's uniform field may be in it: "
                  "state the standard deviation that it had before, [instrument_sd] offset_T.")
     return said
 

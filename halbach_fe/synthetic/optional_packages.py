@@ -20,8 +20,9 @@ def import_extra(module: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise ExtraMissingError(
-            f"Synthetic campaigns need magpylib and NGSolve, but {error.name or module} cannot be "
-            "imported here. Install them: pip install halbach-fe[campaign]") from None
+            "Simulated campaigns, and magnets of magpylib, need magpylib and NGSolve, but "
+            f"{error.name or module} cannot be imported here. Install them: "
+            "pip install halbach-fe[campaign]") from None
 
 
 def version_of(name: str) -> str:
