@@ -165,7 +165,9 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(  # as the `[instrument]` of a study places a map
         points_of(written)[count:], points_of(maps["part1"]) @ turn.T + pose["translation_m"],
         atol=1e-9)
-    assert (out / "joined.html").exists()
+    page = (out / "joined.html").read_text()
+    assert "Where they overlap" in page
+    assert "<h2>Pictures</h2>" not in page  # it has none
     assert (out / "part1" / "check.json").exists()
     assert main(["check", str(tmp_path / "part0.csv"), str(tmp_path / "part0.csv")]) == 2
     with pytest.raises(StudyError, match="two maps or more"):
