@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from numbers import Integral, Real
 
 from halbach_fe.core.errors import StudyError, must_be
@@ -57,6 +58,12 @@ def decimals(value: float, digits: int = 3) -> str:
     if "e" not in text:
         return text
     return f"{float(text):,.0f}".replace(",", "\u202f") if abs(value) > 1 else f"{value:.7f}"
+
+
+def in_a_row(names: Sequence[str]) -> str:
+    """Return names in words: one, two and three."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def parse_number(cell: str) -> float:

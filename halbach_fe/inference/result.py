@@ -31,8 +31,10 @@ from halbach_fe.measurement.doubted_terms import (
     factor_in_words,
     factor_of,
     held_back,
+    held_back_in_words,
     likeness_of,
     shared_doubts,
+    shared_in_words,
     words_of,
 )
 from halbach_fe.measurement.observation import Observation
@@ -289,6 +291,16 @@ class RegionScore:
     coverage95_posterior: float | None
     chi2_prior: float | None
     chi2_posterior: float | None
+
+
+class Reservation(str):
+    """Why an update that agrees with its maps is to be used with care, as its verdict begins.
+
+    Where a text says how a posterior disagrees with its map, one of this class says that it does
+    not, and what is open.
+    """
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True)
@@ -557,6 +569,20 @@ class InferenceResult(ShownInNotebook):
     def held_back(self) -> tuple[Term, ...]:
         """Blocks so far off that their prior is refuted, which holds them back nevertheless."""
         return held_back(self.magnet, self.posterior.mean, self.posterior.sd, self.prior)
+
+    @property
+    def reservation(self) -> Reservation:
+        """Sentences if the update agrees with its maps and is not sound nevertheless, else empty.
+
+        It holds for whatever is computed from the posterior.
+        """
+        if self.disagreement:
+            return Reservation()
+        if self.held_back:
+            measured = self.measured_blocks is not None
+            return Reservation(f"Only in part. {held_back_in_words(self.held_back, measured)}")
+        said = shared_in_words(self.shared_doubts, self.magnet.dimension == 2)
+        return Reservation(f"Only with care. {said}" if said else "")
 
     @property
     def _doubted(self) -> str:

@@ -73,8 +73,11 @@ def distributions_of(
 def disagreement_of(posterior: Mapping[str, Gaussian] | InferenceResult | None) -> str | None:
     """Return how the update of a posterior disagrees with its map; None if that is not known.
 
-    A posterior that is read from a file knows it as the result of `infer` does.
+    If it agrees, that is its reservation, which is empty if it is sound. A posterior that is read
+    from a file knows it as the result of `infer` does.
     """
+    if isinstance(posterior, InferenceResult):
+        return posterior.disagreement or posterior.reservation
     return getattr(posterior, "disagreement", None)
 
 

@@ -18,7 +18,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import ChangedContentError, read_hdf5, with_checksum, write_hdf5
 from halbach_fe.core.tables import csv_text
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult
+from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Reservation
 from halbach_fe.inference.same_magnet import check_same_magnet
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.study.model import Study
@@ -36,7 +36,8 @@ class StoredPosterior(dict[str, Gaussian]):
     Attributes
     ----------
     disagreement : str or None
-        `InferenceResult.disagreement` of the update; None if the file does not state it.
+        `InferenceResult.disagreement` of the update, or else its reservation; None if the file
+        does not state it.
     """
 
     disagreement: str | None = None
@@ -47,6 +48,7 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
     magnetization = update.magnetizations
     magnetization.attrs["study"] = update.study.model_dump_json()
     magnetization.attrs["disagreement"] = update.disagreement
+    magnetization.attrs["reservation"] = str(update.reservation)
     distributions = {"prior": update.prior, "posterior": update.posterior}
     for name, distribution in distributions.items():
         magnetization.update(_stored_root(name, distribution, update.prior))
@@ -77,7 +79,9 @@ def read_posterior(magnet: Magnet, path: Path) -> StoredPosterior:
         own = untrusted.finite_array(data["nominal"], data["nominal"].shape)
         study = Study.model_validate_json(data.attrs["study"])
         if "disagreement" in data.attrs:
-            distributions.disagreement = printable(str(data.attrs["disagreement"]), MAX_SENTENCES)
+            said, open_ = (printable(str(data.attrs.get(name, "")), MAX_SENTENCES)
+                           for name in ("disagreement", "reservation"))
+            distributions.disagreement = said or Reservation(open_)
         for name in ("prior", "posterior"):
             distributions[name] = Gaussian(
                 untrusted.finite_array(data[f"{name}_mean"], own.shape),

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.special as special
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.numbers import decimals
+from halbach_fe.core.numbers import decimals, in_a_row
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.stats.gaussian import Gaussian
 
@@ -133,6 +133,46 @@ def doubts_in_words(found: Sequence[Term]) -> str:
     named = "; ".join(one.in_words for one in found[:MOST_NAMED])
     return ("For that these would have to be changed far beyond what was known before: "
             f"{named}{f'; and {more} more' if more > 0 else ''}.")
+
+
+def shared_in_words(found: Sequence[Term], cross_section: bool) -> str:
+    """Say what all blocks would share far beyond their prior, and what else does the same."""
+    said = []
+    for each in found:
+        turn = each.name != ALL_BLOCKS
+        what = (f"turned by {each.size} about {each.name[-1]}" if turn else
+                f"{decimals(100 * abs(each.value))}\u00a0% "
+                f"{'weaker' if each.value < 0 else 'stronger'}")
+        keys = [] if cross_section else [
+            f"[instrument_sd] {'rotation_rad' if turn else 'gain'}"]
+        keys += [] if turn else ["[prior] common_mode_sd"]
+        said.append(
+            f"All blocks would be {what} together, which is {decimals(each.distance, 2)} standard "
+            f"deviations of what their prior allows ({each.known}). "
+            f"{'A turn of the map' if turn else 'A gain of the instrument'} does the same, and the "
+            "readings cannot tell which it is" + (
+                f": state how far {'either' if len(keys) > 1 else 'the latter'} may be off "
+                f"({' and '.join(keys)}), and update again."
+                if keys else "."))
+    return " ".join(said)
+
+
+def held_back_in_words(blocks: Sequence[Term], measured: bool) -> str:
+    """Say which blocks are so far off that their prior is wrong and still acts; else nothing."""
+    if not blocks:
+        return ""
+    first, one = blocks[0], len(blocks) == 1
+    named = in_a_row([each.name.removeprefix("block ") for each in blocks[:MOST_NAMED]])
+    more = f" and {len(blocks) - MOST_NAMED} more" if len(blocks) > MOST_NAMED else ""
+    return (f"{'Block' if one else 'Blocks'} {named}{more} {'is' if one else 'are'} up to "
+            f"{decimals(first.distance, 2)} standard deviations away from what "
+            f"{'was measured of single blocks' if measured else 'the study says'}, "
+            f"which still draws {'it' if one else 'them'} back: the error bars of "
+            f"{'this block and its' if one else 'these blocks and their'} neighbours are too "
+            "short. Find out what is the matter (diagnose), or " + (
+                "look whether it stands in that slot, " if measured else
+                "state it in the study ([[array.exceptions]], or a wider [prior]), ")
+            + "and update again.")
 
 
 def words_of(name: str) -> tuple[str, str]:

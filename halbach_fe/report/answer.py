@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from halbach_fe.inference.result import Reservation
 from halbach_fe.report.words import in_a_row
 
 STANDS_FOR = {
@@ -155,7 +156,15 @@ def agreement(disagreement: str | None) -> str:
 
 
 def of_a_conflict(question: str, said: str, disagreement: str) -> Answer:
-    """Return an answer from an update that disagrees with its map, which is not to be trusted."""
+    """Return an answer from an update that disagrees with its map, which is not to be trusted.
+
+    One that agrees, but with a `Reservation`, is to be trusted as far as that says.
+    """
+    if isinstance(disagreement, Reservation):
+        return Answer(
+            question, said, f"{disagreement} These numbers are of that update.",
+            "Find out what it is, and update again, before you rely on these numbers.",
+            "halbach-fe infer STUDY --measurements MAP -o DIR", sound=False)
     return Answer(
         question, f"Not known, as model and measurement disagree. If the model were right: {said}",
         f"No. {disagreement}",

@@ -8,7 +8,6 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
-from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, MOST_NAMED
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
@@ -16,7 +15,6 @@ from halbach_fe.report.words import (
     faults_in_words,
     flux_density,
     fraction,
-    in_a_row,
     place_of,
     with_error,
 )
@@ -56,17 +54,16 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         "[inference.held_out] or --held-out.")
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
-    shared = _of_all_blocks(result)
-    single = _of_single_blocks(result)
-    verdict = (f"Only in part. {single} Model" if single else
-               f"Only with care. {shared} But model" if shared else "Yes. Model")
+    single, shared = result.held_back, result.shared_doubts
+    verdict = (f"{result.reservation} {'Model' if single else 'But model'}"
+               if result.reservation else "Yes. Model")
     return Answer(
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         f"{verdict} and readings agree: chi² per reading before the update is "
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
         f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
-        *(LOOK if single or (shared and "update again" not in shared) else
+        *(LOOK if single or (shared and "update again" not in result.reservation) else
           AGAIN if shared else _after_agreement(result)), sound=not (single or shared))
 
 
@@ -82,47 +79,6 @@ def _after_agreement(result: InferenceResult) -> tuple[str, str]:
             f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
             f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
             "DIR/posterior.h5 -o DIR")
-
-
-def _of_all_blocks(result: InferenceResult) -> str:
-    """Say what all blocks would share far beyond their prior, and what else does the same."""
-    said = []
-    for each in result.shared_doubts:
-        turn = each.name != ALL_BLOCKS
-        what = (f"turned by {each.size} about {each.name[-1]}" if turn else
-                f"{decimals(100 * abs(each.value))}\u00a0% "
-                f"{'weaker' if each.value < 0 else 'stronger'}")
-        keys = [] if result.study.dimension == 2 else [
-            f"[instrument_sd] {'rotation_rad' if turn else 'gain'}"]
-        keys += [] if turn else ["[prior] common_mode_sd"]
-        said.append(
-            f"All blocks would be {what} together, which is {decimals(each.distance, 2)} standard "
-            f"deviations of what their prior allows ({each.known}). "
-            f"{'A turn of the map' if turn else 'A gain of the instrument'} does the same, and the "
-            "readings cannot tell which it is" + (
-                f": state how far {'either' if len(keys) > 1 else 'the latter'} may be off "
-                f"({' and '.join(keys)}), and update again."
-                if keys else "."))
-    return " ".join(said)
-
-
-def _of_single_blocks(result: InferenceResult) -> str:
-    """Say which blocks are so far off that their prior is wrong and still acts; else nothing."""
-    blocks = result.held_back
-    if not blocks:
-        return ""
-    first, one = blocks[0], len(blocks) == 1
-    named = in_a_row([each.name.removeprefix("block ") for each in blocks[:MOST_NAMED]])
-    more = f" and {len(blocks) - MOST_NAMED} more" if len(blocks) > MOST_NAMED else ""
-    return (f"{'Block' if one else 'Blocks'} {named}{more} {'is' if one else 'are'} up to "
-            f"{decimals(first.distance, 2)} standard deviations away from what "
-            f"{'was measured of single blocks' if result.measured_blocks else 'the study says'}, "
-            f"which still draws {'it' if one else 'them'} back: the error bars of "
-            f"{'this block and its' if one else 'these blocks and their'} neighbours are too "
-            "short. Find out what is the matter (diagnose), or " + (
-                "look whether it stands in that slot, " if result.measured_blocks else
-                "state it in the study ([[array.exceptions]], or a wider [prior]), ")
-            + "and update again.")
 
 
 def _of_the_probe(result: InferenceResult) -> str:

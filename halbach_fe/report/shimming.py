@@ -237,18 +237,21 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         return of_no_main(question, said, "Not in these units", "shim STUDY --measurements MAP")
     make = ("Make the moves in their order, measure again, and update study.shimmed.toml."
             if shim.shimmed_study else "Make the moves in their order, and measure again.")
-    if reason_against(shim, result):
+    if result.reservation and shim.steps:
+        make = "Find out what it is, and update again, before any block is moved."
+    elif reason_against(shim, result):
         make = f"Leave the magnet as it is. If the gain is worth the work after all: {make}"
     mounted = "" if not shim.steps or shim.study.prior.mounting_sd_deg > 0 else (
         " That blocks are turned a little when they are mounted again is left out, as the study "
         "has no prior.mounting_sd_deg.")
     return Answer(
-        question, said, f"Yes. Model and map agree. {ended}{mounted}", *(
+        question, said,
+        f"{result.reservation or 'Yes. Model and map agree.'} {ended}{mounted}", *(
             (make,
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
-             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")))
+             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")), sound=not result.reservation)
 
 
 def _of_possible(shim: Shim) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.numbers import decimals as decimals
+from halbach_fe.core.numbers import in_a_row as in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.study.model import Study
 
@@ -115,12 +114,6 @@ def share_in_words(share: float, sd: float | None) -> str:
 def counted(number: int, noun: str, plural: str = "") -> str:
     """Return a number and its noun: 1 move, 2 moves."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
-
-
-def in_a_row(names: Sequence[str]) -> str:
-    """Return names in words: one, two and three."""
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
 
 
 def is_fourier(study: Study) -> bool:

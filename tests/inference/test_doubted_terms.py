@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.api import multipoles
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.core.pace import Pace
@@ -28,6 +29,7 @@ from halbach_fe.inference.registration import (
     register,
     turn_from_axes,
 )
+from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.magnets import to_magpylib
 from halbach_fe.measurement.doubted_terms import (
     ALL_AXES,
@@ -54,6 +56,7 @@ from halbach_fe.measurement.instrument import in_si_and_magnet_axes
 from halbach_fe.measurement.instrument_terms import NAMES
 from halbach_fe.measurement.map_check import check_map
 from halbach_fe.report.inference_answer import answer as inference_answer
+from halbach_fe.report.multipoles import answer as multipoles_answer
 from halbach_fe.report.registration import (
     AT_REST,
     DOUBTED,
@@ -335,6 +338,12 @@ def test_a_block_that_its_prior_holds_back_is_named(generator, tmp_path, weak, s
     else:
         assert block == pytest.approx(1 - weak, abs=0.01)
         assert "Only in part" not in said.trust
+    write_inference(result, tmp_path)
+    for known in (result, read_posterior(magnet, tmp_path / "posterior.h5")):
+        found = multipoles(magnet, Session.open(tmp_path), posterior=known)
+        later = multipoles_answer(found.tables, None, found.disagreement)
+        assert later.sound == (not held)
+        assert later.trust.startswith("Only in part. Block" if held else "Yes: the update agrees")
 
 
 def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path):
