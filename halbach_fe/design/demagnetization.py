@@ -48,6 +48,13 @@ SHARES = (0.0, 0.01)
 """Shares of the magnet's volume for which the limit temperature is reported."""
 
 
+ABSOLUTE_ZERO_C = -273.15
+
+LINEAR = 0.25, 2.0
+"""Change of the coercivity up to which its coefficient is believed: that of NdFeB doubles at about
+-145 °C, where its easy axis turns (-138 °C), and linear laws of data sheets end above 1/4."""
+
+
 @dataclass(frozen=True)
 class Cells:
     """Blocks cut into small cells, layer by layer.
@@ -136,8 +143,8 @@ class DemagnetizationMap(ShownInNotebook):
         """Return the highest temperature in °C with at most a share of the volume past the knee.
 
         It is infinite if more of the volume is past the knee at no temperature, and -infinity if at
-        every one. Where `worst_when_cold`, it is the lowest such temperature, and the signs of the
-        infinities are the others.
+        every one above absolute zero. Where `worst_when_cold`, it is the lowest such temperature,
+        and the signs of the infinities are the others.
         """
         material = self.material
         at_reference = -self.along / remanence_factor(material, material.temperature_C)
@@ -154,7 +161,16 @@ class DemagnetizationMap(ShownInNotebook):
         order = np.argsort(sign * limit)
         passed = np.cumsum(self.cells.volumes[order]) / self.cells.volumes.sum()
         first = int(np.searchsorted(passed, share + 1e-12))
-        return float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
+        found = float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
+        return found if found > ABSOLUTE_ZERO_C else -np.inf
+
+    @property
+    def far_from_reference(self) -> float | None:
+        """Factor by which the linear law changes the coercivity, if it is beyond `LINEAR`."""
+        material = self.material
+        factor = float(knee(material, material.temperature_C)
+                       / knee(material, material.reference_temperature_C))
+        return None if LINEAR[0] <= factor <= LINEAR[1] else factor
 
     def by_block(self) -> list[dict[str, Any]]:
         """Return a row per magnetized block: H, margins, and the coercivity that it would need."""

@@ -85,30 +85,35 @@ def answer(found: DemagnetizationMap) -> Answer:
     nonlinear = (" At other temperatures the field of the iron is scaled with the remanence."
                  if is_nonlinear(found.study) else "")
     limit = found.limit_temperature(SHARES[-1])
-    at_room = " It loses magnetization at room temperature already." if (
-        limit > max(ROOM_C, temperature) if found.worst_when_cold
-        else limit < min(ROOM_C, temperature)) else ""
+    room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
+    at_room = " It loses magnetization at room temperature already." if room else ""
+    loses, far = lost > 0 or room, found.far_from_reference
     at = f"at {temperature:g}\u00a0°C"
     reference = found.material.reference_temperature_C
     cooler = "" if temperature == reference else (
         f" The study's remanence counts as that at {reference:g}\u00a0°C.")
     return Answer(
         "Do the blocks keep their magnetization?",
-        f"{'No' if lost > 0 else 'Yes'}: {at}, {start}.{losing} The smallest margin "
+        f"{'Not known' if far else 'No' if loses else 'Yes'}: {at}, "
+        f"{'if the linear law held, ' if far else ''}{start}.{losing} The smallest margin "
         f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{at_room}",
-        "Yes, as far as coercivity and coefficients of the study are right: data sheets state them "
-        "within some per cent. The very edges of blocks are worse than any cell (the option "
-        f"--across makes them smaller); shares of the volume hardly depend on that.{nonlinear}"
-        f"{cooler}",
-        *(("Choose a grade of a higher coercivity for these blocks (the table on the page says "
+        (f"No: the coefficients of the study would make the coercivity {far:.2g} times that at "
+         f"{reference:g}\u00a0°C, and hold only nearer to it. " if far else
+         "Yes, as far as coercivity and coefficients of the study are right: data sheets state "
+         "them within some per cent. ")
+        + "The very edges of blocks are worse than any cell (the option --across makes them "
+        f"smaller); shares of the volume hardly depend on that.{nonlinear}{cooler}",
+        *(("State coercivity and remanence that were measured at about that temperature, and that "
+           "as reference_temperature_C.", "halbach-fe demagnetization STUDY -o DIR") if far else
+          ("Choose a grade of a higher coercivity for these blocks (the table on the page says "
            f"which), or keep the magnet {'warmer' if found.worst_when_cold else 'cooler'}. If it "
            "is built already, a measurement shows what it has lost.",
-           "halbach-fe diagnose STUDY --measurements MAP -o DIR") if lost > 0 else
+           "halbach-fe diagnose STUDY --measurements MAP -o DIR") if loses else
           ("Nothing has to be done at this temperature. Next, see which forces the blocks feel.",
            "halbach-fe forces STUDY -o DIR") if found.study.dimension == 3 else
           ("Nothing has to be done at this temperature. Next, see what the tolerances of the "
            "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")),
-        concern=f"A{at[1:]}, {start}." if lost > 0 else "")
+        concern=f"A{at[1:]}, {start}." if lost > 0 else at_room.strip(), sound=not far)
 
 
 def _limit_in_words(found: DemagnetizationMap, share: float) -> str:

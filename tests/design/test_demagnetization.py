@@ -165,6 +165,41 @@ def test_ferrite_passes_the_knee_in_the_cold(dipole, session, share):
     assert f"passes the knee below {round(limit)} °C" in answer(found).said
 
 
+@pytest.mark.parametrize("coercivity", [260e3, 400e3])
+def test_ferrite_that_is_hot_was_at_room_temperature_before(dipole, session, coercivity):
+    """Nothing of either is past the knee at 100 °C: the weak one loses when it is put together."""
+    found = demagnetization_map(build_magnet(dipole(array__remanence_T=0.4, demagnetization={
+        "intrinsic_coercivity_A_per_m": coercivity, "remanence_coefficient_per_K": -2e-3,
+        "coercivity_coefficient_per_K": 3.5e-3, "temperature_C": 100.0})), session)
+    lost = found.share_beyond(np.array([20.0]))[0]
+    assert (found.share_beyond_now, lost > 0.01) == (0.0, coercivity < 300e3)
+    said = answer(found)
+    assert said.said.startswith("No" if lost > 0.01 else "Yes")
+    assert ("at room temperature already" in said.said) == bool(said.concern) == (lost > 0.01)
+
+
+@pytest.mark.parametrize(("temperature", "far"), [
+    (-270.0, 2.74), (-150.0, 2.02), (-100.0, None), (110.0, None), (160.0, 0.16)])
+def test_a_linear_law_is_not_believed_far_from_room_temperature(warm, temperature, far):
+    """1 - 0.006 (T - 20): NdFeB turns its easy axis at -138 °C, where no data sheet holds."""
+    found = warm(temperature)
+    assert found.far_from_reference == (far and pytest.approx(far, rel=1e-9))
+    said = answer(found)
+    assert said.sound == (far is None)
+    assert said.said.startswith("Not known" if far else ("Yes", "No"))
+    assert ("reference_temperature_C" in said.step) == (far is not None)
+
+
+def test_no_temperature_is_below_absolute_zero(dipole, session):
+    """Of a knee so near the linear law would find the limit at some -300 °C."""
+    found = demagnetization_map(build_magnet(dipole(demagnetization=COLD | {
+        "squareness": 0.3, "temperature_C": 80.0})), session)
+    limit = found.limit_temperature(0.0)
+    assert limit == -np.inf
+    assert found.share_beyond(np.array([-273.15]))[0] > 0
+    assert "at every temperature" in answer(found).said
+
+
 def test_what_is_past_the_knee_anyway_is_not_said_to_pass_it_never(dipole, session):
     found = demagnetization_map(build_magnet(dipole(demagnetization=COLD | {
         "intrinsic_coercivity_A_per_m": 12e3})), session)
