@@ -95,6 +95,7 @@ def halbach_ring(
     if material is not None and (remanence_T, recoil_permeability) != (None, None):
         raise StudyError(must_be("material", "halbach_ring", "given alone, as it has a remanence "
                                  "and a recoil permeability", "both"))
+    check_number("order", "halbach_ring", order, 1)
     check_number("rings", "halbach_ring", rings, 1, whole=True)
     ring_length = None if length_m is None else length_m / rings
     magnet = new_magnet(MagnetTemplate(
@@ -140,6 +141,12 @@ def magnet_of_blocks(
     array([0.0255, 0.    , 0.    ])
     """
     if not isinstance(table, FreeBlocks):
+        if not hasattr(table, "keys") or any(
+                isinstance(table[one], str) or not np.ndim(table[one]) for one in table):
+            raise StudyError(must_be(
+                "table", "magnet_of_blocks", "columns by name, each a list with an element for "
+                "every block", f"a {type(table).__name__} that is none",
+                'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.'))
         columns = {column: _plain(table[column]) for column in table}
         count = max((len(values) for values in columns.values()), default=0)
         columns.setdefault("name", [f"b{number}" for number in range(1, count + 1)])

@@ -101,4 +101,4 @@ def check_number(
         limits = (f" from {low:g} to {high:g}" if math.isfinite(low) and math.isfinite(high) else
                   f" of at least {low:g}" if math.isfinite(low) else "")
         raise StudyError(must_be(name, function, f"a {'whole' if whole else 'finite'} number"
-                                 + limits, value))
+                                 + limits, repr(value) if isinstance(value, str) else value))

@@ -84,6 +84,8 @@ class SortedBlocks(ShownInNotebook):
         Description of the order of the given table.
     alike : dict of str to tuple of int
         Slots that could take the same blocks, by a name for their type.
+    doubts : tuple of str
+        Sentences about a table that may be of another magnet, see `MeasuredPrior`.
     left_over : int
         Number of blocks without a slot.
     has_choice : bool
@@ -100,6 +102,7 @@ class SortedBlocks(ShownInNotebook):
     random: Floats
     own_order: str
     alike: dict[str, tuple[int, ...]]
+    doubts: tuple[str, ...] = ()
 
     @property
     def left_over(self) -> int:
@@ -217,7 +220,8 @@ def sort_blocks(
         (model.homogeneity.of(after), model.homogeneity.of(known))
         if isinstance(model, DeviationModel) else None,
         unit * np.sqrt(random / count),
-        "as numbered" if placed is None else "as placed in the table", alike)
+        "as numbered" if placed is None else "as placed in the table", alike,
+        prior_from_blocks(magnet, result).doubts)
 
 
 def types_in_words(alike: dict[str, tuple[int, ...]]) -> str:

@@ -84,7 +84,8 @@ def field_map(
     B_T : array_like, shape (n, components)
         Readings; NaN where there is none.
     sigma_T : array_like, optional
-        Standard deviation of the noise: one number, or of the shape of ``B_T``.
+        Standard deviation of the noise: one number, one for each reading (n,) or each component,
+        or of the shape of ``B_T``.
     attributes : dict of str to str, optional
     components : sequence of str
         Which components the columns of ``B_T`` are.
@@ -129,7 +130,14 @@ def field_map(
         attrs=dict(attributes or {}))
     data["B_T"].attrs["units"] = "T"
     if sigma_T is not None:
-        data["sigma_T"] = (("point", "component"), of_all(sigma_T), {"units": "T"})
+        sigma = np.array(sigma_T, float)
+        if sigma.shape == (len(points),) != (len(components),):
+            sigma = sigma[:, None]
+        elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
+            raise MeasurementError(must_be(
+                "sigma_T", "field_map", f"one number, or of shape ({len(points)},) or "
+                f"{given.shape}", str(sigma.shape)))
+        data["sigma_T"] = (("point", "component"), of_all(sigma), {"units": "T"})
     return data
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -143,6 +143,13 @@ def _chose(found: SortedBlocks) -> bool:
 
 def answer(found: SortedBlocks) -> Answer:
     """Say what sorting gains over the table's order and over chance, and what to do next."""
+    said = _answer(found)
+    return replace(said, trust=f"Not yet. {' '.join(found.doubts)}", sound=False) if (
+        found.doubts) else said
+
+
+def _answer(found: SortedBlocks) -> Answer:
+    """Return the answer of a table that is of this magnet."""
     best, own = found.best.rms_of_mean, found.numbered.rms_of_mean
     low, high = np.quantile(found.random, QUANTILES[::2])
     if isinstance(found.model, DeviationModel):

@@ -181,9 +181,15 @@ def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
 
 def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
-    points = np.asarray(points_m, float)
+    try:
+        points: Floats = np.ma.filled(np.ma.asarray(points_m, float), np.nan)
+    except (TypeError, ValueError):  # text, or rows of different lengths
+        raise StudyError(must_be("points_m", magnet.name, "x, y, z in m: an array (..., 3)",
+                                 f"a {type(points_m).__name__} that is none")) from None
     if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
+        missing = points.ndim and points.shape[-1] == 3
         raise StudyError(must_be("points_m", magnet.name, "finite x, y, z in m: an array (..., 3)",
+                                 "values that are not finite" if missing else
                                  f"one of shape {points.shape}"))
     session = NOT_KEPT if magnet.is_vacuum else Session.temporary()  # closed forms write no file
     return field_function(magnet, session)(points.reshape(-1, 3)).reshape(points.shape)

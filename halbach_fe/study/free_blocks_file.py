@@ -340,6 +340,6 @@ def _sentence(error: ValidationError, rows: Callable[[int], str], where: str) ->
     if given is None:
         return must_be(what, where, "given", "nothing")
     if not isinstance(given, int | float):
-        return must_be(what, where, sentences.expected(first), "something else")
+        return must_be(what, where, sentences.expected(first), sentences.received(given))
     return must_be(what, where, sentences.expected(first), f"{given:g}",
                    sentences.wrong_unit(str(column), given, first.get("ctx", {})))

@@ -166,8 +166,8 @@ def _sentence(error: ValidationError, where: str) -> str:
             hint = f"Add the key, as one of {', '.join(map(repr, tags))}."
     elif kind == "tuple_type" and isinstance(value, dict) and _holds_tables(model, first["loc"]):
         hint = f"Write [[{key}]] for [{key}], and once more for each further one."
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        hint = sentences.wrong_unit(key, value, first.get("ctx", {})) or "Correct the value."
+    else:
+        hint = sentences.hint(key, first)
     return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
 
 

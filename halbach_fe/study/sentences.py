@@ -90,6 +90,9 @@ WRONG_UNITS = (
 DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius_scale")
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
+MOST_DEVIATION = 0.5
+"""From 1, up to which a number is taken for a whole factor."""
+
 ZERO_C_IN_K = 273.15
 
 MOST_PER_K = 0.02
@@ -124,9 +127,29 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     return ""
 
 
+CURVE = ('Name a steel, { kind = "steel", name = "aisi_1010" }, or a file of pairs with the header '
+         'H_A_per_m,B_T: { kind = "table", file = "steel.csv" }.')
+"""What a curve of iron is, where pairs or a name stand in its place."""
+
+
+def hint(key: str, error: ErrorDetails) -> str:
+    """Return what to do about a value, of another type, unit or size; empty if nobody knows."""
+    value, kind = error.get("input"), error["type"]
+    if key.endswith(".curve"):
+        return CURVE
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return ""
+    if kind != "tuple_type":
+        return wrong_unit(key, value, error.get("ctx", {})) or "Correct the value."
+    deviation = wrong_unit(key, value, {"le": MOST_DEVIATION})
+    return f"Write it in brackets, an element for each axis or part. {deviation}".strip()
+
+
 def expected(error: ErrorDetails) -> str:
     """Return what a value must be."""
     given = error.get("ctx", {})
+    if error["type"] == "union_tag_not_found" and not isinstance(error["input"], Mapping):
+        return EXPECTED["model_type"]
     if error["type"] == "string_pattern_mismatch":
         return PATTERNS.get(given["pattern"], "a text of other characters")
     kind = error["type"]

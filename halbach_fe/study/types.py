@@ -198,9 +198,11 @@ class StudyModel(BaseModel):
             return type(self).model_validate(values)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            key = ".".join(map(str, first["loc"])) or "the whole"
+            key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}"
+                          for part in first["loc"]).lstrip(".") or "the whole"
             if (ours := sentences.contradiction(first)) is not None:
                 raise StudyError(
                     f"Input `{key}` of {where} must be consistent: {ours}.") from None
             raise StudyError(must_be(f"`{key}`", where, sentences.expected(first),
-                                     sentences.received(first["input"]))) from None
+                                     sentences.received(first["input"]),
+                                     sentences.hint(key, first))) from None

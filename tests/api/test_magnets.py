@@ -135,11 +135,34 @@ def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([1, 2]), "x, y, z"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([0.03, 0, 0]),
      "in air"),
+    (lambda: hf.halbach_ring("dipole", inner_radius_m=0.02, outer_radius_m=0.04),
+     "order of halbach_ring must be .* received 'dipole'"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T("0, 0, 0"),
+     "a str that is none"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([[0, np.nan, 0]]),
+     "values that are not finite"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T(
+        np.ma.masked_less([[0.0, -1.0, 0.0]], 0)), "values that are not finite"),
+    (lambda: hf.magnet_of_blocks({"shape": "cuboid", "x_m": 0.0}), "columns by name"),
+    (lambda: hf.magnet_of_blocks([{"shape": "cuboid", "x_m": 0.0}]), "a list that is none"),
+    (lambda: hf.magnet_of_blocks({"shape": ["sphere"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0],
+                                  "radius_m": [0.01], "remanence_T": [1.3]}), "received 'sphere'"),
+    (lambda: hf.field_map(np.zeros((9, 3)), np.zeros((9, 3)), np.full(8, 1e-5)), "sigma_T"),
     (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]]), "of shapes"),
     (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]], components=["x", "Bz"]), "out of x, y, z")])
 def test_mistakes_get_a_sentence(call, said):
     with pytest.raises(hf.HalbachError, match=said):
         call()
+
+
+def test_noise_of_each_reading_is_that_of_its_components():
+    """One sigma a reading, one a component, and one for each value."""
+    sigma = np.arange(1.0, 6.0)
+    points, field = np.zeros((5, 3)), np.ones((5, 3))
+    full = np.tile(sigma[:, None], 3)
+    for given, expected in ((sigma, full), (full, full), ([1.0, 2.0, 3.0], full[:3, :1].T)):
+        found = hf.field_map(points, field, given)["sigma_T"].values
+        np.testing.assert_array_equal(found, np.broadcast_to(expected, (5, 3)))
 
 
 def test_the_version_is_that_of_the_package():

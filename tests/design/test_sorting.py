@@ -12,6 +12,7 @@ from halbach_fe.design.sorting import sort_blocks
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.report.sorting import answer
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.bodies import magnet_of
@@ -174,6 +175,21 @@ def test_where_there_is_no_choice_it_is_said(session):
     table, _ = coil_table(study, nominal, nominal, COIL_SD, np.random.default_rng(0))
     with pytest.warns(HalbachWarning, match="nothing to sort"):
         sort_blocks(build_magnet(study), table, model, np.random.default_rng(0))
+
+
+@pytest.mark.usefixtures("few_starts")
+def test_a_table_of_other_blocks_is_not_sorted_with_a_yes(session):
+    """All moments 30 % larger than the blocks'; control: the same order without that doubt."""
+    study = study_of(**CUBES)
+    magnet = build_magnet(study)
+    model = multipole_model(magnet, MultipoleReference(RADIUS, ORDERS), session)
+    _, table = blocks(study, 8)
+    with pytest.warns(HalbachWarning, match=r"\d\d % stronger"):
+        found = sort_blocks(magnet, replace(table, moment=1.3 * table.moment), model,
+                            np.random.default_rng(1))
+    said = answer(found)
+    assert (said.trust[:8], said.sound) == ("Not yet.", False)
+    assert answer(replace(found, doubts=())).sound
 
 
 def test_the_seed_decides(session):

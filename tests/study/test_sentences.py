@@ -102,6 +102,11 @@ def test_every_kind_of_error_has_a_sentence():
     ({"maps": {"name": "a", "file": "a.csv"}}, "`maps` of study must be a list; instead received a "
      "table. Write [[maps]] for [maps], and once more for each further one."),
     ({"instrument": {"gain": {"x": 0.1}}}, "must be a list; instead received a table."),
+    ({"iron_ring__curve": [[0, 0], [100, 1]]}, "a list of 2. Name a steel, { kind = \"steel\""),
+    ({"iron_ring__curve": "aisi_1010"}, "'aisi_1010'. Name a steel, { kind = \"steel\""),
+    ({"instrument": {"gain": 1.02}}, "a list; instead received 1.02. Write it in brackets, an "
+     "element for each axis or part. It is the deviation from 1: if 1.02 is the whole factor, "
+     "write 0.02;"),
     ({"maps": [{"name": "a", "file": ""}]}, "`maps[0].file` of study must be a text of 1 or more"),
     ({"demagnetization": {"irreversible": "maybe"}}, "`demagnetization"),
 ])

@@ -398,6 +398,8 @@ def test_no_number_is_nan_or_infinite():
     ({"array__remanence": 1.2}, "Did you mean `remanence_T`?"),
     ({"zzz": "red"}, "Known keys here: name, "),
     ({"iron_ring__relative_permeability": 500.0}, "instead received nothing. Give `iron_ring`"),
+    ({"instrument": {"gain": [1.02, 1, 1]}}, "1.02 is the whole factor, write 0.02;"),
+    ({"array__inner_radius_m": 50.0}, "Was it meant in millimetres? Then write 0.05."),
     ({"dimension__x": 2}, "`dimension` of changed Study must be a table")])
 def test_with_refuses_keys_and_tables_that_are_not_there(change, said):
     """A slip in a name was a TypeError, or an AttributeError of None."""
