@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import OutputError, StudyError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
@@ -29,6 +29,9 @@ from halbach_fe.study.free_blocks_file import validated_blocks, write_free_block
 from halbach_fe.study.model import Study
 from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
 from halbach_fe.synthetic.optional_packages import import_extra
+
+WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
+"""First line of the studies that `write_study` writes."""
 
 LEAST_SIGMA_T = 1e-6
 """Noise of the best probes in T."""
@@ -207,7 +210,7 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     Raises
     ------
     OutputError
-        If a file cannot be written.
+        If a file cannot be written, or is there already and was not written by this function.
 
     Examples
     --------
@@ -220,9 +223,15 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     study = magnet.study if isinstance(magnet, Magnet) else magnet
     path, table = Path(path), study.array.free_blocks
     blocks = f"{path.stem}.blocks.csv"
+    ours = path.is_file() and path.read_bytes().startswith(WRITTEN.encode())
+    for file in (path, *([] if table is None else [path.with_name(blocks)])):
+        if file.exists() and not ours:
+            raise OutputError(must_be(
+                "path", "write_study", "a new file, or one that this function wrote",
+                f"{str(file)!r}, which would be lost", "Choose another name, or remove it."))
     if table is not None:
         write_free_blocks(table, path.with_name(blocks))
-    write_text(path, study_text(study, blocks))
+    write_text(path, WRITTEN + study_text(study, blocks))
 
 
 def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:

@@ -101,6 +101,26 @@ def test_a_study_is_written_and_read_back(tmp_path):
     assert hf.read_study(tmp_path / "few.toml") == other.study
 
 
+def test_a_study_that_somebody_wrote_is_not_replaced(tmp_path):
+    """Its comments would be lost. Control: what the function wrote itself is replaced."""
+    magnet, path = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04), tmp_path / "a.toml"
+    hf.write_study(magnet, path)
+    hf.write_study(magnet.with_(array__remanence_T=1.1), path)
+    assert hf.read_study(path).array.remanence_T == 1.1
+    mine = "# our magnet\n" + path.read_text().partition("\n")[2]
+    path.write_text(mine)
+    with pytest.raises(hf.HalbachError, match="which would be lost"):
+        hf.write_study(magnet, path)
+    assert path.read_text() == mine
+    table = tmp_path / "b.blocks.csv"  # of which the study b.toml would write one
+    table.write_text("mine")
+    with pytest.raises(hf.HalbachError, match=r"b\.blocks\.csv.* would be lost"):
+        hf.write_study(hf.magnet_of_blocks({
+            "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
+            "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]}), tmp_path / "b.toml")
+    assert table.read_text() == "mine"
+
+
 def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator):
     """The truth is magpylib's: one block is 2 % weak. No file and no folder is named."""
     monkeypatch.chdir(tmp_path)
