@@ -167,10 +167,13 @@ class DemagnetizationMap(ShownInNotebook):
     @property
     def far_from_reference(self) -> float | None:
         """Factor by which the linear law changes the coercivity, if it is beyond `LINEAR`."""
-        material = self.material
-        factor = float(knee(material, material.temperature_C)
-                       / knee(material, material.reference_temperature_C))
+        factor = self.coercivity_factor(self.material.temperature_C)
         return None if LINEAR[0] <= factor <= LINEAR[1] else factor
+
+    def coercivity_factor(self, temperature_C: float) -> float:
+        """Return the coercivity at a temperature by the linear law, over that of the reference."""
+        return float(knee(self.material, temperature_C)
+                     / knee(self.material, self.material.reference_temperature_C))
 
     def by_block(self) -> list[dict[str, Any]]:
         """Return a row per magnetized block: H, margins, and the coercivity that it would need."""

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.design.demagnetization import SHARES, DemagnetizationMap, knee, write_vtu
+from halbach_fe.design.demagnetization import LINEAR, SHARES, DemagnetizationMap, knee, write_vtu
 from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
@@ -88,23 +88,28 @@ def answer(found: DemagnetizationMap) -> Answer:
     room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
     at_room = " It loses magnetization at room temperature already." if room else ""
     loses, far = lost > 0 or room, found.far_from_reference
+    # what is past the knee at a temperature on the way, where the law holds, is lost
+    sure = room or (lost > 0 and math.isfinite(limit)
+                    and LINEAR[0] <= found.coercivity_factor(limit) <= LINEAR[1])
     at = f"at {temperature:g}\u00a0°C"
     reference = found.material.reference_temperature_C
     cooler = "" if temperature == reference else (
         f" The study's remanence counts as that at {reference:g}\u00a0°C.")
     return Answer(
         "Do the blocks keep their magnetization?",
-        f"{'Not known' if far else 'No' if loses else 'Yes'}: {at}, "
+        f"{'Not known' if far and not sure else 'No' if loses else 'Yes'}: {at}, "
         f"{'if the linear law held, ' if far else ''}{start}.{losing} The smallest margin "
         f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{at_room}",
-        (f"No: the coefficients of the study would make the coercivity {far:.2g} times that at "
+        (f"{'Only that it loses some' if sure else 'No'}: the coefficients of the "
+         f"study would make the coercivity {far:.2g} times that at "
          f"{reference:g}\u00a0°C, and hold only nearer to it. " if far else
          "Yes, as far as coercivity and coefficients of the study are right: data sheets state "
          "them within some per cent. ")
         + "The very edges of blocks are worse than any cell (the option --across makes them "
         f"smaller); shares of the volume hardly depend on that.{nonlinear}{cooler}",
-        *(("State coercivity and remanence that were measured at about that temperature, and that "
-           "as reference_temperature_C.", "halbach-fe demagnetization STUDY -o DIR") if far else
+        *(("State coercivity and remanence that were measured nearer to that temperature, and "
+           "theirs as reference_temperature_C.", "halbach-fe demagnetization STUDY -o DIR")
+          if far and not sure else
           ("Choose a grade of a higher coercivity for these blocks (the table on the page says "
            f"which), or keep the magnet {'warmer' if found.worst_when_cold else 'cooler'}. If it "
            "is built already, a measurement shows what it has lost.",
