@@ -144,8 +144,9 @@ def _chose(found: SortedBlocks) -> bool:
 def answer(found: SortedBlocks) -> Answer:
     """Say what sorting gains over the table's order and over chance, and what to do next."""
     said = _answer(found)
-    return replace(said, trust=f"Not yet. {' '.join(found.doubts)}", sound=False) if (
-        found.doubts) else said
+    return said if not found.doubts else replace(
+        said, trust=f"Not yet. {' '.join(found.doubts)}", sound=False,
+        step="Answer this first, and sort again.", command="halbach-fe sort STUDY BLOCKS -o DIR")
 
 
 def _answer(found: SortedBlocks) -> Answer:

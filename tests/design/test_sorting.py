@@ -189,6 +189,7 @@ def test_a_table_of_other_blocks_is_not_sorted_with_a_yes(session):
                             np.random.default_rng(1))
     said = answer(found)
     assert (said.trust[:8], said.sound) == ("Not yet.", False)
+    assert "Assemble" not in said.step
     assert answer(replace(found, doubts=())).sound
 
 
