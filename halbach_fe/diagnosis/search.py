@@ -47,6 +47,9 @@ MAX_PLACE_STEPS, PLACE_TOLERANCE = 20, 0.1
 """Largest number of steps that improve a place, and the length in standard deviations of a step
 that ends them."""
 
+SHOWN_PROBABILITY = 1e-3
+"""Probability of a candidate below which it is not asked what would be otherwise with it."""
+
 Say = Callable[[str], None]
 """A callable that reports progress; its argument is a line of text."""
 Signatures = dict[tuple[str, Place], Floats]
@@ -612,6 +615,38 @@ def with_rivals(
                     known.sd**2 + odds @ np.array(more)) / (1 + odds.sum())), 0.0)
     return tuple(replace(effect, sd=np.sqrt(variance), rivals=rivals)
                  for effect, variance, rivals in zip(identified, variances, every, strict=True))
+
+
+def with_further_causes(
+    search: Search, identified: Sequence[IdentifiedEffect], probabilities: Floats
+) -> tuple[IdentifiedEffect, ...]:
+    """Return identified effects whose error bars contain that one more effect may be missing.
+
+    Amplitudes are a mixture of those beside every further candidate, each at the best place of its
+    effect, and of those without any. ``probabilities`` (candidates,) are those of one more.
+    """
+    own = [search.hypotheses.index(effect.hypothesis) for effect in identified]
+    beside = [replace(effect.selection, candidate=search.candidates[number])
+              for effect, number in zip(identified, own, strict=True)]
+    best: dict[str, tuple[float, int]] = {}
+    total: dict[str, float] = {}
+    for number, probability in enumerate(probabilities.tolist()):
+        name = search.candidates[number].effect
+        best[name] = max(best.get(name, (0.0, -1)), (probability, number))
+        total[name] = total.get(name, 0.0) + probability
+    variances = [effect.sd**2 for effect in identified]
+    known = amplitudes(search, beside)
+    for name, (probability, number) in best.items():
+        if probability < SHOWN_PROBABILITY or number in (*search.rough, *own):
+            continue
+        with_more = amplitudes(search, [*beside, SelectedEffect(
+            search.candidates[number], 0.0, 0.0, ())])
+        for k, (one, other) in enumerate(zip(known, with_more, strict=False)):
+            if len(one.values) == len(variances[k]):
+                variances[k] += total[name] * np.maximum(
+                    other.sd**2 + (other.values - one.values)**2 - one.sd**2, 0.0)
+    return tuple(replace(effect, sd=np.where(effect.sd > 0, np.sqrt(variance), 0.0))
+                 for effect, variance in zip(identified, variances, strict=True))
 
 
 def _of_all_parts(
