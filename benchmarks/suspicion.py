@@ -39,13 +39,7 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import NominalSolver, Search, identify_effects, score_hypotheses
-from halbach_fe.diagnosis.unknown_cause import (
-    SUSPECTED,
-    Further,
-    families_of,
-    judge,
-    suspicions,
-)
+from halbach_fe.diagnosis.unknown_cause import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult

@@ -227,8 +227,9 @@ def _diagnose(
     if not starts:  # which are places that explain the map
         pace.begin("looking where the map lies")
         poses, corrected = find_poses(corrected, data, _subsession(session, "pose"), say)
-    campaign = Campaign.of(corrected, data, validation_map)
     blocks = blocks_of(blocks, study, corrected)
+    campaign = replace(Campaign.of(corrected, data, validation_map),
+                       blocks=beside_amplitudes(blocks, corrected))
     signatures: Signatures = {}
     solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
     first: tuple[InferenceResult, Search] | None = None

@@ -23,6 +23,7 @@ from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.inference.infer import with_instruments
 from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.result import InstrumentTerms
+from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
@@ -111,10 +112,13 @@ class Campaign:
         Those that the study lists, or the only one; and the validation map, if there is one.
     data : Dataset or dict of str to Dataset
         The maps themselves, without a validation map.
+    blocks : BlockTable or None
+        Measured blocks, which a study with effects must be able to have.
     """
 
     maps: tuple[ScannedMap, ...]
     data: xr.Dataset | Mapping[str, xr.Dataset]
+    blocks: BlockTable | None = None
 
     @classmethod
     def of(

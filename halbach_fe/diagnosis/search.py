@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import HalbachError
+from halbach_fe.core.errors import HalbachError, HalbachWarning
 from halbach_fe.core.pace import Progress
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
@@ -37,6 +38,7 @@ from halbach_fe.diagnosis.screening import (
 )
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.mesh import with_rough_mesh
@@ -546,13 +548,20 @@ def identify_effects(
 
 
 def possible(study: Study, identified: Sequence[IdentifiedEffect], campaign: Campaign) -> bool:
-    """Tell whether a valid study can have effects of these amplitudes, with all points in air."""
+    """Tell whether a valid study can have effects of these amplitudes, with all points in air, and
+    with the blocks that were measured.
+    """
     if any(value < parameter.minimum for effect in identified
            for value, parameter in zip(effect.values, effect.parameters, strict=True)):
         return False
     try:
         changed = apply_effects(study, identified)
-        inside = build_magnet(changed).contains(campaign.points_of(changed))
+        magnet = build_magnet(changed)
+        inside = magnet.contains(campaign.points_of(changed))
+        if campaign.blocks is not None and identified:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", HalbachWarning)
+                prior_from_blocks(magnet, campaign.blocks)
     except (HalbachError, ValidationError):  # an amplitude beyond its key's limits is the latter
         return False
     return not inside.any()
