@@ -16,10 +16,13 @@ from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.search import Search, amplitudes, with_further_causes, with_rivals
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference import infer as module_of_infer
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import with_memory, without_memory
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.study.magnet import Neighbour
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
@@ -210,3 +213,30 @@ def test_bars_contain_that_a_cause_may_be_missing_which_nothing_shows():
     alone, mixed = np.sqrt(np.mean(np.square(found), axis=0))
     assert 0.75 < mixed < 1.2  # wide amplitudes have half of the prior, and are not drawn
     assert alone > 5
+
+
+def test_blocks_of_a_neighbour_deviate(session, monkeypatch):
+    """Truth by magpylib, with a neighbour whose blocks deviate: it alone is named, and the update
+    is as sure as it may be. As if they were nominal, which is the control, it is far off.
+    """
+    generator, middle = np.random.default_rng(3), 0.26
+    true, other = drawn(STUDY, generator), drawn(STUDY, generator)
+    away = field(STUDY, other, POINTS - [0.0, 0.0, middle])
+    shown = field(STUDY, true, POINTS) + away
+    data = field_map(POINTS, shown + NOISE_T * generator.standard_normal(shown.shape))
+    effects = [one for one in catalogue() if one.name in (
+        "neighbour_magnet", "background", "gain_x")]
+    found = diagnose(STUDY, data, session, effects=effects)
+    assert [one.hypothesis.effect.name for one in found.identified] == ["neighbour_magnet"]
+
+    stated = STUDY.with_(external__neighbours=(Neighbour(z_m=middle),))
+
+    def chi2():
+        result = infer(build_magnet(stated), data, session)
+        off = true.ravel() / MU_0 - result.posterior.mean
+        return off @ np.linalg.solve(result.posterior.covariance, off) / len(off)
+
+    assert chi2() < 1.5  # of 36 to 108 magnetizations, whose sd is below 0.25
+    monkeypatch.setattr(module_of_infer, "neighbour_deviations",
+                        lambda magnet, points: np.zeros((1, *points.shape)))
+    assert chi2() > 3
