@@ -317,8 +317,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
     sources = [title_of(name, titles) for name in names if name in OTHER_SOURCES]
     if "neighbour_magnet" in names and sources:
         sentences.append(
-            f"{in_a_row(sources).capitalize()} may be what the blocks of the neighbouring magnet "
-            "deviate from nominal, which its model does not have.")
+            f"{in_a_row(sources).capitalize()} may be how the neighbouring magnet differs from a "
+            "copy of this one, which its model is.")
     unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                for effect in diagnosis.identified
                if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
