@@ -39,7 +39,7 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import NominalSolver, Search, identify_effects, score_hypotheses
-from halbach_fe.diagnosis.unknown_cause import SUSPECTED, families_of, judge, suspicions
+from halbach_fe.diagnosis.unknown_cause import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
@@ -117,7 +117,8 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
             suspected: list[list[Any]] = []
             if probability_at_most(search, named) >= SUSPECTED:
                 judgement = judge(search, update, named, flexible)
-                suspected = _listed(suspicions(judgement, STUDY, search))
+                suspected = _listed(suspicions(
+                    judgement, Further.of(judgement), STUDY, search))
             if named and suspected:
                 whole = diagnose(STUDY, data, replace(session, folder=session.folder / str(seed)),
                                  effects=effects)

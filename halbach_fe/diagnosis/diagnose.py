@@ -57,7 +57,14 @@ from halbach_fe.diagnosis.position_noise import (
     have_settled,
     with_position_noise,
 )
-from halbach_fe.diagnosis.result import Diagnosis, Floor, IdentifiedEffect, Suspicion, UnknownCause
+from halbach_fe.diagnosis.result import (
+    Diagnosis,
+    Floor,
+    IdentifiedEffect,
+    Imitation,
+    Suspicion,
+    UnknownCause,
+)
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
     NominalSolver,
@@ -68,6 +75,7 @@ from halbach_fe.diagnosis.search import (
     identify_effects,
     possible,
     score_hypotheses,
+    with_further_causes,
     with_rivals,
     with_short_steps,
 )
@@ -75,9 +83,11 @@ from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by
 from halbach_fe.diagnosis.summary import place_in_words
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.diagnosis.unknown_cause import (
+    Further,
     Judgement,
     describe_unknown,
     families_of,
+    imitated,
     judge,
     named_effects,
     suspicions,
@@ -217,8 +227,9 @@ def _diagnose(
     if not starts:  # which are places that explain the map
         pace.begin("looking where the map lies")
         poses, corrected = find_poses(corrected, data, _subsession(session, "pose"), say)
-    campaign = Campaign.of(corrected, data, validation_map)
     blocks = blocks_of(blocks, study, corrected)
+    campaign = replace(Campaign.of(corrected, data, validation_map),
+                       blocks=beside_amplitudes(blocks, corrected))
     signatures: Signatures = {}
     solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
     first: tuple[InferenceResult, Search] | None = None
@@ -335,13 +346,20 @@ def _diagnose(
                              floor_T, time_limit_s, left)
     unknown: UnknownCause | None = None
     suspected: tuple[Suspicion, ...] = ()
+    imitation: Imitation | None = None
+    further: Further | None = None
     if not solver_error:
         unknown = describe_unknown(judgement, update, search, identified)
-        if unknown is None and answer == number + 1:
-            suspected = suspicions(judgement, corrected, search)
+        if unknown is None:
+            further = Further.of(judgement)
+            imitation = imitated(judgement, further, update, search)
+            if answer == number + 1:
+                suspected = suspicions(judgement, further, corrected, search)
     if unknown is not None and unknown.alone and not start and not position_noise:
         update, search = first
     identified = with_rivals(search, identified)
+    if further is not None:
+        identified = with_further_causes(search, identified, further.probabilities)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     in_model = [column for number in numbers for column in search.candidates[number].columns]
     limits = detection_limits(update, campaign, search.columns[:, in_model])
@@ -361,7 +379,7 @@ def _diagnose(
         loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
         answer=answer, gross_errors=gross_errors, poses=poses, outliers=outliers,
         position_noise=position_noise,
-        solver_error=solver_error, converged=converged, positions=positions,
+        solver_error=solver_error, imitated=imitation, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)
 

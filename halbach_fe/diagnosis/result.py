@@ -108,6 +108,28 @@ class Suspicion:
 
 
 @dataclass(frozen=True)
+class Imitation:
+    """Effects that may be missing without any reading to show it, as the blocks imitate them.
+
+    With one of them the magnetizations of an update are off by more than their error bars: their
+    chi-squared per parameter is above 2.
+
+    Attributes
+    ----------
+    probability : float
+        Posterior probability that such an effect is missing, if at most one more is.
+    effects : tuple of str
+        Names of the likeliest of them.
+    shares : tuple of float
+        Probability of each of these.
+    """
+
+    probability: float
+    effects: tuple[str, ...]
+    shares: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class UnknownPart:
     """One term of a discrepancy that no effect of the catalogue explains.
 
@@ -253,6 +275,8 @@ class Diagnosis(ShownInNotebook):
         The discrepancy that the identified effects leave, if there is one.
     suspected : tuple of Suspicion
         What is likelier than not to be missing, but not certain enough to be named.
+    imitated : Imitation or None
+        What may be missing that blocks imitate, if it is not improbable.
     probabilities : dict
         Posterior probability of each effect by name, and of ``none``, on the assumption that at
         most one effect is missing from the corrected study. Effects that explain too little to be
@@ -327,6 +351,7 @@ class Diagnosis(ShownInNotebook):
     outliers: tuple[Outlier, ...] = ()
     position_noise: tuple[PositionNoise, ...] = ()
     solver_error: SolverErrorExplanation | None = None
+    imitated: Imitation | None = None
     converged: bool = True
     positions: tuple[PossiblePosition, ...] = ()
     limits: DetectionLimits | None = None

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError
@@ -22,9 +23,11 @@ from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.inference.infer import with_instruments
 from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.result import InstrumentTerms
+from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import is_total_field, points_of
 from halbach_fe.measurement.instrument import (
+    check_components,
     check_total_field,
     in_si_and_magnet_axes,
     map_time,
@@ -55,6 +58,8 @@ class ScannedMap:
         From 0 to 1.
     rows : slice
         Of its points among those of all maps.
+    missing : ndarray of bool, shape (n, 3)
+        Which components were not read.
     is_total : bool
         Whether it is a map of |B| alone.
     """
@@ -67,17 +72,25 @@ class ScannedMap:
     points: Floats
     time: Floats
     rows: slice
+    missing: NDArray[np.bool_]
     is_total: bool = False
 
     def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
-        """Tell whether the map can show an effect: |B| has one sensor, without axes."""
+        """Tell whether the map can show an effect, and be corrected for it.
+
+        |B| has one sensor, without axes; a planar Hall effect needs all components.
+        """
         if not effect.can_show(self.points):
             return False
-        if effect.kind == "field" or not self.is_total:
-            return not effect.of_total_field
+        if effect.kind == "field" or effect.of_total_field:
+            return self.is_total or not effect.of_total_field
         try:
             for values in np.diag([parameter.sd for parameter in effect.parameters]).tolist():
-                check_total_field(effect.apply(study, place, values).instrument)
+                instrument = effect.apply(study, place, values).instrument
+                if self.is_total:
+                    check_total_field(instrument)
+                else:
+                    check_components(instrument, self.missing)
         except MeasurementError:
             return False
         return True
@@ -99,10 +112,13 @@ class Campaign:
         Those that the study lists, or the only one; and the validation map, if there is one.
     data : Dataset or dict of str to Dataset
         The maps themselves, without a validation map.
+    blocks : BlockTable or None
+        Measured blocks, which a study with effects must be able to have.
     """
 
     maps: tuple[ScannedMap, ...]
     data: xr.Dataset | Mapping[str, xr.Dataset]
+    blocks: BlockTable | None = None
 
     @classmethod
     def of(
@@ -117,7 +133,7 @@ class Campaign:
             found.append(ScannedMap(
                 one.name, one.probe, one.pose, number if listed else None, one.is_validation,
                 points, map_time(one.data), slice(first, first + len(points)),
-                is_total_field(one.data)))
+                np.isnan(one.data["B_T"].values), is_total_field(one.data)))
             first += len(points)
         return cls(tuple(found), data)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import HalbachError
+from halbach_fe.core.errors import HalbachError, HalbachWarning
 from halbach_fe.core.pace import Progress
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
@@ -37,6 +38,7 @@ from halbach_fe.diagnosis.screening import (
 )
 from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.mesh import with_rough_mesh
@@ -46,6 +48,9 @@ from halbach_fe.study.model import FIELD_KEYS, Study
 MAX_PLACE_STEPS, PLACE_TOLERANCE = 20, 0.1
 """Largest number of steps that improve a place, and the length in standard deviations of a step
 that ends them."""
+
+SHOWN_PROBABILITY = 1e-3
+"""Probability of a candidate below which it is not asked what would be otherwise with it."""
 
 Say = Callable[[str], None]
 """A callable that reports progress; its argument is a line of text."""
@@ -543,13 +548,20 @@ def identify_effects(
 
 
 def possible(study: Study, identified: Sequence[IdentifiedEffect], campaign: Campaign) -> bool:
-    """Tell whether a valid study can have effects of these amplitudes, with all points in air."""
+    """Tell whether a valid study can have effects of these amplitudes, with all points in air, and
+    with the blocks that were measured.
+    """
     if any(value < parameter.minimum for effect in identified
            for value, parameter in zip(effect.values, effect.parameters, strict=True)):
         return False
     try:
         changed = apply_effects(study, identified)
-        inside = build_magnet(changed).contains(campaign.points_of(changed))
+        magnet = build_magnet(changed)
+        inside = magnet.contains(campaign.points_of(changed))
+        if campaign.blocks is not None and identified:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", HalbachWarning)
+                prior_from_blocks(magnet, campaign.blocks)
     except (HalbachError, ValidationError):  # an amplitude beyond its key's limits is the latter
         return False
     return not inside.any()
@@ -612,6 +624,38 @@ def with_rivals(
                     known.sd**2 + odds @ np.array(more)) / (1 + odds.sum())), 0.0)
     return tuple(replace(effect, sd=np.sqrt(variance), rivals=rivals)
                  for effect, variance, rivals in zip(identified, variances, every, strict=True))
+
+
+def with_further_causes(
+    search: Search, identified: Sequence[IdentifiedEffect], probabilities: Floats
+) -> tuple[IdentifiedEffect, ...]:
+    """Return identified effects whose error bars contain that one more effect may be missing.
+
+    Amplitudes are a mixture of those beside every further candidate, each at the best place of its
+    effect, and of those without any. ``probabilities`` (candidates,) are those of one more.
+    """
+    own = [search.hypotheses.index(effect.hypothesis) for effect in identified]
+    beside = [replace(effect.selection, candidate=search.candidates[number])
+              for effect, number in zip(identified, own, strict=True)]
+    best: dict[str, tuple[float, int]] = {}
+    total: dict[str, float] = {}
+    for number, probability in enumerate(probabilities.tolist()):
+        name = search.candidates[number].effect
+        best[name] = max(best.get(name, (0.0, -1)), (probability, number))
+        total[name] = total.get(name, 0.0) + probability
+    variances = [effect.sd**2 for effect in identified]
+    known = amplitudes(search, beside)
+    for name, (probability, number) in best.items():
+        if probability < SHOWN_PROBABILITY or number in (*search.rough, *own):
+            continue
+        with_more = amplitudes(search, [*beside, SelectedEffect(
+            search.candidates[number], 0.0, 0.0, ())])
+        for k, (one, other) in enumerate(zip(known, with_more, strict=False)):
+            if len(one.values) == len(variances[k]):
+                variances[k] += total[name] * np.maximum(
+                    other.sd**2 + (other.values - one.values)**2 - one.sd**2, 0.0)
+    return tuple(replace(effect, sd=np.where(effect.sd > 0, np.sqrt(variance), 0.0))
+                 for effect, variance in zip(identified, variances, strict=True))
 
 
 def _of_all_parts(

@@ -277,6 +277,12 @@ def place_in_words(place: Place) -> str:
     return " and ".join(filter(None, blocks)) or place.name
 
 
+def label_in_words(label: str) -> str:
+    """Describe a place by its label in words, as `place_in_words`: ``r01s05`` is ring 1, slot 5."""
+    return re.sub(r"\br(\d+)(?:s(\d+))?\b", lambda found: block_in_words(
+        int(found[1]), int(found[2] or 0)), label)
+
+
 def _in_map(name: str | None) -> str:
     """Return the name of a map before what is said of it; nothing for the only one."""
     return "" if name is None else f"map {name}: "
@@ -382,14 +388,20 @@ def position_in_words(position: PossiblePosition) -> str:
 
 
 def rivals(identified: IdentifiedEffect) -> list[tuple[Candidate, float]]:
-    """Return the other effects that the readings cannot distinguish, each at its best place.
+    """Return what the readings cannot distinguish: other effects, each at its best place, and the
+    same one at other blocks, rings or instruments.
 
-    The second item of each pair is the log Bayes factor.
+    A place that is fitted, as that of an object, has an error bar in place of others. The second
+    item of each pair is the log Bayes factor.
     """
-    best: dict[str, tuple[Candidate, float]] = {}
+    effect, place = identified.hypothesis.effect, identified.place
+    is_of_places = not effect.refinements and bool(effect.kind == "field" or place.instrument)
+    best: dict[tuple[str, str], tuple[Candidate, float]] = {}
     for candidate, factor in identified.selection.alternatives:
-        if candidate.effect != identified.selection.candidate.effect:
-            best.setdefault(candidate.effect, (candidate, factor))
+        if candidate.effect != effect.name:
+            best.setdefault((candidate.effect, ""), (candidate, factor))
+        elif is_of_places:
+            best.setdefault((candidate.effect, candidate.place), (candidate, factor))
     return list(best.values())
 
 
@@ -422,6 +434,7 @@ def diagnosis_summary(
         "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
         "vibration": _vibration_entry(diagnosis.position_noise),
         "suspected": [_suspicion(one) for one in diagnosis.suspected],
+        "imitated": asdict(diagnosis.imitated) if diagnosis.imitated else None,
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
         "groups": {"before": _groups(diagnosis.groups_before),

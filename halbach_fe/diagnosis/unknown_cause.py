@@ -7,34 +7,42 @@ what it acts on, along which coordinate it varies, and how large it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.sparse.csgraph import connected_components
+from scipy.special import logsumexp
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.competition import Competition, Explanation, Term
-from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
+from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,
+    Candidate,
     SelectedEffect,
     log_bayes_factors,
     selected_effect,
     with_candidates,
+    with_wide_priors,
 )
-from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion, UnknownCause, UnknownPart
-from halbach_fe.diagnosis.search import Search, amplitudes, possible
+from halbach_fe.diagnosis.result import (
+    IdentifiedEffect,
+    Imitation,
+    Suspicion,
+    UnknownCause,
+    UnknownPart,
+)
+from halbach_fe.diagnosis.search import SHOWN_PROBABILITY, Search, amplitudes, possible
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-
-MAX_READINGS = 6000
-"""Largest number of readings that judge between effects and the unknown. Of more, a random subset
-is taken."""
 
 FAR_BETTER = 0.5
 """Share of the best explanation's log odds below which the catalogue's own explanation is given up
@@ -59,6 +67,9 @@ SUSPECTED = 0.5
 
 SHARE_OF_SUSPECTS = 0.9
 """Share of the suspects' probability that those that are listed have together."""
+
+IMITATED = 0.1
+"""Probability of something that blocks imitate from which an update is called uncertain."""
 
 
 @dataclass(frozen=True)
@@ -134,22 +145,12 @@ def judge(
     """Compare the identified effects with causes of any shape."""
     rows = np.flatnonzero(~update.held_out)
     noise, observation = update.errors.subset(rows), update.observation
-    marginal, columns, residual = search.marginal, search.columns, search.residual
-    absorbed, evidence = search.absorbed, search.evidence
-    some: slice | Ints = slice(None)
-    if len(rows) > MAX_READINGS:
-        some = np.sort(np.random.default_rng(0).choice(len(rows), MAX_READINGS, replace=False))
-        marginal, columns, residual = (
-            Marginal.of(marginal.whitened[some]), columns[some], residual[some])
-        absorbed = marginal.absorbed(np.column_stack([columns, residual]))
-        evidence = marginal.evidence(columns, residual, absorbed)
 
     def whiten(fields: Floats) -> Floats:
         return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
 
-    competition = Competition(marginal, columns, absorbed, residual, evidence,
-                              search.candidates, flexible, lambda fields: whiten(fields)[some],
-                              search.rough)
+    competition = Competition(search.marginal, search.columns, search.absorbed, search.residual,
+                              search.evidence, search.candidates, flexible, whiten, search.rough)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     sources = {number: effect.hypothesis.place.at_m
                for number, effect in zip(numbers, identified, strict=True)
@@ -268,52 +269,133 @@ def _part(term: Term, field: Floats, rivals: Sequence[Term]) -> UnknownPart:
         family.span / waves if waves > 0 else None, term.fitted.log_bayes_factor, family.map)
 
 
+@dataclass(frozen=True)
+class Further:
+    """What else may be missing beside the effects of the best explanation.
+
+    The probabilities assume that at most one more thing is missing: an effect of the catalogue, or
+    a cause of any shape.
+
+    Attributes
+    ----------
+    odds : ndarray, shape (candidates,)
+        Log posterior odds of every candidate; -inf for those that are in the explanation.
+    probabilities : ndarray, shape (candidates,)
+    """
+
+    odds: Floats
+    probabilities: Floats
+
+    @classmethod
+    def of(cls, judgement: Judgement) -> Further:
+        """Compare all candidates beside the effects of the best explanation."""
+        competition, best = judgement.competition, judgement.best
+        candidates = competition.candidates
+        odds = log_bayes_factors(with_candidates(
+            competition.evidence, [candidates[k] for k in best.effects]), candidates)
+        odds += competition.prior
+        taken = {candidates[k].effect for k in best.effects if candidates[k].unique}
+        odds[[number for number, candidate in enumerate(candidates)
+              if number in best.effects or candidate.effect in taken]] = -np.inf
+        others = [term.fitted.log_bayes_factor + competition.prior_of_family
+                  for term in competition.terms_beside(best.effects, ())]
+        return cls(odds, np.exp(odds - logsumexp([0.0, *others, *odds])))
+
+    def by_effect(
+        self, candidates: Sequence[Candidate], chosen: Collection[int] | None = None
+    ) -> dict[str, float]:
+        """Return the probability of every effect, the likeliest first; of some candidates only, if
+        their numbers are given.
+        """
+        found: dict[str, float] = {}
+        for number, (candidate, probability) in enumerate(zip(
+                candidates, self.probabilities.tolist(), strict=True)):
+            if chosen is None or number in chosen:
+                found[candidate.effect] = found.get(candidate.effect, 0.0) + probability
+        return dict(sorted(found.items(), key=lambda one: -one[1]))
+
+
+def _together(by_name: dict[str, float]) -> dict[str, float]:
+    """Return the likeliest effects that have most of the probability together."""
+    most = SHARE_OF_SUSPECTS * sum(by_name.values())
+    found: dict[str, float] = {}
+    for name, probability in by_name.items():
+        if sum(found.values()) >= most:
+            break
+        found[name] = probability
+    return found
+
+
 def suspicions(
-    judgement: Judgement, corrected: Study, search: Search
+    judgement: Judgement, further: Further, corrected: Study, search: Search
 ) -> tuple[Suspicion, ...]:
     """Return what is likelier than not to be missing, but not certain enough to be named.
 
-    The probabilities assume that at most one more thing is missing: an effect of the catalogue, or
-    a cause of any shape. Effects that share a probability are one suspicion.
+    Effects that share a probability are one suspicion.
     """
     competition, best = judgement.competition, judgement.best
-    if best.terms:
-        return ()
-    candidates = competition.candidates
-    odds = log_bayes_factors(with_candidates(
-        competition.evidence, [candidates[k] for k in best.effects]), candidates)
-    odds += competition.prior
-    taken = {candidates[k].effect for k in best.effects if candidates[k].unique}
-    odds[[number for number, candidate in enumerate(candidates)
-          if number in best.effects or candidate.effect in taken]] = -np.inf
-    others = [term.fitted.log_bayes_factor + competition.prior_of_family
-              for term in competition.terms_beside(best.effects, ())]
-    top = max(0.0, float(odds.max(initial=0.0)), *others)
-    weights = np.exp(odds - top)
-    total = float(np.exp(-top) + weights.sum() + np.exp(np.array(others) - top).sum())
-    by_name: dict[str, float] = {}
-    for candidate, weight in zip(candidates, weights.tolist(), strict=True):
-        by_name[candidate.effect] = by_name.get(candidate.effect, 0.0) + weight / total
-    ranked = sorted(by_name, key=lambda name: -by_name[name])
-    named: list[str] = []
-    together = sum(by_name.values())
-    while ranked and sum(by_name[name] for name in named) < SHARE_OF_SUSPECTS * together:
-        named.append(ranked.pop(0))
-    probability = sum(by_name[name] for name in named)
-    if probability < SUSPECTED:
+    candidates, odds = competition.candidates, further.odds
+    named = _together(further.by_effect(candidates))
+    probability = sum(named.values())
+    if best.terms or probability < SUSPECTED:
         return ()
     likeliest = int(np.argmax(odds))
-    factor = float(odds[likeliest] - competition.prior[likeliest])
     best_of = [max((number for number, one in enumerate(candidates) if one.effect == name),
                    key=lambda number: odds[number]) for name in named]
     beside = [SelectedEffect(candidates[number], 0.0, 0.0, ()) for number in best.effects]
+    fitted = [amplitudes(search, [*beside, SelectedEffect(
+        candidates[number], float(odds[number] - competition.prior[number]),
+        float(odds[number]), ())]) for number in best_of if number not in search.rough]
     return (Suspicion(
-        tuple(named), probability, search.hypotheses[likeliest],
-        tuple(by_name[name] for name in named), factor,
+        tuple(named), probability, search.hypotheses[likeliest], tuple(named.values()),
+        float(odds[likeliest] - competition.prior[likeliest]),
         _why_not_named(judgement, corrected, search, likeliest, probability),
-        tuple(amplitudes(search, [*beside, SelectedEffect(
-            candidates[number], float(odds[number] - competition.prior[number]),
-            float(odds[number]), ())])[-1] for number in best_of if number not in search.rough)),)
+        tuple(one[-1] for one in fitted if possible(corrected, one, search.campaign))),)
+
+
+def imitated(
+    judgement: Judgement, further: Further, update: InferenceResult, search: Search
+) -> Imitation | None:
+    """Return what may be missing that blocks imitate, so that an update is less sure than its bars.
+
+    An effect J theta that the study lacks changes the posterior mean of the blocks by ``C H' J
+    theta``, the chi-squared of which is ``theta' J' H C H' J theta``. What an effect changes of
+    the magnetizations themselves is no error of the update.
+    """
+    candidates, best = search.candidates, judgement.best
+    if best.terms:
+        return None
+    beside = with_candidates(search.evidence, [candidates[k] for k in best.effects])
+    count, wrong = len(update.magnet.parameter_names), {}
+    for number in np.flatnonzero(further.probabilities > SHOWN_PROBABILITY).tolist():
+        candidate, hypothesis = candidates[number], search.hypotheses[number]
+        if number in search.rough or candidate.is_binary:
+            continue
+        fit = with_wide_priors(beside, [candidate]).fit(candidate.free)
+        taken = search.absorbed[:, list(candidate.free)]
+        chi2 = float(np.sum((taken @ fit.mean)**2) + np.sum((taken @ fit.covariance) * taken))
+        if chi2 > count and not _is_of_magnetizations(hypothesis, update.study):
+            wrong[number] = chi2 / count
+    by_name = further.by_effect(candidates, wrong)
+    probability = sum(by_name.values())
+    if probability < IMITATED:
+        return None
+    shown = _together(by_name)
+    return Imitation(probability, tuple(shown), tuple(shown.values()))
+
+
+def _is_of_magnetizations(hypothesis: Hypothesis, study: Study) -> bool:
+    """Tell whether an effect changes magnetizations, as a temperature does."""
+    effect = hypothesis.effect
+    if effect.kind == "instrument":
+        return False
+    values = [parameter.sd / 10 for parameter in effect.parameters]
+    try:
+        changed = build_magnet(hypothesis.apply(study, values)).nominal_magnetization
+    except (HalbachError, ValidationError):
+        return False
+    before = build_magnet(study).nominal_magnetization
+    return len(changed) != len(before) or not np.allclose(changed, before, rtol=1e-9)
 
 
 def _why_not_named(

@@ -36,9 +36,15 @@ from halbach_fe.inference.same_magnet import distribution_of
 from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
-from halbach_fe.measurement.instrument import turn_of
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    probe_points,
+    sensor_matrix,
+    turn_of,
+)
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.block_variation import study_prior, with_others
+from halbach_fe.response.block_variation import neighbour_deviations, study_prior, with_others
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
@@ -66,6 +72,9 @@ stepped dipole of docs/accuracy.md were solved anew at 54, 29 and 6, and moved f
 NO_WORSE, SMALLEST_SHARE = 1.0, 0.2
 """A change of the terms is halved if their log posterior density decreases by more than the first,
 but not to less than the second."""
+
+SEEN = 0.1
+"""Size in noises, over all readings together, below which a mode of neighbours is left out."""
 
 LEFT_OUT = 0.02
 """Relative change of a posterior variance (1 % of a standard deviation) that discarded information
@@ -181,6 +190,11 @@ def infer(
                 readings))
             whole_prior = joined(whole_prior, np.zeros(len(of_instruments)),
                                  np.ones(len(of_instruments)))
+        nearby = _neighbour_columns(magnet, maps, readings)
+        if nearby.size:
+            matrix = Beside(matrix, nearby)
+            whole_prior = joined(whole_prior, np.zeros(nearby.shape[1]),
+                                 np.ones(nearby.shape[1]))
         if at is not None:
             matrix = Beside(matrix, open_terms.columns(at.field, maps, readings))
             whole_prior = joined(whole_prior, -total, open_terms.sd)
@@ -195,7 +209,8 @@ def infer(
             np.flatnonzero(training))
         whole = update.distribution
         values, _, change = np.split(
-            whole.mean, np.cumsum([len(model.parameters), len(of_instruments)]))
+            whole.mean, np.cumsum(
+                [len(model.parameters), len(of_instruments) + nearby.shape[1]]))
         sd = whole.sd_of(np.hstack([np.zeros((len(change), len(whole.mean) - len(change))),
                                     open_terms.counted]))
         if at is not None:
@@ -236,7 +251,7 @@ def infer(
             f"{update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
     posterior = whole
-    if len(open_terms) or of_instruments:
+    if len(open_terms) or of_instruments or nearby.size:
         magnet_prior, posterior = of_the_first([whole_prior, whole], len(model.parameters))
     if magnet.is_nonlinear and not linearized_only:
         _check_linearization(magnet, readings.observation, session, model, posterior.mean,
@@ -261,6 +276,24 @@ def infer(
         amplitudes=_amplitudes(magnet.study, whole, len(model.parameters)),
         overlaps=overlaps(matrix, residual, errors, whole_prior, readings),
         noise_blocks=estimated)
+
+
+def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
+    """Return the readings (n, k) in T of what neighbours' blocks deviate, per standard deviation.
+
+    Modes that no reading shows are left out.
+    """
+    if not magnet.study.external.neighbours:
+        return np.zeros((len(readings.values), 0))
+    found = []
+    for one in maps:
+        instrument = one.study.instrument
+        points = probe_points(instrument, points_of(in_si_and_magnet_axes(instrument, one.data)))
+        found.append(neighbour_deviations(magnet, points) @ sensor_matrix(instrument).T)
+    columns = readings.observation.read(np.concatenate(found, axis=1)).T
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    seen = sizes > SEEN * float(np.median(readings.noise.sd))
+    return np.asarray(left[:, seen] * sizes[seen])
 
 
 def _amplitudes(study: Study, posterior: Gaussian, parameters: int) -> Amplitudes | None:

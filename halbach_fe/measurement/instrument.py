@@ -268,7 +268,7 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
     time = map_time(data)
     shown = without_memory(instrument, np.asarray(data["B_T"].values, float), time)
     missing = np.isnan(shown)
-    _check_components(instrument, missing)
+    check_components(instrument, missing)
     linear = instrument.with_(rotation_rad=(0.0, 0.0, 0.0))
     matrix, field = sensor_matrix(linear), np.nan_to_num(shown)
     for _ in range(ROUNDS):
@@ -316,8 +316,10 @@ def check_total_field(instrument: Instrument) -> None:
                 f"`instrument.{name}`", "a map of |B|", "left out, as |B| has no axes", str(found)))
 
 
-def _check_components(instrument: Instrument, missing: NDArray[np.bool_]) -> None:
-    """Check that the planar Hall effect is corrected only where all components were measured."""
+def check_components(instrument: Instrument, missing: NDArray[np.bool_]) -> None:
+    """Raise a MeasurementError if a planar Hall effect is to be corrected where not all components
+    were measured; ``missing`` (n, 3) tells which were not.
+    """
     for axis, name in enumerate(COMPONENTS):
         others = [j for j in range(3) if j != axis]
         if instrument.planar_hall_per_T[axis] and (

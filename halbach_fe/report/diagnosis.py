@@ -203,10 +203,11 @@ def _disagreement_summary(found: Sequence[ResidualGroup]) -> str:
 
 def _equivalence_sentence(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
     """Name the effects that the readings cannot distinguish from an identified effect."""
-    found = [f"{title}{' ' + candidate.place if candidate.place else ''}, {bayes_factor(factor)}"
-             for title, (candidate, factor) in zip(
+    own_name = identified.hypothesis.effect.name
+    found = [f"{title}{' ' + one.place if one.place and one.effect != own_name else ''}, "
+             f"{bayes_factor(factor)}" for title, (one, factor) in zip(
                  titles_of_rivals(identified, titles), rivals(identified), strict=True)]
-    name = title_of(identified.hypothesis.effect.name, titles)
+    name = title_of(own_name, titles)
     own = bayes_factor(identified.selection.log_bayes_factor)
     return (f"Instead of {name} (Bayes factor {own}), the cause may equally well be: "
             f"{'; '.join(found)}.")

@@ -9,11 +9,12 @@ import numpy as np
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import place_of
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS
-from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
+from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect, Imitation
 from halbach_fe.diagnosis.summary import (
     PRESENT,
     STUDY_FILE,
     amounts,
+    label_in_words,
     limits_in_words,
     other_findings,
     place_in_words,
@@ -40,6 +41,9 @@ the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the error
 is built with care."""
 
 
+LEAST_SHARE = 0.02
+"""Probability from which something that may be missing is listed."""
+
 OTHER_SOURCES = ("background", "ferromagnetic_object")
 """Effects by which a neighbouring magnet's field can be corrected."""
 
@@ -62,6 +66,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
     only_suspected = diagnosis.suspected and not diagnosis.identified
     sound = not (diagnosis.unknown or only_suspected or diagnosis.solver_error or _fails(
         diagnosis) or diagnosis.after.held_out_conflict or _is_restless(diagnosis))
+    if diagnosis.imitated is not None:
+        doubts.append(_imitated_in_words(diagnosis.imitated, catalogue_titles(diagnosis)))
     if diagnosis.identified and doubts:
         # besides how well the model fits now, and error bars that are too wide
         doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
@@ -86,6 +92,9 @@ def answer(diagnosis: Diagnosis) -> Answer:
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     """Say whether an answer without named effects can be trusted."""
     chi2 = f"chi² per training reading is {decimals(diagnosis.after.prior_conflict)}"
+    if sound and diagnosis.imitated is not None:
+        return ("Only as far as this map shows: the readings are explained to their noise, with "
+                "the blocks' tolerances integrated out.")
     if sound:
         return ("Yes: the readings are explained to their noise, with the blocks' tolerances "
                 "integrated out.")
@@ -165,6 +174,17 @@ def _remedies(diagnosis: Diagnosis) -> list[str]:
     """Say what can be put right at the magnet itself, by hand."""
     return [REMEDIES[effect.hypothesis.effect.name].format(place_in_words(effect.place))
             for effect in diagnosis.identified if effect.hypothesis.effect.name in REMEDIES]
+
+
+def _imitated_in_words(imitation: Imitation, titles: dict[str, str]) -> str:
+    """Say what may be missing that no reading shows."""
+    parts = [f"{title_of(name, titles)} {100 * share:.0f} %" for name, share in zip(
+        imitation.effects, imitation.shares, strict=True) if share >= LEAST_SHARE]
+    return (f"With a probability of {100 * imitation.probability:.0f} % something is missing that "
+            "no reading shows, as the blocks imitate it"
+            f"{f' ({in_a_row(parts)})' if parts else ''}: the blocks of an update are then off by "
+            "more than their error bars. What is possible belongs into the study as [[uncertain]] "
+            "or [instrument_sd].")
 
 
 def _also_possible(diagnosis: Diagnosis) -> str:
@@ -285,7 +305,7 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
                 "The held-out readings contradict that, as their chi² should be about 1: another "
                 f"cause looks like {added} where the other readings are.")
     sentences += [
-        f"{_maps(diagnosis, 'do')} not tell {title_of(effect.hypothesis.effect.name, titles)} "
+        f"{_maps(diagnosis, 'do')} not tell {_told_apart(effect, titles)} "
         f"from {joined_by_or(titles_of_rivals(effect, titles))}."
         for effect in diagnosis.identified if rivals(effect)]
     if diagnosis.identified and diagnosis.positions:
@@ -297,8 +317,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
     sources = [title_of(name, titles) for name in names if name in OTHER_SOURCES]
     if "neighbour_magnet" in names and sources:
         sentences.append(
-            f"{in_a_row(sources).capitalize()} may be what the blocks of the neighbouring magnet "
-            "deviate from nominal, which its model does not have.")
+            f"{in_a_row(sources).capitalize()} may be how the neighbouring magnet differs from a "
+            "copy of this one, which its model is.")
     unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
                for effect in diagnosis.identified
                if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
@@ -373,8 +393,18 @@ def catalogue_titles(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def titles_of_rivals(identified: IdentifiedEffect, titles: dict[str, str]) -> list[str]:
-    """Return the descriptions of an effect's rivals."""
-    return [title_of(candidate.effect, titles) for candidate, _ in rivals(identified)]
+    """Return the descriptions of an effect's rivals, with the place of those that differ by it."""
+    return [title_of(candidate.effect, titles) + (
+        f", {label_in_words(candidate.place)}"
+        if candidate.effect == identified.hypothesis.effect.name else "")
+        for candidate, _ in rivals(identified)]
+
+
+def _told_apart(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
+    """Return the description of an effect, with its place if rivals differ from it by the place."""
+    name = identified.hypothesis.effect.name
+    same = any(candidate.effect == name for candidate, _ in rivals(identified))
+    return title_of(name, titles) + (f", {place_in_words(identified.place)}" if same else "")
 
 
 def title_of(name: str, titles: dict[str, str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +18,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.summary import place_in_words, rivals
-from halbach_fe.geometry.blocks import block_in_words
+from halbach_fe.diagnosis.summary import label_in_words, place_in_words, rivals
 from halbach_fe.inference.result import COVERAGE_Z, InferenceResult
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.diagnosis_answer import catalogue_titles, title_of
@@ -232,9 +230,7 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
     def in_words(name: str, place: str = "") -> str:
         """Return the description of an effect in short lines."""
         said = {NONE: "nothing is missing", UNKNOWN: OUTSIDE}.get(name) or title_of(name, titles)
-        place = re.sub(r"\br(\d+)s(\d+)\b", lambda found: block_in_words(
-            int(found[1]), int(found[2])), place)
-        return textwrap.fill(", ".join(filter(None, (said, place))), LONGEST_NAME)
+        return textwrap.fill(", ".join(filter(None, (said, label_in_words(place)))), LONGEST_NAME)
 
     bars = []
     for effect in diagnosis.identified:

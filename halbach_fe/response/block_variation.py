@@ -27,12 +27,14 @@ import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import Observation
+from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.uncertain import Uncertain, shifted
 
@@ -197,6 +199,29 @@ def study_prior(magnet: Magnet, count: int) -> Gaussian:
     return with_others(nominal_prior(
         magnet.nominal_magnetization, magnet.dimension, settings.magnitude_sd,
         settings.direction_sd_deg, settings.common_mode_sd), magnet, count)
+
+
+def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
+    """Return what neighbours' blocks deviate, as fields (k, n, 3) in T of independent modes.
+
+    Each is that of one standard deviation of the study's prior of magnetizations, at points (n, 3)
+    in m. The blocks of a neighbour are others than this magnet's, and were not measured.
+    """
+    settings, neighbours = magnet.study.prior, magnet.study.external.neighbours
+    if not neighbours:
+        return np.zeros((0, *points.shape))
+    root = sparse.csr_array(root_matrix(nominal_prior(
+        magnet.nominal_magnetization, 3, settings.magnitude_sd, settings.direction_sd_deg,
+        settings.common_mode_sd).root)).toarray()
+    found = []
+    for one in neighbours:
+        turn = rotation_about_z(np.radians(one.turn_deg))
+        local = (points - [0.0, 0.0, one.z_m]) @ turn
+        own = np.zeros((root.shape[1], *points.shape))
+        for number, unit in enumerate(unit_fields(magnet.blocks, local)):
+            own += np.moveaxis(unit @ root[3 * number:3 * number + 3], -1, 0)
+        found.append(MU_0 * one.factor * own @ turn.T)
+    return np.concatenate(found)
 
 
 def with_others(prior: Gaussian, magnet: Magnet, count: int) -> Gaussian:

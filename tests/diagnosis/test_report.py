@@ -14,7 +14,13 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
-from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion, UnknownCause, UnknownPart
+from halbach_fe.diagnosis.result import (
+    IdentifiedEffect,
+    Imitation,
+    Suspicion,
+    UnknownCause,
+    UnknownPart,
+)
 from halbach_fe.diagnosis.summary import (
     amounts,
     diagnosis_summary,
@@ -130,6 +136,24 @@ def test_verdicts(flat):
     assert answer(replace(found, unknown=unknown)).trust.startswith("No. ")
     assert answer(replace(found, after=found.before)).trust.startswith("No. ")
     assert answer(found).trust.startswith("Yes. ")
+    imitation = Imitation(0.3, ("radial_gap", "length"), (0.28, 0.01))
+    assert answer(replace(found, imitated=imitation)).trust.startswith("Only in part. ")
+    clean = replace(found, identified=(), imitated=imitation)
+    assert answer(clean).trust.startswith("Only as far as this map shows: ")
+    assert "With a probability of 30 % something is missing" in answer(clean).trust
+    assert "28 %" in answer(clean).trust  # and not what has 1 %
+    assert diagnosis_summary(clean)["imitated"]["probability"] == 0.3
+    assert answer(replace(clean, imitated=None)).trust.startswith("Yes: ")
+    for kind, said in (("block_missing", "Only in part. "), ("ferromagnetic_object", "Yes. ")):
+        own = Hypothesis(EFFECTS[kind], Place(1, 2) if kind == "block_missing" else Place(
+            at_m=(0.3, 0.0, 0.0)))
+        tie = replace(one, hypothesis=own, values=np.ones(len(own.effect.parameters)),
+                      sd=np.ones(len(own.effect.parameters)), selection=replace(
+            one.selection, alternatives=((Candidate(kind, "r01s05", ()), 1.0),)))
+        told = answer(replace(found, identified=(tie,))).trust
+        assert told.startswith(said)  # an object has one place, with a bar
+        assert ("missing block, ring 1, slot 2 from missing block, ring 1, slot 5" in told) == (
+            kind == "block_missing")
     suspicion = Suspicion(("gain_x",), 0.9, Hypothesis(EFFECTS["gain_x"], Place()), (0.9,), 5.5)
     besides = answer(replace(found, suspected=(suspicion,)))
     assert besides.sound  # what was named stands, and is used

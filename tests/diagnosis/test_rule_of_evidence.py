@@ -14,12 +14,15 @@ from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
-from halbach_fe.diagnosis.search import Search, amplitudes, with_rivals
+from halbach_fe.diagnosis.search import Search, amplitudes, with_further_causes, with_rivals
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference import infer as module_of_infer
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import with_memory, without_memory
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.study.magnet import Neighbour
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
@@ -185,3 +188,50 @@ def test_bars_contain_that_a_part_may_not_be_zero():
     likeliest, every = np.sqrt(np.mean(np.square(found), axis=0))
     assert 0.85 < every < 1.15  # 0.02 by chance, and half of the prior is that of large amplitudes
     assert likeliest > 5
+
+
+def test_bars_contain_that_a_cause_may_be_missing_which_nothing_shows():
+    """A misalignment that looks like the named gain and is there in a tenth of the draws: without
+    it in the bars, which is the control, the gain is off by 50 of them in these draws.
+    """
+    generator = np.random.default_rng(2)
+    columns = np.array([[100.0, 50.0], [0.0, 1.0]])
+    effects = [next(one for one in catalogue() if one.name == name)
+               for name in ("gain_x", "misalignment_xy")]
+    candidates = tuple(Candidate(one.name, "", (number,)) for number, one in enumerate(effects))
+    found = []
+    for draw in range(1000):
+        true = generator.standard_normal(2) * [1, draw % 10 == 0]
+        residual = columns @ true + generator.standard_normal(2)
+        search = Search(tuple(Hypothesis(one, Place()) for one in effects), candidates,
+                        Evidence.of(columns.T @ columns, columns.T @ residual,
+                                    residual @ residual, 2), *[None] * 7)
+        first = amplitudes(search, [SelectedEffect(candidates[0], 9.0, 9.0, ())])
+        off = first[0].values[0] / effects[0].parameters[0].sd - true[0]
+        found.append([off / (each[0].sd[0] / effects[0].parameters[0].sd) for each in (
+            first, with_further_causes(search, first, np.array([0.0, 0.1])))])
+    alone, mixed = np.sqrt(np.mean(np.square(found), axis=0))
+    assert 0.75 < mixed < 1.2  # wide amplitudes have half of the prior, and are not drawn
+    assert alone > 5
+
+
+def test_blocks_of_a_neighbour_deviate(session, monkeypatch):
+    """Truth by magpylib, with a neighbour whose blocks deviate: the update is as sure as it may be.
+    As if they were nominal, which is the control, it is far off.
+    """
+    generator, middle = np.random.default_rng(3), 0.26
+    true, other = drawn(STUDY, generator), drawn(STUDY, generator)
+    away = field(STUDY, other, POINTS - [0.0, 0.0, middle])
+    shown = field(STUDY, true, POINTS) + away
+    data = field_map(POINTS, shown + NOISE_T * generator.standard_normal(shown.shape))
+    stated = STUDY.with_(external__neighbours=(Neighbour(z_m=middle),))
+
+    def chi2():
+        result = infer(build_magnet(stated), data, session)
+        off = true.ravel() / MU_0 - result.posterior.mean
+        return off @ np.linalg.solve(result.posterior.covariance, off) / len(off)
+
+    assert chi2() < 1.5  # of 36 to 108 magnetizations, whose sd is below 0.25
+    monkeypatch.setattr(module_of_infer, "neighbour_deviations",
+                        lambda magnet, points: np.zeros((1, *points.shape)))
+    assert chi2() > 3

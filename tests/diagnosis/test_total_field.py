@@ -64,6 +64,15 @@ def test_a_probe_of_the_magnitude_has_no_sensors():
             OF_A_SENSOR if magnitude else OF_MAGNITUDE)
 
 
+def test_a_planar_hall_effect_needs_all_components():
+    """A map that reads x alone cannot be corrected for it."""
+    effect = next(one for one in catalogue() if one.name == "planar_hall_x")
+    data = simulate_campaign(study_of(1), 8).readings
+    assert Campaign.of(study_of(1), data).places(effect, study_of(1))
+    data["B_T"].values[:, 1:] = np.nan
+    assert not Campaign.of(study_of(1), data).places(effect, study_of(1))
+
+
 def test_the_probe_of_the_magnitude_drifts(session):
     data = simulate_campaign(study_of(1), 8, magnitude=True).readings
     count = data.sizes["point"]
