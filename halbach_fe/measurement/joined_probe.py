@@ -137,6 +137,7 @@ class JoinedModel(ProbeModel):
                                       *(PLACED_SD,) * len(maps)])
         self.prior_sd = self.any_sd
         self.ends = np.cumsum([0, *(len(one.points) for one in maps)])
+        self._last = []
 
     def rows_of(self, number: int) -> slice:
         """Return the rows of a map."""
@@ -248,7 +249,7 @@ class JoinedModel(ProbeModel):
             alone = self.alone(at, number, rows, width2)
             known = self.only(number, rows)
             left = (self.field[known] - self.readings(alone.at, known)) / np.maximum(
-                alone.free.diagonals()[0].reshape(-1, 3), LEAST_OWN)
+                alone.free.diagonal().reshape(-1, 3), LEAST_OWN)
             points = self.maps[number].points
             other.scatter[self.rows_of(number)] = scatter_around(points, points[own], left)
         other.weights = weights_of(other.scatter)

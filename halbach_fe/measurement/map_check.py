@@ -489,7 +489,7 @@ def _remaining(
     residual = whole.left
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
-        model.noise_left(whole.at, chosen, whole.width2)[1], LEAST_LEFT))
+        model.noise_left(whole.at, chosen, whole.width2), LEAST_LEFT))
     scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
     (as_given,) = fit_fields(model.charges, points[chosen], [given[chosen]])
     return {
@@ -593,7 +593,7 @@ class _Fitted:
         for _ in range(WEIGHTINGS):
             model = fitted.model.weighted(fitted.at, rows, fitted.width2)
             # the prior width of the field, now that the instrument no longer counts as noise
-            fit = model.fit(fitted.at, rows)
+            fit = model.fit(fitted.at, rows, fitted.fit.number)
             fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, NEXT_ITERATIONS), fit)
         return fitted
 
@@ -765,25 +765,29 @@ def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
 
     The distance is that from where sensors at (3, 3) in m read the field. The instrument is
     perfect, or is first fitted with some points and charges that are neither near nor far: those of
-    a map near edges of magnets, fitted by far charges, gave sensors 10 mm off.
+    a map near edges of magnets, fitted by far charges, gave sensors 10 mm off. Charges are tried
+    from far to near, which are more, until the evidence of the readings falls.
     """
     spacing, some = point_spacing(scan.points), scan.of(_some_points(scan.points))
     start = some.model(Charges.around(some.points, GAPS[-2] * spacing))
     every = np.ones(len(some.points), bool)
     perfect = start.fit(start.start(HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)), every)
-    instrument = fit_probe(start, every, perfect)
+    probes = fit_probe(start, every, perfect), start.start(perfect)
     every = np.ones(len(scan.points), bool)
     found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
-    probes = instrument, start.start(perfect)
-    for number, probe in enumerate(probes):
-        read_at = _read_at(scan.points, probe.sensors_m)
-        for place, gap in enumerate(GAPS):
+    for probe in probes:
+        read_at, last = _read_at(scan.points, probe.sensors_m), -np.inf
+        for gap in reversed(GAPS):
             near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
             if near or gap == GAPS[-1]:
                 fit = scan.model(Charges.around(read_at, gap * spacing)).fit(probe, every)
                 evidence = fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
                 found.append((evidence, gap, probe, fit))
-            pace.advance(number * len(GAPS) + place + 1, len(probes) * len(GAPS))
+                pace.advance(len(found), len(probes) * len(GAPS))
+                if evidence < last:
+                    break
+                last = evidence
+    pace.advance(len(probes) * len(GAPS), len(probes) * len(GAPS))
     _, gap, probe, fit = max(found, key=lambda each: each[0])
     return gap * spacing, probe.sensors_m, fit
 
@@ -874,11 +878,12 @@ def _stated(
     terms: tuple[InstrumentTerm, ...] = ()
     for number in range(ROUNDS):
         model = fitted.model.with_terms(~no_terms)
-        pairs = [rows, *_parts(model, fitted.at, rows)]
+        halves = _halves(model, fitted.at, rows)
+        parts = 1 + 2 * len(halves)
         told = []
-        for part in pairs:
-            told.append(Evidence.of(model, part, fitted.at, fitted.width2))
-            pace.advance(number * len(pairs) + len(told), ROUNDS * len(pairs))
+        for each in Evidence.of(model, rows, fitted.at, fitted.width2, halves):
+            told.append(each)
+            pace.advance(number * parts + len(told), ROUNDS * parts)
         parameters = all_parameters(model.prior_sd, model.shares(fitted.at))
         kept, terms = selected(parameters, told)
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
@@ -909,16 +914,16 @@ def selected(
         kept[list(max(new)[1])] = True
 
 
-def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return halves of the map, two by two: along x, y and z, and by how steep the field is."""
+def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Return one half of the map each along x, y and z, and by how steep the field is."""
     steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
     found: list[NDArray[np.bool_]] = []
     for values in (*model.points.T, steepness):
         middle = (float(np.median(values[rows])) if values is steepness
                   else (values[rows].max() + values[rows].min()) / 2)
-        halves = rows & (values <= middle), rows & (values > middle)
-        if min(half.sum() for half in halves) >= FEWEST_IN_PART:
-            found += halves
+        half = rows & (values <= middle)
+        if min(half.sum(), rows.sum() - half.sum()) >= FEWEST_IN_PART:
+            found.append(half)
     return found
 
 

@@ -638,12 +638,12 @@ class _Joined:
     def with_terms(self) -> tuple[tuple[InstrumentTerm, ...], _Joined]:
         """Return the terms of the probe that are common, or of one map, and the fit with these."""
         open_terms, parameters = _own_terms(self.maps, self.model, self._shares())
-        told = [self._evidence(open_terms, self.rows)]
+        told = list(self._evidence(open_terms))
         kept = self.model.prior_sd > 0
         found = self
         at = np.flatnonzero(kept)
         if any(_stands_out(parameter, told[0], at) for parameter in parameters):
-            told += [self._evidence(open_terms, half) for half in self._halves()]
+            told = list(self._evidence(open_terms, self._halves()))
             new, _ = selected(parameters, told, kept)
             if (new & ~kept).any():
                 found = self._with(new)
@@ -660,17 +660,20 @@ class _Joined:
         return replace(self, model=model, at=fit_probe(
             model, self.rows, fit, replace(self.at, prior_sd=model.prior_sd)))
 
-    def _evidence(self, open_terms: NDArray[np.bool_], rows: NDArray[np.bool_]) -> Evidence:
-        """Return what some rows tell of some terms of the probe."""
-        return Evidence.of(self.model.with_terms(open_terms), rows, self.at, self.width2)
+    def _evidence(
+        self, open_terms: NDArray[np.bool_], halves: Sequence[NDArray[np.bool_]] = ()
+    ) -> Iterator[Evidence]:
+        """Return what the rows tell of some terms of the probe, and what halves of them do."""
+        return Evidence.of(self.model.with_terms(open_terms), self.rows, self.at, self.width2,
+                           halves)
 
     def _halves(self) -> list[NDArray[np.bool_]]:
-        """Return halves of the rows along x, y and z, which halve the overlaps."""
+        """Return one half of the rows along x, y and z each, which halve the overlaps."""
         shared = np.concatenate([self._shared(number) for number in range(len(self.maps))])
         places, found = self._points(), []
         for column in places.T:
             middle = float(np.median(column[shared & self.rows]))
-            found += [self.rows & (column <= middle), self.rows & (column > middle)]
+            found.append(self.rows & (column <= middle))
         return found
 
     def _shares(self) -> Floats:
