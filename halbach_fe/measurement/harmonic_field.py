@@ -172,7 +172,7 @@ def solid_harmonic_fields(points: Floats, degrees: int) -> Floats:
 
 
 ROUNDING = 1e-13
-"""Added to the information of the amplitudes, relative to its mean, so that maps without noise have
+"""Smallest penalty in units of the mean information per amplitude, so that maps without noise have
 positive definite matrices too."""
 
 PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
@@ -209,6 +209,10 @@ class HarmonicFit:
     number: int = USUAL
 
 
+NO_FIT = HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)
+"""What a search starts from that does not use it."""
+
+
 class FreeField:
     """What the prior field of the charges leaves of readings: ``P = (1 + A A^T / penalty)^-1``.
 
@@ -223,7 +227,7 @@ class FreeField:
         tall = by_amplitude if self.dual else by_amplitude.T
         self.gram = tall @ tall.T if gram is None else gram
         self.mean = float(np.trace(self.gram)) / by_amplitude.shape[1]
-        self.penalty = penalty + ROUNDING * self.mean
+        self.penalty = max(penalty, ROUNDING * self.mean)
 
     def of_noise(self, penalty: float) -> FreeField:
         """Return the same for another penalty."""
@@ -235,7 +239,6 @@ class FreeField:
             gram = self.gram[np.ix_(rows, rows)]
         else:
             gram = None if rest is None else self.gram - rest.gram
-        # the penalty has its share of rounding already
         return FreeField(self.by_amplitude[rows], self.penalty, gram, self.dual)
 
     @cached_property

@@ -36,10 +36,10 @@ from halbach_fe.measurement.field_map import (
     refuse_undirected,
 )
 from halbach_fe.measurement.harmonic_field import (
+    NO_FIT,
     Charges,
+    FreeField,
     HarmonicFit,
-    fit_fields,
-    fit_readings,
     spacing_of,
 )
 from halbach_fe.measurement.probe_in_field import (
@@ -118,6 +118,10 @@ UNLIKE = 0.5
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
 instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
+
+NEARLY_ALIKE = 300.0
+"""The same in a linear instrument, from which orientations are no longer tried: errors of usual
+sizes are not quite linear."""
 
 WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
@@ -491,10 +495,11 @@ def _remaining(
     left = residual[chosen] / np.sqrt(np.maximum(
         model.noise_left(whole.at, chosen, whole.width2), LEAST_LEFT))
     scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
-    (as_given,) = fit_fields(model.charges, points[chosen], [given[chosen]])
+    fields = FreeField(model.charges.fields(points[chosen]).reshape(-1, len(model.charges)), 0.0)
+    as_given = fields.most_probable(given[chosen].ravel(), whole.fit.number)
     return {
-        "rms_as_given_T": _rms(given[chosen]
-                               - model.charges.fields(points[chosen]) @ as_given.amplitudes),
+        "rms_as_given_T": _rms(given[chosen] - (
+            fields.by_amplitude @ as_given.amplitudes).reshape(-1, 3)),
         "rms_T": _rms(residual[chosen] @ np.abs(matrix)), "floor_T": _rms(floor @ np.abs(matrix)),
         "windows": _windows(points[chosen], residual[chosen] @ np.abs(matrix)),
         "noise_T": scatter.noise_T, "position_noise_m": scatter.position_m,
@@ -590,10 +595,10 @@ class _Fitted:
     def weighted(self, rows: NDArray[np.bool_]) -> _Fitted:
         """Return the fit of some rows that are weighted anew."""
         fitted = self
-        for _ in range(WEIGHTINGS):
-            model = fitted.model.weighted(fitted.at, rows, fitted.width2)
-            # the prior width of the field, now that the instrument no longer counts as noise
-            fit = model.fit(fitted.at, rows, fitted.fit.number)
+        for number in range(WEIGHTINGS):
+            model, fit = fitted.model.weighted(fitted.at, rows, fitted.width2), fitted.fit
+            if not number:  # the width of the prior, now that the instrument is no noise
+                fit = model.fit(fitted.at, rows, fit.number)
             fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, NEXT_ITERATIONS), fit)
         return fitted
 
@@ -739,18 +744,24 @@ def _orientation(
     """
     spacing = point_spacing(scan.points)
     scan = scan.of(_some_points(scan.points))
-    charges, weights = Charges.around(scan.points, GAPS[-2] * spacing), weights_of(scan.scatter)
-    matrices = _orientations()
-    fits = fit_readings((weights[..., None] * charges.fields(scan.points)).reshape(
-        -1, len(charges)), [(weights * (scan.field @ matrix.T)).ravel() for matrix in matrices])
+    given, every = scan.model(Charges.around(scan.points, GAPS[-2] * spacing)), np.ones(
+        len(scan.points), bool)
+    perfect, matrices = given.start(NO_FIT), _orientations()
+    free = given.free(perfect, every, 0.0)
+    fits = [free.most_probable(given.turned(matrix).target(perfect, every))
+            for matrix in matrices]
     sigma = np.array([fit.sigma for fit in fits])
-    left = np.flatnonzero(sigma <= WORTH_TRYING * sigma.min())
+    left = np.flatnonzero(sigma <= WORTH_TRYING * sigma.min()).tolist()
     if len(left) == 1:
         return matrices[left[0]], ()
-    every, against = np.ones(len(scan.points), bool), {}
-    for number in left.tolist():
-        model = scan.turned(matrices[number]).model(charges)
-        fitted = fit_probe(model, every, fits[number], iterations=FEW_ITERATIONS)
+    nearly = {number: _linear_against(given.turned(matrices[number]), fits[number])
+              for number in left}
+    left = [number for number, value in nearly.items()
+            if not number or value <= min(nearly.values()) + NEARLY_ALIKE]
+    against = {}
+    for number in left:
+        fitted = fit_probe(given.turned(matrices[number]), every, fits[number],
+                           iterations=FEW_ITERATIONS)
         impossible = np.abs(fitted.instrument).max() > doubted_from(len(fitted.instrument))
         against[number] = np.inf if impossible and number else float(
             3 * len(every) * np.log(fitted.sigma) + fitted.instrument @ fitted.instrument / 2)
@@ -758,6 +769,16 @@ def _orientation(
     alike = [number for number in against if against[number] <= min(against.values()) + ALIKE]
     best = 0 if 0 in alike else min(alike, key=lambda number: against[number])
     return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
+
+
+def _linear_against(model: ProbeModel, fit: HarmonicFit) -> float:
+    """Return how improbable readings are, with an instrument in which they are linear."""
+    every = np.ones(len(model.points), bool)
+    (told,) = Evidence.of(model, every, model.start(fit), fit.sigma**2 / fit.penalty)
+    instrument, _ = told.estimate(np.arange(len(told.sums)))
+    readings = 3 * len(every)
+    return float(readings * (np.log(fit.sigma) + np.log(
+        1 - told.sums @ instrument / readings) / 2) + instrument @ instrument / 2)
 
 
 def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
@@ -771,23 +792,28 @@ def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
     spacing, some = point_spacing(scan.points), scan.of(_some_points(scan.points))
     start = some.model(Charges.around(some.points, GAPS[-2] * spacing))
     every = np.ones(len(some.points), bool)
-    perfect = start.fit(start.start(HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)), every)
-    probes = fit_probe(start, every, perfect), start.start(perfect)
-    every = np.ones(len(scan.points), bool)
+    perfect = start.fit(start.start(NO_FIT), every)
+    probe, every = fit_probe(start, every, perfect), np.ones(len(scan.points), bool)
     found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
-    for probe in probes:
-        read_at, last = _read_at(scan.points, probe.sensors_m), -np.inf
-        for gap in reversed(GAPS):
-            near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
-            if near or gap == GAPS[-1]:
-                fit = scan.model(Charges.around(read_at, gap * spacing)).fit(probe, every)
-                evidence = fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
-                found.append((evidence, gap, probe, fit))
-                pace.advance(len(found), len(probes) * len(GAPS))
-                if evidence < last:
-                    break
-                last = evidence
-    pace.advance(len(probes) * len(GAPS), len(probes) * len(GAPS))
+
+    def evidence(gap: float, probe: ProbeFit) -> float:
+        charges = Charges.around(_read_at(scan.points, probe.sensors_m), gap * spacing)
+        fit = scan.model(charges).fit(probe, every, found[-1][-1].number if found else None)
+        found.append((fit.log_evidence - float(probe.instrument @ probe.instrument) / 2, gap,
+                      probe, fit))
+        pace.advance(len(found), len(GAPS) + 1)
+        return found[-1][0]
+
+    last, read_at = -np.inf, _read_at(scan.points, probe.sensors_m)
+    for gap in reversed(GAPS):
+        near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
+        if near or gap == GAPS[-1]:
+            now = evidence(gap, probe)
+            if now < last:
+                break
+            last = now
+    evidence(max(found, key=lambda each: each[0])[1], start.start(perfect))
+    pace.advance(len(GAPS) + 1, len(GAPS) + 1)
     _, gap, probe, fit = max(found, key=lambda each: each[0])
     return gap * spacing, probe.sensors_m, fit
 

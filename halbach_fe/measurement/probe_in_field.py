@@ -28,8 +28,9 @@ from a fit of nearly the same readings."""
 HALVINGS = 8
 """Number of times that a step is halved until it improves the fit."""
 
-AT_REST = 1.0
-"""Decrease of chi-squared below which the fit is at rest, of thousands of readings."""
+NEARLY_AT_REST = 10.0
+"""Decrease of chi-squared, of thousands of readings, below which a step is taken as if they were
+linear in it."""
 
 STEEPER = 100.0
 """Ratio of the squared gradients of nine tenths and one tenth of the readings from which the noise
@@ -150,6 +151,12 @@ class ProbeModel:
         self.scatter, self.weights = scatter, weights_of(scatter)
         self._last: list[Any] = []
 
+    def turned(self, matrix: Floats) -> Self:
+        """Return a model of the components that a matrix (3, 3) makes of the readings."""
+        other = copy(self)
+        other.field = self.field @ matrix.T
+        return other
+
     def with_terms(self, kept: NDArray[np.bool_]) -> Self:
         """Return a model whose instrument has some of all parameters (p,) only."""
         other = copy(self)
@@ -202,7 +209,8 @@ class ProbeModel:
         value = (self.charges, at.instrument * self.prior_sd, rows)
         if not (self._last and self._last[0] is value[0] and all(
                 np.array_equal(*each) for each in zip(self._last[1:3], value[1:], strict=True))):
-            self._last[:] = [*value, self.weights, FreeField(
+            self._last.clear()  # before the next one is made, which is as large
+            self._last += [*value, self.weights, FreeField(
                 self.by_amplitude(at, rows).reshape(-1, len(self.charges)), 0.0)]
         elif self._last[3] is not self.weights:
             ratio = (self.weights / self._last[3])[rows].ravel()
@@ -318,15 +326,14 @@ def fit_probe(
     for number in range(iterations + 1):
         design, by_field, covariance = state.normal()
         step, used = state.step(design, covariance), state.used(design, by_field, covariance)
-        after = state
-        if number < iterations and state.decrease(design, step) > AT_REST:
-            after = state.stepped(step)
+        linear = number == iterations or state.decrease(design, step) < NEARLY_AT_REST
+        after = state.linear(step, design, by_field) if linear else state.stepped(step)
         sigma = float(np.sqrt(after.left @ after.left / max(len(after.left) - used, 1.0)))
-        state, at_rest = after.with_noise(sigma, replace(
-            after.at, covariance=sigma**2 * covariance, used=used)), after is state
-        if at_rest:
-            break
-    return state.at
+        found = replace(after.at, sigma=sigma, covariance=sigma**2 * covariance, used=used)
+        if linear or after is state:
+            return found
+        state = after.with_noise(sigma, found)
+    raise AssertionError  # the last step is a linear one
 
 
 @dataclass(frozen=True)
@@ -442,6 +449,12 @@ class State:
     def decrease(self, design: Floats, step: Floats) -> float:
         """Return by how much a step decreases `chi2`, if the readings are linear in it."""
         return float(step @ (design.T @ self.left / self.at.sigma**2 - self.at.instrument))
+
+    def linear(self, step: Floats, design: Floats, left: Floats) -> State:
+        """Return the state after a step in which the readings are linear, see `normal`."""
+        at = replace(self.at, instrument=self.at.instrument + step, amplitudes=(
+            self.at.amplitudes - self.free.amplitudes(design @ step)))
+        return replace(self, at=at, left=self.left - left @ step)
 
     def stepped(self, step: Floats) -> State:
         """Return the state after a step, or a part of it that improves the fit; this one if none
