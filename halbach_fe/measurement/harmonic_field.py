@@ -29,6 +29,10 @@ CLOSENESS = 0.6
 """Distance of charges from each other, relative to that from the region: where they are as far from
 each other as from a point, the field there is rough."""
 
+ENOUGH_FOR_A_THREAD = 500_000
+"""Number of pairs of points and charges that a thread computes in some milliseconds, in which many
+could be started."""
+
 AT_ONCE = 4096
 """Number of readings whose remaining noise is computed at a time, which limits the memory."""
 
@@ -115,7 +119,37 @@ class Charges:
 
         points = np.ascontiguousarray(points, float)
         in_threads(lambda first, last: getattr(charge_kernel, name)(
-            points, *values, first, last, out), share_out(len(points)))
+            points, *values, first, last, out), share_out(
+                len(points), 1 + len(points) * len(self.places) // ENOUGH_FOR_A_THREAD))
+
+
+@dataclass(frozen=True)
+class FewCharges(Charges):
+    """Combinations of charges that readings determine: amplitudes (r,) of ``vectors`` (k, r)."""
+
+    vectors: Floats
+
+    def __len__(self) -> int:
+        """Return the number of combinations."""
+        return self.vectors.shape[1]
+
+    def fields(self, points: Floats) -> Floats:
+        """Return B (n, 3, r) at points (n, 3) in m per amplitude."""
+        all_of_them = Charges(self.places, self.scale).fields(points)
+        return (all_of_them.reshape(3 * len(points), -1) @ self.vectors).reshape(
+            len(points), 3, -1)
+
+    def fields_along(self, points: Floats, directions: Floats) -> Floats:
+        """Return B . u (n, r) per amplitude, for u (n, 3)."""
+        return Charges(self.places, self.scale).fields_along(points, directions) @ self.vectors
+
+    def field(self, points: Floats, amplitudes: Floats) -> Floats:
+        """Return B (n, 3) in T for amplitudes (r,)."""
+        return super().field(points, self.vectors @ amplitudes)
+
+    def gradient(self, points: Floats, amplitudes: Floats) -> Floats:
+        """Return the gradient (n, 3, 3) in 1/m of the field of amplitudes (r,)."""
+        return super().gradient(points, self.vectors @ amplitudes)
 
 
 def spacing_of(points: Floats, gap: float) -> float:
@@ -178,6 +212,10 @@ positive definite matrices too."""
 PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
 """Penalties among which the evidence chooses, in units of the mean information per amplitude."""
 
+LEAST_KNOWN = 0.01
+"""Information that readings have of a combination of amplitudes, in units of that of the prior, up
+to which it is left out: the fit has 1 % of it at most."""
+
 USUAL = 8
 """Number of the penalty from which the search for the most probable one starts."""
 
@@ -232,6 +270,16 @@ class FreeField:
     def of_noise(self, penalty: float) -> FreeField:
         """Return the same for another penalty."""
         return FreeField(self.by_amplitude, penalty, self.gram, self.dual)
+
+    def determined(self, penalty: float) -> Floats:
+        """Return the combinations (k, r) of amplitudes that readings tell more of than a share
+        `LEAST_KNOWN` of what is known before them.
+        """
+        values, vectors = linalg.eigh(self.gram, check_finite=False)
+        kept = values > LEAST_KNOWN * max(penalty, ROUNDING * self.mean)
+        if not self.dual:
+            return np.asarray(vectors[:, kept])
+        return np.asarray(self.by_amplitude.T @ (vectors[:, kept] / np.sqrt(values[kept])))
 
     def part(self, rows: NDArray[np.bool_], rest: FreeField | None = None) -> FreeField:
         """Return the same for some of the readings (m,), of which ``rest`` has all others."""

@@ -38,6 +38,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.harmonic_field import (
     NO_FIT,
     Charges,
+    FewCharges,
     FreeField,
     HarmonicFit,
     spacing_of,
@@ -48,7 +49,6 @@ from halbach_fe.measurement.probe_in_field import (
     LAG,
     MATRICES,
     MIXING,
-    NEXT_ITERATIONS,
     OFFSETS,
     PAIRS,
     TURNS,
@@ -57,7 +57,6 @@ from halbach_fe.measurement.probe_in_field import (
     ProbeModel,
     fit_probe,
     scatter_of,
-    weights_of,
 )
 from halbach_fe.measurement.scan_lines import (
     HELD_OUT_EVERY,
@@ -98,7 +97,7 @@ rough. In a bore of 46 mm that was mapped to 18 mm in steps of 5 mm, 5.5 mm at a
 left 0.6 mT of held-out lines, and 5.5 mm at 5 mm 1.9 mT."""
 
 WEIGHTINGS = 2
-"""Number of times that the readings are weighted anew, after the first. In six maps with sensors
+"""Number of times that the readings of the first fit are weighted anew. In six maps with sensors
 millimetres apart, the largest of nine errors of their places was 5 to 19 standard deviations with
 the first weights, 3.3 with these, and 3.3 with more."""
 
@@ -592,19 +591,19 @@ class _Fitted:
         """Prior variance of the amplitudes in T^2."""
         return self.fit.sigma**2 / self.fit.penalty
 
-    def weighted(self, rows: NDArray[np.bool_]) -> _Fitted:
+    def weighted(self, rows: NDArray[np.bool_], times: int = 1) -> _Fitted:
         """Return the fit of some rows that are weighted anew."""
         fitted = self
-        for number in range(WEIGHTINGS):
+        for number in range(times):
             model, fit = fitted.model.weighted(fitted.at, rows, fitted.width2), fitted.fit
             if not number:  # the width of the prior, now that the instrument is no noise
                 fit = model.fit(fitted.at, rows, fit.number)
-            fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, NEXT_ITERATIONS), fit)
+            fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, FEW_ITERATIONS), fit)
         return fitted
 
     def by(self, rows: NDArray[np.bool_]) -> _Fitted:
         """Return the fit of other rows."""
-        return replace(self, at=fit_probe(self.model, rows, self.fit, self.at, NEXT_ITERATIONS))
+        return replace(self, at=fit_probe(self.model, rows, self.fit, self.at, FEW_ITERATIONS))
 
     @property
     def left(self) -> Floats:
@@ -640,8 +639,11 @@ def _first_fit(scan: Scan, rows: _Rows, pace: Pace) -> _Fitted:
     """Return the fit of the field and of all parameters of the instrument."""
     gap, sensors, fit = _gap(scan.of(rows.train), pace)
     # around all rows, of which those that are not fitted are read too
-    model = scan.model(Charges.around(_read_at(scan.points[rows.usable], sensors), gap))
-    return _Fitted(model, fit_probe(model, rows.train, fit), fit).weighted(rows.train)
+    charges = Charges.around(_read_at(scan.points[rows.usable], sensors), gap)
+    model = scan.model(charges)
+    free = model.free(model.start(NO_FIT), rows.chosen, 0.0)
+    model = scan.model(FewCharges(charges.places, charges.scale, free.determined(fit.penalty)))
+    return _Fitted(model, fit_probe(model, rows.train, fit), fit).weighted(rows.train, WEIGHTINGS)
 
 
 def _without_spikes(

@@ -21,12 +21,16 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.measurement.harmonic_field import Charges, FreeField, HarmonicFit
 from halbach_fe.measurement.suspect_rows import scatter_around
 
-ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
-"""Largest number of steps of the fit of field and instrument, while orientations are tried, and
-from a fit of nearly the same readings."""
+ITERATIONS, FEW_ITERATIONS = 12, 2
+"""Largest number of steps of the fit of field and instrument before the last, linear one, and while
+orientations are tried or from a fit of nearly the same readings."""
 
 HALVINGS = 8
 """Number of times that a step is halved until it improves the fit."""
+
+NEAR = 0.1
+"""Change of an instrument, in units of its prior, up to which a design is used again: readings per
+amplitude change by some per cent, and residuals are those of the exact ones."""
 
 NEARLY_AT_REST = 10.0
 """Decrease of chi-squared, of thousands of readings, below which a step is taken as if they were
@@ -150,6 +154,7 @@ class ProbeModel:
         self.prior_sd = self.any_sd = sd
         self.scatter, self.weights = scatter, weights_of(scatter)
         self._last: list[Any] = []
+        self.near = NEAR * sd
 
     def turned(self, matrix: Floats) -> Self:
         """Return a model of the components that a matrix (3, 3) makes of the readings."""
@@ -204,13 +209,15 @@ class ProbeModel:
     def free(self, at: ProbeFit, rows: NDArray[np.bool_], penalty: float) -> FreeField:
         """Return what the field leaves of the readings of some rows, for a penalty.
 
-        The last design is kept, which most calls share: weights scale it.
+        The last design is kept, which most calls share: weights scale it, and for an instrument
+        that has hardly changed it is one by which the fit still converges, see `target`.
         """
-        value = (self.charges, at.instrument * self.prior_sd, rows)
-        if not (self._last and self._last[0] is value[0] and all(
-                np.array_equal(*each) for each in zip(self._last[1:3], value[1:], strict=True))):
+        value = at.instrument * self.prior_sd
+        kept = self._last and self._last[0] is self.charges and np.array_equal(
+            rows, self._last[1]) and bool((np.abs(value - self._last[2]) <= self.near).all())
+        if not kept:
             self._last.clear()  # before the next one is made, which is as large
-            self._last += [*value, self.weights, FreeField(
+            self._last += [self.charges, rows, value, self.weights, FreeField(
                 self.by_amplitude(at, rows).reshape(-1, len(self.charges)), 0.0)]
         elif self._last[3] is not self.weights:
             ratio = (self.weights / self._last[3])[rows].ravel()
@@ -219,9 +226,16 @@ class ProbeModel:
         return self._last[4].of_noise(penalty)
 
     def target(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the weighted readings (3 n,) in T without the change of the sensors' offsets."""
-        return np.asarray(((self.field[rows] - self.offsets(at, rows))
-                           * self.weights[rows]).ravel())
+        """Return the weighted readings (3 n,) in T that the amplitudes explain, by `free`.
+
+        They are those without the change of the sensors' offsets, and with what the kept design
+        differs from that of ``at``.
+        """
+        if len(at.amplitudes) != len(self.charges):
+            return np.asarray(((self.field[rows] - self.offsets(at, rows))
+                               * self.weights[rows]).ravel())
+        left = (self.field[rows] - self.readings(at, rows)) * self.weights[rows]
+        return left.ravel() + self.free(at, rows, 0.0).by_amplitude @ at.amplitudes
 
     def offsets(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the change (n, 3) in T of the sensors' offsets."""
