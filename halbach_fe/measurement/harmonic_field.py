@@ -216,8 +216,8 @@ LEAST_KNOWN = 0.01
 """Information that readings have of a combination of amplitudes, in units of that of the prior, up
 to which it is left out: the fit has 1 % of it at most."""
 
-USUAL = 8
-"""Number of the penalty from which the search for the most probable one starts."""
+EVERY = 4
+"""Number of penalties of which one is tried first."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ class HarmonicFit:
     sigma: float
     log_evidence: float
     used: float
-    number: int = USUAL
+    number: int = 0
 
 
 NO_FIT = HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)
@@ -368,8 +368,9 @@ class FreeField:
     def most_probable(self, readings: Floats, near: int | None = None) -> HarmonicFit:
         """Return the fit of readings (m,) by the penalty of largest evidence.
 
-        It is searched from the number ``near`` of one of `PENALTIES`, if one is known, and of one
-        maximum: the more the prior allows, the less it explains by what is not there.
+        It is searched around the number ``near`` of one of `PENALTIES`, if one is known, else
+        around the best of every few: readings near magnets have two maxima, as far from sources
+        they have another noise.
         """
         tried: dict[int, tuple[float, float]] = {}
 
@@ -381,8 +382,9 @@ class FreeField:
                     tried[number] = -np.inf, 1.0
             return tried[number][0]
 
-        best = _climbed(evidence, USUAL if near is None else near, 4 if near is None else 1,
-                        len(PENALTIES))
+        if near is None:
+            near = max(range(0, len(PENALTIES), EVERY), key=evidence)
+        best = _climbed(evidence, near, EVERY // 2, len(PENALTIES))
         field, (found, sigma) = self.by_penalty[best], tried[best]
         return HarmonicFit(field.amplitudes(readings), field.penalty, sigma, found,
                            len(readings) - field.trace, best)

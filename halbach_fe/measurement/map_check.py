@@ -800,7 +800,7 @@ def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
 
     def evidence(gap: float, probe: ProbeFit) -> float:
         charges = Charges.around(_read_at(scan.points, probe.sensors_m), gap * spacing)
-        fit = scan.model(charges).fit(probe, every, found[-1][-1].number if found else None)
+        fit = scan.model(charges).fit(probe, every)
         found.append((fit.log_evidence - float(probe.instrument @ probe.instrument) / 2, gap,
                       probe, fit))
         pace.advance(len(found), len(GAPS) + 1)

@@ -97,7 +97,8 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
     left = model.noise_left(at, rows, width2)
     by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(charges))
     information = by_amplitude.T @ by_amplitude
-    prior = max(at.sigma**2 / width2, harmonic_field.ROUNDING * np.trace(information) / len(charges))
+    prior = max(at.sigma**2 / width2,
+                harmonic_field.ROUNDING * np.trace(information) / len(charges))
     fitted = by_amplitude @ np.linalg.solve(
         information + prior * np.eye(len(charges)), by_amplitude.T)
     rest = np.eye(len(fitted)) - fitted
