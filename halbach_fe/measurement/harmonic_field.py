@@ -9,13 +9,15 @@ amplitudes have a normal prior of mean 0, whose width the evidence of the readin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import factorial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
@@ -26,6 +28,13 @@ MOST_CHARGES = 3300
 CLOSENESS = 0.6
 """Distance of charges from each other, relative to that from the region: where they are as far from
 each other as from a point, the field there is rough."""
+
+ENOUGH_FOR_A_THREAD = 500_000
+"""Number of pairs of points and charges that a thread computes in some milliseconds, in which many
+could be started."""
+
+AT_ONCE = 4096
+"""Number of readings whose remaining noise is computed at a time, which limits the memory."""
 
 UNIFORM = 1e3
 """Prior width of the uniform field in units of the charges' field: it is as good as free."""
@@ -110,7 +119,37 @@ class Charges:
 
         points = np.ascontiguousarray(points, float)
         in_threads(lambda first, last: getattr(charge_kernel, name)(
-            points, *values, first, last, out), share_out(len(points)))
+            points, *values, first, last, out), share_out(
+                len(points), 1 + len(points) * len(self.places) // ENOUGH_FOR_A_THREAD))
+
+
+@dataclass(frozen=True)
+class FewCharges(Charges):
+    """Combinations of charges that readings determine: amplitudes (r,) of ``vectors`` (k, r)."""
+
+    vectors: Floats
+
+    def __len__(self) -> int:
+        """Return the number of combinations."""
+        return self.vectors.shape[1]
+
+    def fields(self, points: Floats) -> Floats:
+        """Return B (n, 3, r) at points (n, 3) in m per amplitude."""
+        all_of_them = Charges(self.places, self.scale).fields(points)
+        return (all_of_them.reshape(3 * len(points), -1) @ self.vectors).reshape(
+            len(points), 3, -1)
+
+    def fields_along(self, points: Floats, directions: Floats) -> Floats:
+        """Return B . u (n, r) per amplitude, for u (n, 3)."""
+        return Charges(self.places, self.scale).fields_along(points, directions) @ self.vectors
+
+    def field(self, points: Floats, amplitudes: Floats) -> Floats:
+        """Return B (n, 3) in T for amplitudes (r,)."""
+        return super().field(points, self.vectors @ amplitudes)
+
+    def gradient(self, points: Floats, amplitudes: Floats) -> Floats:
+        """Return the gradient (n, 3, 3) in 1/m of the field of amplitudes (r,)."""
+        return super().gradient(points, self.vectors @ amplitudes)
 
 
 def spacing_of(points: Floats, gap: float) -> float:
@@ -166,6 +205,21 @@ def solid_harmonic_fields(points: Floats, degrees: int) -> Floats:
     return np.stack(columns, axis=2)
 
 
+ROUNDING = 1e-13
+"""Smallest penalty in units of the mean information per amplitude, so that maps without noise have
+positive definite matrices too."""
+
+PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
+"""Penalties among which the evidence chooses, in units of the mean information per amplitude."""
+
+LEAST_KNOWN = 0.01
+"""Information that readings have of a combination of amplitudes, in units of that of the prior, up
+to which it is left out: the fit has 1 % of it at most."""
+
+EVERY = 4
+"""Number of penalties of which one is tried first."""
+
+
 @dataclass(frozen=True)
 class HarmonicFit:
     """Amplitudes of charges, or of solid harmonics, that fit readings without any instrument.
@@ -181,6 +235,8 @@ class HarmonicFit:
         Log probability of the readings, up to a constant, at the most probable penalty and sigma.
     used : float
         Number of amplitudes that the readings determine.
+    number : int
+        That of the penalty in `PENALTIES`.
     """
 
     amplitudes: Floats
@@ -188,13 +244,163 @@ class HarmonicFit:
     sigma: float
     log_evidence: float
     used: float
+    number: int = 0
 
 
-ROUNDING = 1e-14
-"""Relative size of eigenvalues below which they are rounding."""
+NO_FIT = HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)
+"""What a search starts from that does not use it."""
 
-PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
-"""Penalties among which the evidence chooses, in units of the mean information per amplitude."""
+
+class FreeField:
+    """What the prior field of the charges leaves of readings: ``P = (1 + A A^T / penalty)^-1``.
+
+    ``A`` (m, k) are the readings by amplitude, and ``penalty`` is the ratio of the variances of
+    noise and amplitudes. ``P`` follows from the smaller one of A A^T and A^T A, the ``gram``.
+    """
+
+    def __init__(self, by_amplitude: Floats, penalty: float, gram: Floats | None = None,
+                 dual: bool | None = None) -> None:
+        self.by_amplitude = by_amplitude
+        self.dual = len(by_amplitude) <= by_amplitude.shape[1] if dual is None else dual
+        tall = by_amplitude if self.dual else by_amplitude.T
+        self.gram = tall @ tall.T if gram is None else gram
+        self.mean = float(np.trace(self.gram)) / by_amplitude.shape[1]
+        self.penalty = max(penalty, ROUNDING * self.mean)
+
+    def of_noise(self, penalty: float) -> FreeField:
+        """Return the same for another penalty."""
+        return FreeField(self.by_amplitude, penalty, self.gram, self.dual)
+
+    def determined(self, penalty: float) -> Floats:
+        """Return the combinations (k, r) of amplitudes that readings tell more of than a share
+        `LEAST_KNOWN` of what is known before them.
+        """
+        values, vectors = linalg.eigh(self.gram, check_finite=False)
+        kept = values > LEAST_KNOWN * max(penalty, ROUNDING * self.mean)
+        if not self.dual:
+            return np.asarray(vectors[:, kept])
+        return np.asarray(self.by_amplitude.T @ (vectors[:, kept] / np.sqrt(values[kept])))
+
+    def part(self, rows: NDArray[np.bool_], rest: FreeField | None = None) -> FreeField:
+        """Return the same for some of the readings (m,), of which ``rest`` has all others."""
+        if self.dual:
+            gram = self.gram[np.ix_(rows, rows)]
+        else:
+            gram = None if rest is None else self.gram - rest.gram
+        return FreeField(self.by_amplitude[rows], self.penalty, gram, self.dual)
+
+    @cached_property
+    def lower(self) -> Floats:
+        """The lower triangle of the Cholesky decomposition of the gram and the penalty."""
+        with_prior = self.gram.copy()
+        with_prior[np.diag_indices(len(with_prior))] += self.penalty
+        return np.asarray(linalg.cholesky(with_prior, lower=True, overwrite_a=True,
+                                          check_finite=False))
+
+    def solve(self, values: Floats) -> Floats:
+        """Return the inverse of gram and penalty times values."""
+        return np.asarray(linalg.cho_solve((self.lower, True), values, check_finite=False))
+
+    def left(self, readings: Floats) -> Floats:
+        """Return P times readings (m,) or (m, p)."""
+        if self.dual:
+            return self.penalty * self.solve(readings)
+        return np.asarray(readings - self.by_amplitude @ self.amplitudes(readings))
+
+    def amplitudes(self, readings: Floats) -> Floats:
+        """Return the most probable amplitudes (k,) or (k, p)."""
+        if self.dual:
+            return np.asarray(self.by_amplitude.T @ self.solve(readings))
+        return self.solve(self.by_amplitude.T @ readings)
+
+    @cached_property
+    def trace(self) -> float:
+        """Trace of P: the number of readings that the field does not use up."""
+        inverse, info = linalg.lapack.dtrtri(self.lower, lower=1)
+        assert info == 0  # the factor is that of a Cholesky decomposition
+        rest = 0 if self.dual else len(self.by_amplitude) - self.by_amplitude.shape[1]
+        return rest + self.penalty * float(np.vdot(inverse, inverse))
+
+    def diagonal(self) -> Floats:
+        """Return the diagonal (m,) of P."""
+        if self.dual:
+            inverse, _ = linalg.lapack.dtrtri(self.lower, lower=1)
+            return np.asarray(self.penalty * np.einsum("ij,ij->j", inverse, inverse))
+        return np.concatenate([1 - np.sum(half**2, axis=0) for half in self._halves()])
+
+    def diagonals(self) -> tuple[Floats, Floats]:
+        """Return the diagonals (m,) of P and of P^2."""
+        if self.dual:
+            whole = self.penalty * self.solve(np.eye(len(self.gram)))
+            return np.diag(whole).copy(), np.sum(whole**2, axis=0)
+        once, twice = [], []
+        for half in self._halves():
+            once.append(1 - np.sum(half**2, axis=0))
+            solved = linalg.solve_triangular(self.lower, half, trans=1, lower=True,
+                                             check_finite=False)
+            twice.append(once[-1] - self.penalty * np.sum(solved**2, axis=0))
+        return np.concatenate(once), np.concatenate(twice)
+
+    def _halves(self) -> Iterator[Floats]:
+        """Yield half of the way to the solutions for some columns (k, m) of A^T at a time."""
+        for first in range(0, len(self.by_amplitude), AT_ONCE):
+            yield np.asarray(linalg.solve_triangular(
+                self.lower, self.by_amplitude[first:first + AT_ONCE].T, lower=True,
+                check_finite=False))
+
+    def log_evidence(self, readings: Floats) -> tuple[float, float]:
+        """Return the log probability of readings (m,), up to a constant, and the noise in T."""
+        if self.dual:
+            rest = self.penalty * float(readings @ self.solve(readings))
+        else:
+            rest = float(readings @ readings) - float(
+                readings @ (self.by_amplitude @ self.amplitudes(readings)))
+        sigma = float(np.sqrt(max(rest, 1e-30) / len(readings)))
+        size = 2 * float(np.log(np.diag(self.lower)).sum()) - len(self.lower) * np.log(
+            self.penalty)
+        return -len(readings) * np.log(sigma) - size / 2, sigma
+
+    @cached_property
+    def by_penalty(self) -> list[FreeField]:
+        """The same for each of `PENALTIES`, in units of `mean`."""
+        return [self.of_noise(penalty * self.mean) for penalty in PENALTIES]
+
+    def most_probable(self, readings: Floats, near: int | None = None) -> HarmonicFit:
+        """Return the fit of readings (m,) by the penalty of largest evidence.
+
+        It is searched around the number ``near`` of one of `PENALTIES`, if one is known, else
+        around the best of every few: readings near magnets have two maxima, as far from sources
+        they have another noise.
+        """
+        tried: dict[int, tuple[float, float]] = {}
+
+        def evidence(number: int) -> float:
+            if number not in tried:
+                try:
+                    tried[number] = self.by_penalty[number].log_evidence(readings)
+                except linalg.LinAlgError:  # the penalty is below the rounding of the gram
+                    tried[number] = -np.inf, 1.0
+            return tried[number][0]
+
+        if near is None:
+            near = max(range(0, len(PENALTIES), EVERY), key=evidence)
+        best = _climbed(evidence, near, EVERY // 2, len(PENALTIES))
+        field, (found, sigma) = self.by_penalty[best], tried[best]
+        return HarmonicFit(field.amplitudes(readings), field.penalty, sigma, found,
+                           len(readings) - field.trace, best)
+
+
+def _climbed(value: Callable[[int], float], start: int, step: int, count: int) -> int:
+    """Return the number below ``count`` of the largest value of one maximum, near a first one."""
+    best = start
+    while step:
+        ahead = [other for other in (best - step, best + step)
+                 if 0 <= other < count and value(other) > value(best)]
+        if ahead:
+            best = ahead[0]
+        else:
+            step //= 2
+    return best
 
 
 def fit_fields(charges: Charges, points: Floats, fields: Sequence[Floats]) -> list[HarmonicFit]:
@@ -209,35 +415,5 @@ def fit_fields(charges: Charges, points: Floats, fields: Sequence[Floats]) -> li
 
 def fit_readings(design: Floats, readings: Sequence[Floats]) -> list[HarmonicFit]:
     """Fit each of some readings (m,) in T, of which ``design`` (m, k) is that per amplitude."""
-    count = design.shape[1]
-    if len(design) < count:  # the same by the smaller matrix
-        values, left = np.linalg.eigh(design @ design.T)
-        kept = values > ROUNDING * values[-1]
-        values, left = values[kept], left[:, kept]
-        vectors, projections = design.T @ (left / np.sqrt(values)), left * np.sqrt(values)
-    else:
-        values, vectors = np.linalg.eigh(design.T @ design)
-        values, projections = np.maximum(values, 0.0), design @ vectors
-    return [_most_probable(values, vectors, projections.T @ each, each, count)
-            for each in readings]
-
-
-def _most_probable(
-    values: Floats, vectors: Floats, projected: Floats, readings: Floats, count: int
-) -> HarmonicFit:
-    """Return the fit of largest evidence.
-
-    ``values`` and ``vectors`` belong to the information of ``count`` amplitudes, but for values of
-    0, and ``projected`` are the products of the vectors with it.
-    """
-    best: HarmonicFit | None = None
-    for penalty in PENALTIES * values.sum() / count:
-        rest = float(readings @ readings - np.sum(projected**2 / (values + penalty)))
-        sigma = np.sqrt(max(rest, 1e-30) / len(readings))
-        evidence = (-len(readings) * np.log(sigma)
-                    - float(np.log1p(values / penalty).sum()) / 2)
-        if best is None or evidence > best.log_evidence:
-            best = HarmonicFit(vectors @ (projected / (values + penalty)), float(penalty),
-                               float(sigma), evidence, float(np.sum(values / (values + penalty))))
-    assert best is not None  # there are penalties
-    return best
+    free = FreeField(design, 0.0)
+    return [free.most_probable(each) for each in readings]

@@ -30,6 +30,9 @@ from halbach_fe.measurement.suspect_rows import scatter_around
 TERMS = len(PRIOR_SD)
 """Number of the terms of a probe."""
 
+NEAR_PLACED = (*(3e-4,) * 3, *(3e-3,) * 3, 1e-2)
+"""Changes of these up to which a design is used again, see `NEAR`."""
+
 SHIFT, TURN, GAIN = slice(0, 3), slice(3, 6), 6
 """Places of a map's own numbers: shift of its middle, turn about it, and gain of |B|."""
 
@@ -137,6 +140,9 @@ class JoinedModel(ProbeModel):
                                       *(PLACED_SD,) * len(maps)])
         self.prior_sd = self.any_sd
         self.ends = np.cumsum([0, *(len(one.points) for one in maps)])
+        self._last = []
+        self.near = np.concatenate([*(one.near for one in (maps[0], *maps)),
+                                    *(NEAR_PLACED,) * len(maps)])
 
     def rows_of(self, number: int) -> slice:
         """Return the rows of a map."""
@@ -248,7 +254,7 @@ class JoinedModel(ProbeModel):
             alone = self.alone(at, number, rows, width2)
             known = self.only(number, rows)
             left = (self.field[known] - self.readings(alone.at, known)) / np.maximum(
-                alone.free.diagonals()[0].reshape(-1, 3), LEAST_OWN)
+                alone.free.diagonal().reshape(-1, 3), LEAST_OWN)
             points = self.maps[number].points
             other.scatter[self.rows_of(number)] = scatter_around(points, points[own], left)
         other.weights = weights_of(other.scatter)

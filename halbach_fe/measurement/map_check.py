@@ -36,10 +36,11 @@ from halbach_fe.measurement.field_map import (
     refuse_undirected,
 )
 from halbach_fe.measurement.harmonic_field import (
+    NO_FIT,
     Charges,
+    FewCharges,
+    FreeField,
     HarmonicFit,
-    fit_fields,
-    fit_readings,
     spacing_of,
 )
 from halbach_fe.measurement.probe_in_field import (
@@ -48,7 +49,6 @@ from halbach_fe.measurement.probe_in_field import (
     LAG,
     MATRICES,
     MIXING,
-    NEXT_ITERATIONS,
     OFFSETS,
     PAIRS,
     TURNS,
@@ -57,7 +57,6 @@ from halbach_fe.measurement.probe_in_field import (
     ProbeModel,
     fit_probe,
     scatter_of,
-    weights_of,
 )
 from halbach_fe.measurement.scan_lines import (
     HELD_OUT_EVERY,
@@ -118,6 +117,10 @@ UNLIKE = 0.5
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
 instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
+
+NEARLY_ALIKE = 300.0
+"""The same in a linear instrument, from which orientations are no longer tried: errors of usual
+sizes are not quite linear."""
 
 WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
@@ -489,12 +492,13 @@ def _remaining(
     residual = whole.left
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
-        model.noise_left(whole.at, chosen, whole.width2)[1], LEAST_LEFT))
+        model.noise_left(whole.at, chosen, whole.width2), LEAST_LEFT))
     scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
-    (as_given,) = fit_fields(model.charges, points[chosen], [given[chosen]])
+    fields = FreeField(model.charges.fields(points[chosen]).reshape(-1, len(model.charges)), 0.0)
+    as_given = fields.most_probable(given[chosen].ravel(), whole.fit.number)
     return {
-        "rms_as_given_T": _rms(given[chosen]
-                               - model.charges.fields(points[chosen]) @ as_given.amplitudes),
+        "rms_as_given_T": _rms(given[chosen] - (
+            fields.by_amplitude @ as_given.amplitudes).reshape(-1, 3)),
         "rms_T": _rms(residual[chosen] @ np.abs(matrix)), "floor_T": _rms(floor @ np.abs(matrix)),
         "windows": _windows(points[chosen], residual[chosen] @ np.abs(matrix)),
         "noise_T": scatter.noise_T, "position_noise_m": scatter.position_m,
@@ -590,16 +594,16 @@ class _Fitted:
     def weighted(self, rows: NDArray[np.bool_]) -> _Fitted:
         """Return the fit of some rows that are weighted anew."""
         fitted = self
-        for _ in range(WEIGHTINGS):
-            model = fitted.model.weighted(fitted.at, rows, fitted.width2)
-            # the prior width of the field, now that the instrument no longer counts as noise
-            fit = model.fit(fitted.at, rows)
-            fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, NEXT_ITERATIONS), fit)
+        for number in range(WEIGHTINGS):
+            model, fit = fitted.model.weighted(fitted.at, rows, fitted.width2), fitted.fit
+            if not number:  # the width of the prior, now that the instrument is no noise
+                fit = model.fit(fitted.at, rows, fit.number)
+            fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, FEW_ITERATIONS), fit)
         return fitted
 
     def by(self, rows: NDArray[np.bool_]) -> _Fitted:
         """Return the fit of other rows."""
-        return replace(self, at=fit_probe(self.model, rows, self.fit, self.at, NEXT_ITERATIONS))
+        return replace(self, at=fit_probe(self.model, rows, self.fit, self.at, FEW_ITERATIONS))
 
     @property
     def left(self) -> Floats:
@@ -635,7 +639,10 @@ def _first_fit(scan: Scan, rows: _Rows, pace: Pace) -> _Fitted:
     """Return the fit of the field and of all parameters of the instrument."""
     gap, sensors, fit = _gap(scan.of(rows.train), pace)
     # around all rows, of which those that are not fitted are read too
-    model = scan.model(Charges.around(_read_at(scan.points[rows.usable], sensors), gap))
+    charges = Charges.around(_read_at(scan.points[rows.usable], sensors), gap)
+    model = scan.model(charges)
+    free = model.free(model.start(NO_FIT), rows.chosen, 0.0)
+    model = scan.model(FewCharges(charges.places, charges.scale, free.determined(fit.penalty)))
     return _Fitted(model, fit_probe(model, rows.train, fit), fit).weighted(rows.train)
 
 
@@ -739,18 +746,24 @@ def _orientation(
     """
     spacing = point_spacing(scan.points)
     scan = scan.of(_some_points(scan.points))
-    charges, weights = Charges.around(scan.points, GAPS[-2] * spacing), weights_of(scan.scatter)
-    matrices = _orientations()
-    fits = fit_readings((weights[..., None] * charges.fields(scan.points)).reshape(
-        -1, len(charges)), [(weights * (scan.field @ matrix.T)).ravel() for matrix in matrices])
+    given, every = scan.model(Charges.around(scan.points, GAPS[-2] * spacing)), np.ones(
+        len(scan.points), bool)
+    perfect, matrices = given.start(NO_FIT), _orientations()
+    free = given.free(perfect, every, 0.0)
+    fits = [free.most_probable(given.turned(matrix).target(perfect, every))
+            for matrix in matrices]
     sigma = np.array([fit.sigma for fit in fits])
-    left = np.flatnonzero(sigma <= WORTH_TRYING * sigma.min())
+    left = np.flatnonzero(sigma <= WORTH_TRYING * sigma.min()).tolist()
     if len(left) == 1:
         return matrices[left[0]], ()
-    every, against = np.ones(len(scan.points), bool), {}
-    for number in left.tolist():
-        model = scan.turned(matrices[number]).model(charges)
-        fitted = fit_probe(model, every, fits[number], iterations=FEW_ITERATIONS)
+    nearly = {number: _linear_against(given.turned(matrices[number]), fits[number])
+              for number in left}
+    left = [number for number, value in nearly.items()
+            if not number or value <= min(nearly.values()) + NEARLY_ALIKE]
+    against = {}
+    for number in left:
+        fitted = fit_probe(given.turned(matrices[number]), every, fits[number],
+                           iterations=FEW_ITERATIONS)
         impossible = np.abs(fitted.instrument).max() > doubted_from(len(fitted.instrument))
         against[number] = np.inf if impossible and number else float(
             3 * len(every) * np.log(fitted.sigma) + fitted.instrument @ fitted.instrument / 2)
@@ -760,30 +773,49 @@ def _orientation(
     return matrices[best], tuple(_named(matrices[number]) for number in alike if number != best)
 
 
+def _linear_against(model: ProbeModel, fit: HarmonicFit) -> float:
+    """Return how improbable readings are, with an instrument in which they are linear."""
+    every = np.ones(len(model.points), bool)
+    (told,) = Evidence.of(model, every, model.start(fit), fit.sigma**2 / fit.penalty)
+    instrument, _ = told.estimate(np.arange(len(told.sums)))
+    readings = 3 * len(every)
+    return float(readings * (np.log(fit.sigma) + np.log(
+        1 - told.sums @ instrument / readings) / 2) + instrument @ instrument / 2)
+
+
 def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
     """Return the distance in m of the charges, where the sensors are, and the fit of the field.
 
     The distance is that from where sensors at (3, 3) in m read the field. The instrument is
     perfect, or is first fitted with some points and charges that are neither near nor far: those of
-    a map near edges of magnets, fitted by far charges, gave sensors 10 mm off.
+    a map near edges of magnets, fitted by far charges, gave sensors 10 mm off. Charges are tried
+    from far to near, which are more, until the evidence of the readings falls.
     """
     spacing, some = point_spacing(scan.points), scan.of(_some_points(scan.points))
     start = some.model(Charges.around(some.points, GAPS[-2] * spacing))
     every = np.ones(len(some.points), bool)
-    perfect = start.fit(start.start(HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)), every)
-    instrument = fit_probe(start, every, perfect)
-    every = np.ones(len(scan.points), bool)
+    perfect = start.fit(start.start(NO_FIT), every)
+    probe, every = fit_probe(start, every, perfect), np.ones(len(scan.points), bool)
     found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
-    probes = instrument, start.start(perfect)
-    for number, probe in enumerate(probes):
-        read_at = _read_at(scan.points, probe.sensors_m)
-        for place, gap in enumerate(GAPS):
-            near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
-            if near or gap == GAPS[-1]:
-                fit = scan.model(Charges.around(read_at, gap * spacing)).fit(probe, every)
-                evidence = fit.log_evidence - float(probe.instrument @ probe.instrument) / 2
-                found.append((evidence, gap, probe, fit))
-            pace.advance(number * len(GAPS) + place + 1, len(probes) * len(GAPS))
+
+    def evidence(gap: float, probe: ProbeFit) -> float:
+        charges = Charges.around(_read_at(scan.points, probe.sensors_m), gap * spacing)
+        fit = scan.model(charges).fit(probe, every)
+        found.append((fit.log_evidence - float(probe.instrument @ probe.instrument) / 2, gap,
+                      probe, fit))
+        pace.advance(len(found), len(GAPS) + 1)
+        return found[-1][0]
+
+    last, read_at = -np.inf, _read_at(scan.points, probe.sensors_m)
+    for gap in reversed(GAPS):
+        near = spacing_of(read_at, gap * spacing) <= TOO_FAR_APART * gap * spacing
+        if near or gap == GAPS[-1]:
+            now = evidence(gap, probe)
+            if now < last:
+                break
+            last = now
+    evidence(max(found, key=lambda each: each[0])[1], start.start(perfect))
+    pace.advance(len(GAPS) + 1, len(GAPS) + 1)
     _, gap, probe, fit = max(found, key=lambda each: each[0])
     return gap * spacing, probe.sensors_m, fit
 
@@ -874,11 +906,12 @@ def _stated(
     terms: tuple[InstrumentTerm, ...] = ()
     for number in range(ROUNDS):
         model = fitted.model.with_terms(~no_terms)
-        pairs = [rows, *_parts(model, fitted.at, rows)]
+        halves = _halves(model, fitted.at, rows)
+        parts = 1 + 2 * len(halves)
         told = []
-        for part in pairs:
-            told.append(Evidence.of(model, part, fitted.at, fitted.width2))
-            pace.advance(number * len(pairs) + len(told), ROUNDS * len(pairs))
+        for each in Evidence.of(model, rows, fitted.at, fitted.width2, halves):
+            told.append(each)
+            pace.advance(number * parts + len(told), ROUNDS * parts)
         parameters = all_parameters(model.prior_sd, model.shares(fitted.at))
         kept, terms = selected(parameters, told)
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
@@ -909,16 +942,16 @@ def selected(
         kept[list(max(new)[1])] = True
 
 
-def _parts(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return halves of the map, two by two: along x, y and z, and by how steep the field is."""
+def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Return one half of the map each along x, y and z, and by how steep the field is."""
     steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
     found: list[NDArray[np.bool_]] = []
     for values in (*model.points.T, steepness):
         middle = (float(np.median(values[rows])) if values is steepness
                   else (values[rows].max() + values[rows].min()) / 2)
-        halves = rows & (values <= middle), rows & (values > middle)
-        if min(half.sum() for half in halves) >= FEWEST_IN_PART:
-            found += halves
+        half = rows & (values <= middle)
+        if min(half.sum(), rows.sum() - half.sum()) >= FEWEST_IN_PART:
+            found.append(half)
     return found
 
 

@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.field_map import field_map, points_of
@@ -638,12 +638,12 @@ class _Joined:
     def with_terms(self) -> tuple[tuple[InstrumentTerm, ...], _Joined]:
         """Return the terms of the probe that are common, or of one map, and the fit with these."""
         open_terms, parameters = _own_terms(self.maps, self.model, self._shares())
-        told = [self._evidence(open_terms, self.rows)]
+        told = list(self._evidence(open_terms))
         kept = self.model.prior_sd > 0
         found = self
         at = np.flatnonzero(kept)
         if any(_stands_out(parameter, told[0], at) for parameter in parameters):
-            told += [self._evidence(open_terms, half) for half in self._halves()]
+            told = list(self._evidence(open_terms, self._halves()))
             new, _ = selected(parameters, told, kept)
             if (new & ~kept).any():
                 found = self._with(new)
@@ -660,18 +660,31 @@ class _Joined:
         return replace(self, model=model, at=fit_probe(
             model, self.rows, fit, replace(self.at, prior_sd=model.prior_sd)))
 
-    def _evidence(self, open_terms: NDArray[np.bool_], rows: NDArray[np.bool_]) -> Evidence:
-        """Return what some rows tell of some terms of the probe."""
-        return Evidence.of(self.model.with_terms(open_terms), rows, self.at, self.width2)
+    def _evidence(
+        self, open_terms: NDArray[np.bool_], halves: Sequence[NDArray[np.bool_]] = ()
+    ) -> Iterator[Evidence]:
+        """Return what the rows tell of some terms of the probe, and what halves of them do."""
+        return Evidence.of(self.model.with_terms(open_terms), self.rows, self.at, self.width2,
+                           halves)
 
     def _halves(self) -> list[NDArray[np.bool_]]:
-        """Return halves of the rows along x, y and z, which halve the overlaps."""
+        """Return one half of the rows along x, y and z each, which halve the overlaps."""
         shared = np.concatenate([self._shared(number) for number in range(len(self.maps))])
         places, found = self._points(), []
         for column in places.T:
             middle = float(np.median(column[shared & self.rows]))
-            found += [self.rows & (column <= middle), self.rows & (column > middle)]
+            found.append(self.rows & (column <= middle))
         return found
+
+    def _beyond(self, places: Ints) -> Floats:
+        """Return by how many bars the halves scatter about the whole (p,) in numbers of poses."""
+        whole, *halves = self._evidence(self.model.prior_sd > 0, self._halves())
+        used = np.flatnonzero(self.model.prior_sd > 0)
+        chosen = np.searchsorted(used, places)
+        (value, bars), *parts = [(mean[chosen], np.diag(covariance)[chosen]) for mean, covariance
+                                 in (told.estimate(used) for told in (whole, *halves))]
+        squares = [(mean - value)**2 / np.maximum(own - bars, 0.1 * own) for mean, own in parts]
+        return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
     def _shares(self) -> Floats:
         """Return how much gains and crosstalk change |B|, see `ProbeModel.shares`."""
@@ -729,13 +742,18 @@ class _Joined:
         self, signs: Sequence[int], terms: tuple[InstrumentTerm, ...],
         overlaps: tuple[Overlap, ...],
     ) -> JoinedMaps:
-        """Return the poses with their covariance, which the largest chi2 of an overlap widens."""
+        """Return the poses with their covariance.
+
+        The largest chi2 of an overlap widens it, and so does what its halves say: positions that
+        are off and what the charges do not follow are no noise, but differ by region.
+        """
         wider = max(1.0, *(one.chi2 for one in overlaps))
         model, numbers = self.model, range(1, len(self.maps))
         places = np.concatenate([np.arange(len(model.any_sd))[model.placed(number)][:6]
                                  for number in numbers])
         sd = model.prior_sd[places]
-        covariance = wider * self.at.covariance[np.ix_(places, places)] * np.outer(sd, sd)
+        sd = np.sqrt(wider) * np.maximum(1.0, self._beyond(places) / np.sqrt(wider)) * sd
+        covariance = self.at.covariance[np.ix_(places, places)] * np.outer(sd, sd)
         poses = []
         for number in numbers:
             pose, middle = model.pose(self.at, number), model.middles[number]
@@ -765,9 +783,24 @@ class _Joined:
         for number in range(len(there)):
             part = self.model.rows_of(number)
             read[part] += left[part] @ self.model.pose(self.at, number).turn.T
-        data = field_map(np.vstack(there), read)
+        data = field_map(np.vstack(there), read, self._sigma())
         return data.assign_coords(scan=("point", np.concatenate(
             [_scans(one) for one in self.maps])))
+
+
+    def _sigma(self) -> Floats | None:
+        """Return the noise (n, 3) in T that the maps state of their readings; None if none does.
+
+        A map that states none has that of its check.
+        """
+        if not any("sigma_T" in one.data for one in self.maps):
+            return None
+        squares = []
+        for number, one in enumerate(self.maps):
+            sigma = (one.data["sigma_T"].values if "sigma_T" in one.data
+                     else np.full((len(one.points), 3), one.check.noise_T))
+            squares.append(sigma**2 @ (self.model.pose(self.at, number).turn**2).T)
+        return np.asarray(np.sqrt(np.vstack(squares)))
 
 
 def _within_others(

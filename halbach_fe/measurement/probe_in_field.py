@@ -9,34 +9,32 @@ taken with the amplitudes eliminated.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.measurement.harmonic_field import Charges, HarmonicFit, fit_readings
+from halbach_fe.measurement.harmonic_field import Charges, FreeField, HarmonicFit
 from halbach_fe.measurement.suspect_rows import scatter_around
 
-ITERATIONS, FEW_ITERATIONS, NEXT_ITERATIONS = 12, 6, 2
-"""Largest number of steps of the fit of field and instrument, while orientations are tried, and
-from a fit of nearly the same readings."""
-
-ROUNDING = 1e-13
-"""Added to the information of the amplitudes, relative to its mean, so that maps without noise have
-positive definite matrices too."""
-
-AT_ONCE = 4096
-"""Number of readings whose remaining noise is computed at a time, which limits the memory."""
+ITERATIONS, FEW_ITERATIONS = 12, 2
+"""Largest number of steps of the fit of field and instrument before the last, linear one, and while
+orientations are tried or from a fit of nearly the same readings."""
 
 HALVINGS = 8
 """Number of times that a step is halved until it improves the fit."""
 
-AT_REST = 1.0
-"""Decrease of chi-squared below which the fit is at rest, of thousands of readings."""
+NEAR = 0.1
+"""Change of an instrument, in units of its prior, up to which a design is used again: readings per
+amplitude change by some per cent, and residuals are those of the exact ones."""
+
+NEARLY_AT_REST = 10.0
+"""Decrease of chi-squared, of thousands of readings, below which a step is taken as if they were
+linear in it."""
 
 STEEPER = 100.0
 """Ratio of the squared gradients of nine tenths and one tenth of the readings from which the noise
@@ -155,6 +153,14 @@ class ProbeModel:
         sd[LAG] = max(sd[LAG], float(np.median(step)) if len(step) else 0.0)  # a row late
         self.prior_sd = self.any_sd = sd
         self.scatter, self.weights = scatter, weights_of(scatter)
+        self._last: list[Any] = []
+        self.near = NEAR * sd
+
+    def turned(self, matrix: Floats) -> Self:
+        """Return a model of the components that a matrix (3, 3) makes of the readings."""
+        other = copy(self)
+        other.field = self.field @ matrix.T
+        return other
 
     def with_terms(self, kept: NDArray[np.bool_]) -> Self:
         """Return a model whose instrument has some of all parameters (p,) only."""
@@ -169,8 +175,8 @@ class ProbeModel:
         few such readings, but without weights they are what decides on the instrument: it is given
         errors of many standard deviations that it does not have.
         """
-        left = (self.field - self.readings(at))[rows] / np.maximum(
-            self.noise_left(at, rows, width2)[0], LEAST_OWN)
+        own = self.free(at, rows, at.sigma**2 / width2).diagonal().reshape(-1, 3)
+        left = (self.field - self.readings(at))[rows] / np.maximum(own, LEAST_OWN)
         other = copy(self)
         other.scatter = scatter_around(self.points, self.points[rows], left)
         other.weights = weights_of(other.scatter)
@@ -191,15 +197,45 @@ class ProbeModel:
         return ProbeFit(fit.amplitudes, np.zeros(count), np.eye(count), fit.sigma, fit.used,
                        self.prior_sd, False)
 
-    def fit(self, at: ProbeFit, rows: NDArray[np.bool_]) -> HarmonicFit:
-        """Return the fit of the field alone, read by an instrument that is known."""
-        design = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
-        return fit_readings(design, [self.target(at, rows)])[0]
+    def fit(
+        self, at: ProbeFit, rows: NDArray[np.bool_], near: int | None = None
+    ) -> HarmonicFit:
+        """Return the fit of the field alone, read by an instrument that is known.
+
+        Its penalty is searched from the number ``near``, see `FreeField.most_probable`.
+        """
+        return self.free(at, rows, 0.0).most_probable(self.target(at, rows), near)
+
+    def free(self, at: ProbeFit, rows: NDArray[np.bool_], penalty: float) -> FreeField:
+        """Return what the field leaves of the readings of some rows, for a penalty.
+
+        The last design is kept, which most calls share: weights scale it, and for an instrument
+        that has hardly changed it is one by which the fit still converges, see `target`.
+        """
+        value = at.instrument * self.prior_sd
+        kept = self._last and self._last[0] is self.charges and np.array_equal(
+            rows, self._last[1]) and bool((np.abs(value - self._last[2]) <= self.near).all())
+        if not kept:
+            self._last.clear()  # before the next one is made, which is as large
+            self._last += [self.charges, rows, value, self.weights, FreeField(
+                self.by_amplitude(at, rows).reshape(-1, len(self.charges)), 0.0)]
+        elif self._last[3] is not self.weights:
+            ratio = (self.weights / self._last[3])[rows].ravel()
+            self._last[3:] = [self.weights, FreeField(
+                ratio[:, None] * self._last[4].by_amplitude, 0.0)]
+        return self._last[4].of_noise(penalty)
 
     def target(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the weighted readings (3 n,) in T without the change of the sensors' offsets."""
-        return np.asarray(((self.field[rows] - self.offsets(at, rows))
-                           * self.weights[rows]).ravel())
+        """Return the weighted readings (3 n,) in T that the amplitudes explain, by `free`.
+
+        They are those without the change of the sensors' offsets, and with what the kept design
+        differs from that of ``at``.
+        """
+        if len(at.amplitudes) != len(self.charges):
+            return np.asarray(((self.field[rows] - self.offsets(at, rows))
+                               * self.weights[rows]).ravel())
+        left = (self.field[rows] - self.readings(at, rows)) * self.weights[rows]
+        return left.ravel() + self.free(at, rows, 0.0).by_amplitude @ at.amplitudes
 
     def offsets(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the change (n, 3) in T of the sensors' offsets."""
@@ -258,17 +294,15 @@ class ProbeModel:
 
     def noise_left(
         self, at: ProbeFit, rows: NDArray[np.bool_], width2: float
-    ) -> tuple[Floats, Floats]:
-        """Return how much of each reading (n, 3), and of its variance, the fit of the field leaves.
+    ) -> Floats:
+        """Return how much of the variance of each reading (n, 3) the fit of the field leaves.
 
         The rest the field takes along, the most at the edges of a map. For the prior variance
-        ``width2`` of the amplitudes in T^2 they are the diagonals of P and P^2 of `FreeField`. A
-        residual divided by the first one is that of a fit without the reading. The few numbers of
-        the instrument are left out.
+        ``width2`` of the amplitudes in T^2 it is the diagonal of P^2 of `FreeField`, and that of P
+        is the share of a reading which is left: a residual divided by it is that of a fit without
+        the reading. The few numbers of the instrument are left out.
         """
-        by_amplitude = self.by_amplitude(at, rows).reshape(-1, len(self.charges))
-        once, twice = FreeField(by_amplitude, at.sigma**2 / width2).diagonals()
-        return once.reshape(-1, 3), twice.reshape(-1, 3)
+        return self.free(at, rows, at.sigma**2 / width2).diagonals()[1].reshape(-1, 3)
 
     def ideal(self, at: ProbeFit) -> Floats:
         """Return what a probe without errors would have read (n, 3) in T.
@@ -303,83 +337,17 @@ def fit_probe(
     at = replace(start or model.start(fit), lag=model.lag_shows(rows))
     width2 = fit.sigma**2 / fit.penalty
     state = State.of(model, at, rows, width2)
-    for _ in range(iterations):
+    for number in range(iterations + 1):
         design, by_field, covariance = state.normal()
         step, used = state.step(design, covariance), state.used(design, by_field, covariance)
-        for halving in range(HALVINGS):
-            after = State.of(model, replace(
-                state.at, instrument=state.at.instrument + step / 2**halving), rows, width2)
-            if after.chi2 <= state.chi2:
-                break
-        else:
-            return state.at
+        linear = number == iterations or state.decrease(design, step) < NEARLY_AT_REST
+        after = state.linear(step, design, by_field) if linear else state.stepped(step)
         sigma = float(np.sqrt(after.left @ after.left / max(len(after.left) - used, 1.0)))
-        at_rest = state.chi2 - after.chi2 < AT_REST
-        state = after.with_noise(sigma, replace(
-            after.at, covariance=sigma**2 * covariance, used=used))
-        if at_rest:
-            break
-    return state.at
-
-
-class FreeField:
-    """What the prior field of the charges leaves of readings: ``P = (1 + A A^T / penalty)^-1``.
-
-    ``A`` (m, k) are the readings by amplitude, and ``penalty`` is the ratio of the variances of
-    noise and amplitudes. ``P`` follows from the smaller one of A A^T and A^T A.
-    """
-
-    def __init__(self, by_amplitude: Floats, penalty: float, gram: Floats | None = None) -> None:
-        self.by_amplitude = by_amplitude
-        self.dual = len(by_amplitude) <= by_amplitude.shape[1]
-        tall = by_amplitude if self.dual else by_amplitude.T
-        self.gram = tall @ tall.T if gram is None else gram
-        self.penalty = penalty + ROUNDING * float(np.trace(self.gram)) / by_amplitude.shape[1]
-        with_prior = self.gram.copy()
-        with_prior[np.diag_indices(len(with_prior))] += self.penalty
-        self.factor = linalg.cho_factor(with_prior, lower=True, overwrite_a=True)
-
-    def of_noise(self, penalty: float) -> FreeField:
-        """Return the same for another penalty."""
-        return FreeField(self.by_amplitude, penalty, self.gram)
-
-    def left(self, readings: Floats) -> Floats:
-        """Return P times readings (m,) or (m, p)."""
-        if self.dual:
-            return np.asarray(self.penalty * linalg.cho_solve(self.factor, readings))
-        return np.asarray(readings - self.by_amplitude @ self.amplitudes(readings))
-
-    def amplitudes(self, readings: Floats) -> Floats:
-        """Return the most probable amplitudes (k,) or (k, p)."""
-        if self.dual:
-            return np.asarray(self.by_amplitude.T @ linalg.cho_solve(self.factor, readings))
-        return np.asarray(linalg.cho_solve(self.factor, self.by_amplitude.T @ readings))
-
-    @property
-    def trace(self) -> float:
-        """Trace of P: the number of readings that the field does not use up."""
-        inverse, info = linalg.lapack.dpotri(self.factor[0], lower=1)
-        assert info == 0  # the factor is that of a Cholesky decomposition
-        rest = 0 if self.dual else len(self.by_amplitude) - self.by_amplitude.shape[1]
-        return rest + self.penalty * float(np.trace(inverse))
-
-    def diagonals(self) -> tuple[Floats, Floats]:
-        """Return the diagonals (m,) of P and of P^2."""
-        once, twice = np.empty((2, len(self.by_amplitude)))
-        for first in range(0, len(once), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            if self.dual:
-                unit = np.zeros((len(once), len(once[part])))
-                unit[part] = np.eye(unit.shape[1])
-                columns = self.left(unit)
-                once[part], twice[part] = np.diag(columns[part]), np.sum(columns**2, axis=0)
-                continue
-            rows = self.by_amplitude[part]
-            solved = linalg.cho_solve(self.factor, rows.T)
-            taken = np.sum(rows.T * solved, axis=0)
-            once[part] = 1 - taken
-            twice[part] = 1 - 2 * taken + np.sum(solved * (self.gram @ solved), axis=0)
-        return once, twice
+        found = replace(after.at, sigma=sigma, covariance=sigma**2 * covariance, used=used)
+        if linear or after is state:
+            return found
+        state = after.with_noise(sigma, found)
+    raise AssertionError  # the last step is a linear one
 
 
 @dataclass(frozen=True)
@@ -398,14 +366,29 @@ class Evidence:
 
     @classmethod
     def of(
-        cls, model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, width2: float
-    ) -> Evidence:
-        """Return what some rows tell, near a fit, for the prior variance of amplitudes in T^2."""
+        cls, model: ProbeModel, rows: NDArray[np.bool_], at: ProbeFit, width2: float,
+        parts: Sequence[NDArray[np.bool_]] = (),
+    ) -> Iterator[Evidence]:
+        """Yield what some rows tell, and what each half of them does, near a fit.
+
+        ``parts`` are one half of pairs of halves; the other one has the other rows. ``width2`` is
+        the prior variance of amplitudes in T^2.
+        """
         state = State.of(model, at, rows, width2)
-        design, left, _ = state.normal()
-        information = design.T @ left / at.sigma**2
-        return cls(information, design.T @ state.left / at.sigma**2
-                   + information @ at.instrument)
+        design, *_ = state.normal()
+        target, whole = state.target + design @ at.instrument, state.free
+
+        def told(free: FreeField, own: NDArray[np.bool_]) -> Evidence:
+            by_term = design[own]
+            return cls(*(by_term.T @ free.left(each) / at.sigma**2
+                         for each in (by_term, target[own])))
+
+        yield told(whole, np.ones(len(target), bool))
+        for part in parts:
+            own = np.repeat(part[rows], 3)
+            first = whole.part(own)
+            yield told(first, own)
+            yield told(whole.part(~own, first), ~own)
 
     def estimate(self, kept: Ints) -> tuple[Floats, Floats]:
         """Return the values (k,) and covariance (k, k) of an instrument of some parameters only."""
@@ -439,9 +422,8 @@ class State:
     @classmethod
     def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> State:
         """Fit the field for the instrument and the noise of ``at``."""
-        by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(model.charges))
         return cls._solved(model, rows, width2, at, model.target(at, rows),
-                           FreeField(by_amplitude, at.sigma**2 / width2))
+                           model.free(at, rows, at.sigma**2 / width2))
 
     @classmethod
     def _solved(
@@ -477,6 +459,27 @@ class State:
         """Return the step (p,) of the instrument, see `normal`."""
         return np.asarray(inverse @ (
             design.T @ self.left - self.at.sigma**2 * self.at.instrument))
+
+    def decrease(self, design: Floats, step: Floats) -> float:
+        """Return by how much a step decreases `chi2`, if the readings are linear in it."""
+        return float(step @ (design.T @ self.left / self.at.sigma**2 - self.at.instrument))
+
+    def linear(self, step: Floats, design: Floats, left: Floats) -> State:
+        """Return the state after a step in which the readings are linear, see `normal`."""
+        at = replace(self.at, instrument=self.at.instrument + step, amplitudes=(
+            self.at.amplitudes - self.free.amplitudes(design @ step)))
+        return replace(self, at=at, left=self.left - left @ step)
+
+    def stepped(self, step: Floats) -> State:
+        """Return the state after a step, or a part of it that improves the fit; this one if none
+        does.
+        """
+        for halving in range(HALVINGS):
+            after = State.of(self.model, replace(
+                self.at, instrument=self.at.instrument + step / 2**halving), self.rows, self.width2)
+            if after.chi2 <= self.chi2:
+                return after
+        return self
 
     def used(self, design: Floats, left: Floats, inverse: Floats) -> float:
         """Return `ProbeFit.used`, by the traces of the inverse of all normal equations."""

@@ -11,7 +11,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement import map_check, probe_in_field
+from halbach_fe.measurement import harmonic_field, map_check
 from halbach_fe.measurement.field_map import (
     checked_map,
     field_map,
@@ -85,7 +85,7 @@ def test_charges_make_any_field_in_free_space(generator):
 
 def test_noise_that_a_fit_leaves(generator, monkeypatch):
     """Beside the whole matrix, and beside drawn noise; the control is the same share everywhere."""
-    monkeypatch.setattr(probe_in_field, "AT_ONCE", 100)
+    monkeypatch.setattr(harmonic_field, "AT_ONCE", 100)
     points = GRID[::3]
     field = read_by(generator)[::3]
     charges = Charges.around(points, 2.5 * STEP_M)
@@ -94,10 +94,11 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
                        np.ones(len(points)))
     at, rows = model.start(fit), np.ones(len(points), bool)
     width2 = fit.sigma**2 / fit.penalty
-    left = model.noise_left(at, rows, width2)[1]
+    left = model.noise_left(at, rows, width2)
     by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(charges))
     information = by_amplitude.T @ by_amplitude
-    prior = at.sigma**2 / width2 + probe_in_field.ROUNDING * np.trace(information) / len(charges)
+    prior = max(at.sigma**2 / width2,
+                harmonic_field.ROUNDING * np.trace(information) / len(charges))
     fitted = by_amplitude @ np.linalg.solve(
         information + prior * np.eye(len(charges)), by_amplitude.T)
     rest = np.eye(len(fitted)) - fitted
