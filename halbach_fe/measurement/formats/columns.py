@@ -48,7 +48,7 @@ MEANING = re.compile(
     r"(?i)\b(?:symmetr\w*|mirror\w*|flip\w*|extend[xyz]?|quadrant|octant|half|scal(?:e|ed|ing)|"
     r"factor|norm[be]?|normali[sz]\w*|offsets?|multipl\w*|cent(?:er|re)|origin)\b")
 """Words of a line above the table that may change the meaning of its numbers."""
-CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b[^,;]*?\bx\W{0,3}([-+\d.e]+)\s*(\w+)?\W+"
+CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx\W{0,3}([-+\d.e]+)\s*(\w+)?\W+"
                     r"y\W{0,3}([-+\d.e]+)\s*(\w+)?\W+z\W{0,3}([-+\d.e]+)\s*(\w+)")
 """A point with its coordinates and their unit: centre in lab: x 1 mm, y 2 mm, z 3 mm."""
 MAX_COUNTS = 4
@@ -194,7 +194,9 @@ def _first_numbers(lines: Sequence[Line], declared: DeclaredFormat, where: str) 
         before = (index, len(cells)) if 2 * found > len(cells) else None
     hint = next((comma for _, line in lines for mark in (";", "\t", None)
                  for cell in cells_of(line, mark) if (comma := comma_hint(cell))), "")
-    raise MeasurementError(must_be("content", where, "a table with lines of numbers", "none", hint))
+    raise MeasurementError(must_be(
+        "content", where, "a table with lines of numbers", "none", hint or "State what separates "
+        "the numbers: --delimiter comma, semicolon, tab or spaces."))
 
 
 def _refuse_lost_rows(
@@ -280,5 +282,5 @@ def _refuse_other_length(
         if not is_comment(line) and sum(map(bool, known)) > RECOGNIZED and len(cells) != count:
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",
-                str(len(cells)), "Correct the header, or state the columns: "
-                "--columns NAME,NAME,... takes its place."))
+                str(len(cells)), "State what separates them by --delimiter, correct the header, or state "
+                "the columns: --columns NAME,NAME,... takes its place."))

@@ -101,7 +101,7 @@ def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
         cell = cell.replace(",", "")
     if not cell or cell.lower() == "nan":
         return np.nan
-    return number_in(cell)
+    return number_in(cell.replace("*^", "e"))  # as Mathematica writes exponents
 
 
 def numbers_among(cells: Sequence[str], decimal_comma: bool = False) -> int:
@@ -158,7 +158,8 @@ def rows_of(
             raise MeasurementError(must_be(
                 f"line {position}", where, f"{columns} values", str(len(cells)),
                 "Is the file cut short? Else remove the line, or begin it with #; if the table "
-                f"begins below it, add --skip-lines {position}."))
+                f"begins below it, add --skip-lines {position}; if cells are separated otherwise, "
+                "--delimiter."))
         row = [_number_or_none(cell, declared.decimal_comma) for cell in cells]
         for column, value in enumerate(row):
             if value is None:
