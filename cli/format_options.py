@@ -7,12 +7,7 @@ import math
 from functools import partial
 from pathlib import Path
 
-from halbach_fe.measurement.formats.declared import (
-    DELIMITERS,
-    FORMATS,
-    UNKNOWN,
-    DeclaredFormat,
-)
+from halbach_fe.measurement.formats.declared import DELIMITERS, FORMATS, UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.units import (
     ANGLES,
     FIELDS,

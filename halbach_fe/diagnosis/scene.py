@@ -57,6 +57,8 @@ class ScannedMap:
         Of its points among those of all maps.
     is_total : bool
         Whether it is a map of |B| alone.
+    timed : bool
+        Whether it has times; else ``time`` is the order of its rows.
     """
 
     name: str
@@ -68,6 +70,7 @@ class ScannedMap:
     time: Floats
     rows: slice
     is_total: bool = False
+    timed: bool = True
 
     def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
         """Tell whether the map can show an effect: |B| has one sensor, without axes."""
@@ -117,7 +120,7 @@ class Campaign:
             found.append(ScannedMap(
                 one.name, one.probe, one.pose, number if listed else None, one.is_validation,
                 points, map_time(one.data), slice(first, first + len(points)),
-                is_total_field(one.data)))
+                is_total_field(one.data), "time_s" in one.data))
             first += len(points)
         return cls(tuple(found), data)
 

@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import (
-    Outline,
-    mean_corner,
-    outline_area,
-    outline_part,
-    ring_radii,
-)
+from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outline_part, ring_radii
 from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
 from halbach_fe.study.materials import MU_0
 

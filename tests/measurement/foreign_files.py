@@ -48,7 +48,7 @@ def table(separator="\t", columns=None, order=None, number="{:.12g}", end=""):
                    for row in rows)
 
 
-def mm_T(length=1e3, tesla=1.0):  # noqa: N802
+def mm_T(length=1e3, tesla=1.0):
     """Return the columns x, y, z, Bx, By, Bz in other units."""
     return [*(length * POINTS.T), *(tesla * FIELD.T)]
 

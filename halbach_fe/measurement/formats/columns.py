@@ -282,5 +282,5 @@ def _refuse_other_length(
         if not is_comment(line) and sum(map(bool, known)) > RECOGNIZED and len(cells) != count:
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",
-                str(len(cells)), "State what separates them by --delimiter, correct the header, or state "
-                "the columns: --columns NAME,NAME,... takes its place."))
+                str(len(cells)), "State what separates them by --delimiter, correct the header, or "
+                "state the columns: --columns NAME,NAME,... takes its place."))

@@ -43,8 +43,8 @@ from halbach_fe.measurement.formats.text import (
 )
 from halbach_fe.study.types import COMPONENTS
 
-STATEMENT = re.compile(r"#\s*([-+.\deE]{1,30})\s*#?\s*(initial|step of|number of points vs)\s+([XYZ])"
-                       r"\b.{0,40}")
+STATEMENT = re.compile(r"#\s*([-+.\deE]{1,30})\s*#?\s*(initial|step of|number of points vs)\s+"
+                       r"([XYZ])\b.{0,40}")
 KEYS = ("initial", "step of", "number of points vs")
 CARD, GRID_3D, WIDTH = "MGNCREAT", 300.0, 10
 CARDS = re.compile(r"(?i)\s*(MGNCREAT|MGNDATA)\b")

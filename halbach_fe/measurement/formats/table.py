@@ -349,7 +349,7 @@ def _overridden(
 ) -> list[str]:
     """Return sentences about what --columns states otherwise than the header."""
     found = []
-    for text, column, own in zip(declared.columns, columns, table.columns):
+    for text, column, own in zip(declared.columns, columns, table.columns, strict=False):
         name = own.quantity not in ("", *names.OTHERS, column.quantity) and text != "-"
         unit = units.unit_symbol(own.unit)
         if (name and own.quantity != "B") or (column.quantity and unit and unit
