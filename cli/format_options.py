@@ -24,22 +24,12 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
     """Add the options that describe a file, to a parser or a group of its options."""
     parser.add_argument("--format", choices=FORMATS, default="",
                         help="format of FILE (default: recognized from its beginning)")
-    for kind, members, what in (("length", LENGTHS, "the positions"), ("field", FIELDS, "B")):
-        parser.add_argument(f"--{kind}-unit", type=partial(unit_of, kind), default="",
-                            metavar="UNIT", help=f"unit of {what}: {', '.join(members)}; a factor "
-                            f"may precede it, as in '10 {next(iter(members))}'")
-    parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
                         help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, "
                          "Babs (|B|), dx, dy, dz (moves of a stage from reading to reading), t "
                          "(time), scan, sigma or sigma_Bx ... (noise), or - for a column that is "
                          "ignored; a unit may follow, as in Bx[mT], t[s], t[hhmmss], Bx[1e-7 T]. "
                          "They take the place of the file's header")
-    parser.add_argument("--skip-lines", type=_count, default=0, metavar="N",
-                        help="number of lines at the beginning of FILE that are not read")
-    parser.add_argument("--delimiter", choices=DELIMITERS, default="",
-                        help="what separates columns; spaces are any number of spaces and tabs "
-                        "(default: recognized)")
     parser.add_argument("--positions", type=Path, metavar="TABLE",
                         help="table of x, y and z with a row for each reading of a FILE without "
                         "positions")
@@ -51,6 +41,21 @@ def add_format_arguments(parser: argparse._ActionsContainer) -> None:
                         "example x=0,y=0")
     parser.add_argument("--origin-m", type=point, metavar="X,Y,Z",
                         help="position in m of the file's origin, along the magnet's axes")
+    add_table_arguments(parser)
+
+
+def add_table_arguments(parser: argparse._ActionsContainer) -> None:
+    """Add the options that describe any table, of a map or of blocks."""
+    for kind, members, what in (("length", LENGTHS, "the positions"), ("field", FIELDS, "B")):
+        parser.add_argument(f"--{kind}-unit", type=partial(unit_of, kind), default="",
+                            metavar="UNIT", help=f"unit of {what}: {', '.join(members)}; a factor "
+                            f"may precede it, as in '10 {next(iter(members))}'")
+    parser.add_argument("--angle-unit", choices=ANGLES, default="", help="unit of phi")
+    parser.add_argument("--skip-lines", type=_count, default=0, metavar="N",
+                        help="number of lines at the beginning of FILE that are not read")
+    parser.add_argument("--delimiter", choices=DELIMITERS, default="",
+                        help="what separates columns; spaces are any number of spaces and tabs "
+                        "(default: recognized)")
     parser.add_argument("--decimal-comma", action="store_true",
                         help="numbers have a decimal comma, as in 0,5")
     parser.add_argument("--encoding", default=DeclaredFormat.encoding,

@@ -32,7 +32,7 @@ from halbach_fe.measurement.formats import (
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
-from halbach_fe.measurement.formats.text import lines_of
+from halbach_fe.measurement.formats.text import lines_of, text_of_table
 from halbach_fe.measurement.formats.units import unit_symbol
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
@@ -88,7 +88,7 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
         or which options to add.
     """
     where = f"map {path}"
-    raw = file_bytes(path, where)
+    raw = text_of_table(file_bytes(path, where, workbooks=True), where)
     if not name and (own := _own(path, raw, declared)) is not None:
         return _with_doubt(own, declared)
     name = name or format_of(raw, declared, where)

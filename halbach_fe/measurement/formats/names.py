@@ -91,7 +91,7 @@ def parse(text: str, stated: bool = False) -> ColumnName:
     text = text.strip().strip('"').strip()
     if len(text) > MAX_NAME:
         return ColumnName(f"{text[:MAX_NAME]}...")
-    base, unit = _split(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
+    base, unit = split_unit(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
     key = _key(base)
     quantity = _measured(key, unit_symbol(unit)) or _other_quantity(base, key, unit.strip()) or (
         key if stated and key in STATED else "")
@@ -140,7 +140,7 @@ def noise_of(base: str, key: str) -> str | None:
     rest = [word for word in words if word not in NOISE_WORDS]
     if len(rest) == len(words):
         return None
-    return ALIASES.get(_key(_split("_".join(rest))[0])) if rest else "B"
+    return ALIASES.get(_key(split_unit("_".join(rest))[0])) if rest else "B"
 
 
 def is_clock(column: ColumnName) -> bool:
@@ -153,11 +153,11 @@ def is_time(column: ColumnName) -> bool:
 
     T in a unit of temperature is a temperature.
     """
-    name, unit = _split(column.text)
+    name, unit = split_unit(column.text)
     return _key(name) in TIME_NAMES and unit.strip(" °").lower() not in TEMPERATURES
 
 
-def _split(text: str) -> tuple[str, str]:
+def split_unit(text: str) -> tuple[str, str]:
     """Split a name into the quantity and the unit, which is empty if the name has none."""
     if found := BRACKETS.fullmatch(text):
         return found[1], found[2]

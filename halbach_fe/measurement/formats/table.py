@@ -114,7 +114,7 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     used = _used(columns, table, declared, missing)
     missing += _missing(used, columns, table, declared)
     unit_of: dict[str, str] = {}
-    for kind in units.KINDS:
+    for kind in OPTIONS:
         unit_of |= _units(kind, used, columns, table, declared, missing)
     if missing:
         raise MeasurementError(must_be(

@@ -9,8 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.files import workbook_in
 from halbach_fe.core.numbers import MAX_CELL
 from halbach_fe.core.numbers import parse_number as number_in
 from halbach_fe.measurement.formats.declared import DELIMITERS, DeclaredFormat
@@ -50,6 +52,23 @@ def lines_of(raw: bytes, declared: DeclaredFormat, where: str) -> list[Line]:
     if not found:
         raise MeasurementError(must_be("content", where, "a table of readings", "blank lines"))
     return found
+
+
+def text_of_table(raw: bytes, where: str) -> bytes:
+    """Return the content of a file, of a workbook its first sheet as CSV.
+
+    Raises
+    ------
+    MeasurementError
+        If a workbook cannot be read.
+    """
+    if workbook_in(raw) is None:
+        return raw
+    try:
+        return untrusted.sheet_text(raw)
+    except ValueError as error:
+        raise MeasurementError(must_be("content", where, "a whole workbook", f"'{error}'",
+                                       "Save the sheet as CSV.")) from None
 
 
 def is_comment(line: str) -> bool:

@@ -27,9 +27,13 @@ FIELDS = {"T": Fraction(1), "mT": Fraction(1, 1000), "uT": Fraction(1, 1_000_000
           "nT": Fraction(1, 1_000_000_000), "G": Fraction(1, 10_000), "kG": Fraction(1, 10),
           "mG": Fraction(1, 10_000_000)} | H_FIELDS
 ANGLES = ("deg", "rad")
+VOLUMES = {"m^3": Fraction(1), "cm^3": Fraction(1, 10**6), "mm^3": Fraction(1, 10**9)}
+MOMENTS = {"Am^2": Fraction(1), "mAm^2": Fraction(1, 1000), "emu": Fraction(1, 1000)}
+"""Units of tables of blocks."""
 TIMES = {"s": Fraction(1), "min": Fraction(60), "h": Fraction(3600), "ms": Fraction(1, 1000)}
 KINDS: dict[str, Collection[str]] = {
-    "length": LENGTHS, "field": FIELDS, "angle": ANGLES, "time": TIMES}
+    "length": LENGTHS, "field": FIELDS, "angle": ANGLES, "time": TIMES,
+    "volume": VOLUMES, "moment": MOMENTS}
 """Units by the kind of quantity."""
 CLOCK = re.compile(r"(?i)hh:?mm:?ss")
 """The unit of times of day that are written as numbers: 142359 is 14:23:59."""
@@ -46,7 +50,8 @@ WORDS = {
     "kgauss": "kG", "milligauss": "mG", "mgauss": "mG", "nanotesla": "nT", "teslas": "T",
     "microteslas": "uT", "utesla": "uT", "mtesla": "mT", "gs": "G", "oersted": "Oe", "oe": "Oe",
     "koe": "kOe", "a/m": "A/m", "ka/m": "kA/m", "am-1": "A/m", "wb/m2": "T", "vs/m2": "T",
-    "n/am": "T", "n/(am)": "T",
+    "n/am": "T", "n/(am)": "T", "m3": "m^3", "cm3": "cm^3", "cc": "cm^3", "ml": "cm^3",
+    "mm3": "mm^3", "am2": "Am^2", "j/t": "Am^2", "mam2": "mAm^2", "emu": "emu",
     "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad",
     "radians": "rad"}
 EXACT = {"T": "T", "mT": "mT", "uT": "uT", "µT": "uT", "μT": "uT", "nT": "nT", "G": "G",
@@ -71,7 +76,8 @@ def unit_symbol(text: str) -> str:
         unit, factor = unit_symbol(scaled[2]), float(scaled[1])
         return f"{factor:.12g} {unit}" if unit and unit not in ANGLES and factor > 0 else ""
     return EXACT.get(text) or WORDS.get(text.lower()) or WORDS.get(
-        MARKS.sub("", text.lower()).replace("²", "2").replace("⁻¹", "-1"), "")
+        MARKS.sub("", text.lower()).replace("²", "2").replace("³", "3").replace(
+            "⁻¹", "-1"), "")
 
 
 def kind_of(unit: str) -> str:
@@ -93,5 +99,5 @@ def in_si(values: Floats, unit: str) -> Floats:
     if unit in ANGLES:
         return values * (math.pi / 180) if unit == "deg" else values
     own, _, unit = unit.rpartition(" ")
-    factor = (LENGTHS | FIELDS | TIMES)[unit] * (Fraction(own) if own else 1)
+    factor = (LENGTHS | FIELDS | TIMES | VOLUMES | MOMENTS)[unit] * (Fraction(own) if own else 1)
     return values * float(factor.numerator) / float(factor.denominator)
