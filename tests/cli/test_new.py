@@ -103,7 +103,7 @@ def test_prisms_counted_from_their_tip_and_a_ring(tmp_path, capsys, row):
     points = points_from(read_study(path).observation.positions)
     assert not magnet.contains(points).any()
     assert np.isfinite(magnet.field_T(points)).all()
-    assert "halbach-fe solve" in capsys.readouterr().out
+    assert "halbach-fe solve" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("solid", [True, False])

@@ -118,7 +118,7 @@ def test_workbooks_and_the_command(tmp_path, capsys):
                  "--fixed", "sigma=0.1 %"]) == 0
     np.testing.assert_allclose(read_blocks(out).moment, MOMENT)
     free = tmp_path / "own.csv"
-    free.write_text((FREE + "Br [mT]\nb;cuboid;10;0;0;0;0;0;10;20;30;1300\n"))
+    free.write_text(FREE + "Br [mT]\nb;cuboid;10;0;0;0;0;0;10;20;30;1300\n")
     assert main(["import-blocks", str(free), "-o", str(tmp_path / "free.csv")]) == 0
     assert read_free_blocks(tmp_path / "free.csv")["remanence_T"] == [1.3]
     book = openpyxl.Workbook()

@@ -48,8 +48,8 @@ MEANING = re.compile(
     r"(?i)\b(?:symmetr\w*|mirror\w*|flip\w*|extend[xyz]?|quadrant|octant|half|scal(?:e|ed|ing)|"
     r"factor|norm[be]?|normali[sz]\w*|offsets?|multipl\w*|cent(?:er|re)|origin)\b")
 """Words of a line above the table that may change the meaning of its numbers."""
-CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx\W{0,3}([-+\d.e]+)\s*(\w+)?\W+"
-                    r"y\W{0,3}([-+\d.e]+)\s*(\w+)?\W+z\W{0,3}([-+\d.e]+)\s*(\w+)")
+CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+"
+                    r"y[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+z[\s=:]{0,3}([-+\d.e]+)\s*(\w+)")
 """A point with its coordinates and their unit: centre in lab: x 1 mm, y 2 mm, z 3 mm."""
 MAX_COUNTS = 4
 MAX_LINE, MAX_REMARKS = 200, 5
@@ -249,8 +249,8 @@ def _splits(line: str, delimiter: str | None) -> list[list[str]]:
     """
     text = uncommented(line) if is_comment(line) else line.strip()
     marks = [mark for mark in (delimiter, ",", ";", "\t") if mark and mark in text]
-    found = [_spaced(text)] if delimiter is None else []
-    return [*found, *(cells_of(text, mark) for mark in dict.fromkeys(marks)), _spaced(text)]
+    split = [cells_of(text, mark) for mark in dict.fromkeys(marks)]
+    return [_spaced(text), *split] if delimiter is None else [*split, _spaced(text)]
 
 
 def _with_vector(cells: list[str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 from halbach_fe.measurement.formats.units import (
     CLOCK,
@@ -86,6 +87,7 @@ class ColumnName:
     unit: str = ""
 
 
+@lru_cache(maxsize=1024)  # lines of many words are read as headers too
 def parse(text: str, stated: bool = False) -> ColumnName:
     """Return quantity and unit of the name of a column, which the user may have ``stated``."""
     text = text.strip().strip('"').strip()

@@ -56,6 +56,8 @@ WORDS = {
     "radians": "rad"}
 EXACT = {"T": "T", "mT": "mT", "uT": "uT", "µT": "uT", "μT": "uT", "nT": "nT", "G": "G",
          "kG": "kG", "mG": "mG"}
+MAX_UNIT = 40
+"""Largest number of characters of a unit."""
 MARKS = re.compile(r"[\s.*·⋅^_{}]|\*\*")
 """What spellings of one unit differ in: V.s/m^2, V*s/m2, Vs/m²."""
 SCALED = re.compile(r"(\d{1,20}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,2})?)\s*[*x·]?\s*([^\d\s].*)")
@@ -72,6 +74,8 @@ def unit_symbol(text: str) -> str:
     as in ``1e-07 T``.
     """
     text = text.strip()
+    if len(text) > MAX_UNIT:
+        return ""
     if scaled := SCALED.fullmatch(text):
         unit, factor = unit_symbol(scaled[2]), float(scaled[1])
         return f"{factor:.12g} {unit}" if unit and unit not in ANGLES and factor > 0 else ""
