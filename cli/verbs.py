@@ -25,7 +25,7 @@ VERBS = {
     "simulate-measurement": "simulate_measurement", "import-map": "import_map",
     "import-blocks": "import_blocks", "check": "check",
     "register": "register", "report": "report",
-    "export": "export",
+    "export": "export", "field": "field",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
 """Name of the module of each verb."""
 

@@ -52,6 +52,8 @@ CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]
                     r"y[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+z[\s=:]{0,3}([-+\d.e]+)\s*(\w+)")
 """A point with its coordinates and their unit: centre in lab: x 1 mm, y 2 mm, z 3 mm."""
 MAX_COUNTS = 4
+MAX_HEADER = 20_000
+"""Number of characters of a line that are read as names of columns."""
 MAX_LINE, MAX_REMARKS = 200, 5
 """Number of characters of such a line that are searched, and of such lines that are told."""
 
@@ -247,7 +249,7 @@ def _splits(line: str, delimiter: str | None) -> list[list[str]]:
 
     A header may be separated by spaces even if its rows are separated by commas.
     """
-    text = uncommented(line) if is_comment(line) else line.strip()
+    text = (uncommented(line) if is_comment(line) else line.strip())[:MAX_HEADER]
     marks = [mark for mark in (delimiter, ",", ";", "\t") if mark and mark in text]
     split = [cells_of(text, mark) for mark in dict.fromkeys(marks)]
     return [_spaced(text), *split] if delimiter is None else [*split, _spaced(text)]
