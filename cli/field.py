@@ -1,16 +1,18 @@
 """Compute B and H on lines with error bars, their first and second integrals, and kick maps.
 
 The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With --posterior
-the bars are those of the measured magnet, otherwise those of the study's prior. With --inside points
-may lie inside blocks of permeability 1. Writes field.csv and integrals.csv, and for a grid of lines
-kick_map.txt, in the text format of Radia with kicks in T^2 m^2.
+the bars are those of the measured magnet, otherwise those of the study's prior. With --inside
+points may lie inside blocks of permeability 1. Writes field.csv and integrals.csv, and for a grid
+of lines kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
 """
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
@@ -18,6 +20,9 @@ from halbach_fe.core.errors import CommandLineError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.tables import csv_text
 from halbach_fe.study.types import COMPONENTS
+
+if TYPE_CHECKING:
+    from halbach_fe.response.field_on_lines import FieldOnLines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,8 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
         found = field_on_lines(magnet, lines, known, session, arguments.inside)
     folder = arguments.output
     write_text(folder / "field.csv", csv_text(_points(found)))
-    columns: dict[str, Floats] = {name: values for name, values in zip(
-        ("u_m", "v_m"), (one.ravel() for one in np.meshgrid(*offsets, indexing="ij")), strict=True)}
+    grid = np.meshgrid(*offsets, indexing="ij")
+    columns: dict[str, Floats] = {"u_m": grid[0].ravel(), "v_m": grid[1].ravel()}
     for order, unit in ((1, "T_m"), (2, "T_m2")):
         mean, sd = found.integrals(order)
         for axis, values, bars in zip(COMPONENTS, mean.T, sd.T, strict=True):
@@ -85,13 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _points(found: object) -> dict[str, Floats]:
+def _points(found: FieldOnLines) -> dict[str, NDArray[Any]]:
     """Return the columns of the table of points."""
-    from halbach_fe.response.field_on_lines import FieldOnLines
-
-    assert isinstance(found, FieldOnLines)
     strength, strength_sd = found.strength
-    columns: dict[str, Floats] = {}
+    columns: dict[str, NDArray[Any]] = {}
     for name, values in (("{}_m", found.lines.points), ("B{}_T", found.mean),
                          ("sd_B{}_T", found.sd), ("H{}_A_per_m", strength),
                          ("sd_H{}_A_per_m", strength_sd)):

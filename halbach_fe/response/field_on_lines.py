@@ -1,13 +1,13 @@
 """B and H on parallel lines with their bars, their first and second integrals, and kick maps.
 
-The first integral of B along a line is ``int B ds`` in T m, the second ``int int B ds' ds`` in T m^2.
-A kick map has the second-order kicks of an undulator, whose first integrals vanish: with the
+The first integral of B along a line is ``int B ds`` in T m, the second ``int int B ds' ds`` in
+T m^2. A kick map has the second-order kicks of an undulator, whose first integrals vanish: with the
 potential ``Phi = int |int B_across ds'|^2 ds`` in T^2 m^3 they are ``-1/2 grad Phi / (B rho)^2``
-(P. Elleaume, A new approach to the electron beam dynamics in undulators and wigglers, EPAC 1992).
+(P. Elleaume, EPAC 1992, p. 661).
 The integrals are Simpson's: lines through faces of blocks, where B jumps, need more points.
 
-Inside blocks of permeability 1 the field is a closed form too: B is mu_0 H, that of all charges, plus
-the polarization of the block.
+Inside blocks of permeability 1 the field is a closed form too: B is mu_0 H, that of all charges,
+plus the polarization of the block.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from halbach_fe.core.numbers import MU_0
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.formulation_choice import check_points, external_field
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
+from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 
@@ -139,13 +139,13 @@ class FieldOnLines:
             cumulative_simpson(change, dx=step, axis=1)[:, -1], axis=-1)
 
     def kicks(self) -> tuple[Floats, Floats]:
-        """Return the kicks (n, m) in T^2 m^2, to be divided by (B rho)^2, along both axes across."""
+        """Return the kicks (n, m) in T^2 m^2 along both axes across, times (B rho)^2."""
         shape = tuple(len(one) for one in self.lines.across)
         potential = self.kick_potential()[0].reshape(shape)
-        first, second = (-0.5 * np.gradient(potential, offsets, axis=axis,
-                                            edge_order=min(2, len(offsets) - 1))
-                         for axis, offsets in enumerate(self.lines.across))
-        return first, second
+        first, second = (np.asarray(np.gradient(
+            potential, offsets, axis=axis, edge_order=2 if len(offsets) > 2 else 1))
+            for axis, offsets in enumerate(self.lines.across))
+        return -0.5 * first, -0.5 * second
 
 
 def field_on_lines(
@@ -183,10 +183,10 @@ def field_on_lines(
         model = response_matrix(magnet, flux_density_at(points), session)
         offset, matrix, error = (values.reshape(len(points), 3, *values.shape[1:]) for values in (
             model.offset, model.whole, model.error))
-    own = np.zeros((len(points), 3, count))
+    of_block = np.zeros((len(points), 3, count))
     for row in np.flatnonzero(number >= 0):
-        own[row, range(3), range(3 * number[row], 3 * number[row] + 3)] = MU_0
-    flat, own = matrix.reshape(-1, count), own.reshape(-1, count)
+        of_block[row, range(3), range(3 * number[row], 3 * number[row] + 3)] = MU_0
+    flat, own = matrix.reshape(-1, count), of_block.reshape(-1, count)
     shape = lines.points.shape
     names = np.array([*(block.name for block in magnet.blocks), ""])
     return FieldOnLines(

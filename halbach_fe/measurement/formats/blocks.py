@@ -90,7 +90,7 @@ class DeclaredBlocks(DeclaredFormat):
         Value and unit of quantities for which the table has no column, such as ``12 cm^3``.
     """
 
-    axes: tuple[str, str, str] = COMPONENTS
+    axes: tuple[str, str, str] = ("x", "y", "z")
     along_block: bool = False
     fixed: Mapping[str, str] = field(default_factory=dict)
 
@@ -168,10 +168,10 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         raise MeasurementError(must_be("--columns", where, f"made of {', '.join(QUANTITIES)} and -",
                                        f"'{unknown[0]}'"))
     body = [row for row in rows[start + 1:] if not row[2]]
-    for number, cells, _ in body:
-        if len(cells) != len(header):
+    for number, row, _ in body:
+        if len(row) != len(header):
             raise MeasurementError(must_be(f"line {number}", where, f"of {len(header)} cells, as "
-                                           "the header", str(len(cells))))
+                                           "the header", str(len(row))))
     if not body:
         raise MeasurementError(must_be("content", where, "at least one block", "none"))
     cells: dict[str, list[str]] = {}
@@ -181,7 +181,7 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
             raise MeasurementError(must_be("header", where, f"with one column {name}", "two",
                                            "Choose one with --columns; - ignores a column."))
         if name:
-            cells[name], unit[name] = [row[1][column] for row in body], said
+            cells[name], unit[name] = [one[1][column] for one in body], said
     for name, text in declared.fixed.items():
         value, _, said = text.partition(" ")
         value = value.replace(".", ",") if declared.decimal_comma else value
@@ -192,7 +192,7 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
     for name in unit:
         unit[name] = units.unit_symbol(unit[name]) or (
             unit[name] if unit[name] else kinds.get(KIND.get(name, ""), ""))
-    return _Table(cells, unit, tuple(row[0] for row in body), where, declared.decimal_comma)
+    return _Table(cells, unit, tuple(one[0] for one in body), where, declared.decimal_comma)
 
 
 def _names(cells: Sequence[str]) -> bool:
