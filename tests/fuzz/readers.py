@@ -549,8 +549,8 @@ def readers() -> tuple[Reader, ...]:
             b"id;ring;slot;Jx [mT];Jy [mT];Jz [mT];Volume [cm^3];sd [%]\nA;1;1;1300;0;0;12;0.1\n",
             b"id,shape,xc [mm],yc [mm],zc [mm],dx [mm],dy [mm],dz [mm],Br [T]\n"
             b"a,cuboid,1,2,3,10,10,10,1.3\n"),
-            lambda path: import_blocks(path, DeclaredBlocks()), (MeasurementError, StudyError),
-            lambda table, _: len(table) > 0, (b"[A m^2]", b"rotation_x", b"#")),
+            lambda path: import_blocks(path, DeclaredBlocks()), MeasurementError, len,
+            (b"[A m^2]", b"rotation_x", b"#")),
         replace(foreign, name="import: openpmd", seeds=(grid,), tokens=(*HDF5, b"gridSize",
                 b"%T", b"complex", b"magneticField", b"axisLabels", b"unitSI")),
         *(replace(foreign, name=f"import as {name}", read=imported(name),

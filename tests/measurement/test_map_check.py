@@ -22,8 +22,8 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
-from halbach_fe.measurement.scan_lines import held_out_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
+from halbach_fe.measurement.scan_lines import held_out_lines
 from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows
 from halbach_fe.report.map_check import (
     OPEN_SIGN,

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, must_be, printable
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be, printable
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MU_0
 from halbach_fe.measurement.block_table import BlockTable
@@ -127,9 +127,8 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
     Raises
     ------
     MeasurementError
-        If something is missing (one message lists all of it), or a cell is not what it must be.
-    StudyError
-        If a table with positions makes no free blocks.
+        If something is missing (one message lists all of it), a cell is not what it must be, or a
+        table with positions makes no free blocks.
     """
     where = f"table of blocks {path}"
     raw = text_of_table(file_bytes(path, where, workbooks=True), where)
@@ -353,4 +352,7 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
                 vectors = Rotation.from_rotvec(np.nan_to_num(turns)).apply(vectors)
             for axis, values in zip(COMPONENTS, vectors.T, strict=True):
                 columns[f"remanence_{axis}_T"] = values.tolist()
-    return validated_blocks(columns, table.where)
+    try:
+        return validated_blocks(columns, table.where)
+    except StudyError as error:
+        raise MeasurementError(str(error)) from None
