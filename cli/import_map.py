@@ -1,7 +1,7 @@
 """Convert a measured map from another file format, to metres, tesla and halbach-fe's own columns.
 
 Reads tables of columns (separated by commas, semicolons, tabs or spaces, with or without a header),
-Opera's .table files, text files exported by COMSOL, maps of G4beamline and BDSIM, and
+Opera's .table files, text files exported by COMSOL, maps of G4beamline, BDSIM, SRW and FLUKA, and
 openPMD-beamphysics field meshes. Units, columns and constant coordinates that the file does not
 state must be given as options; nothing is guessed.
 """

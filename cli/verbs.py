@@ -22,13 +22,14 @@ VERBS = {
     "forces": "forces", "design": "design", "cad": "cad", "plan": "plan", "prior": "prior",
     "shim": "shim", "shim-tray": "shim_tray", "sort": "sort",
     "tolerance": "tolerance", "demagnetization": "demagnetization",
-    "simulate-measurement": "simulate_measurement", "import-map": "import_map", "check": "check",
+    "simulate-measurement": "simulate_measurement", "import-map": "import_map",
+    "import-blocks": "import_blocks", "check": "check",
     "register": "register", "report": "report",
-    "export": "export",
+    "export": "export", "field": "field",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
 """Name of the module of each verb."""
 
-LISTS = ("--columns", "--origin-m")
+LISTS = ("--columns", "--origin-m", "--axes")
 """Options whose values are lists that may begin with a minus."""
 
 

@@ -132,8 +132,8 @@ def as_path(path: str | Path) -> Path:
     return path if isinstance(path, Path) else Path(path)
 
 
-def file_bytes(path: Path, where: str) -> bytes:
-    """Return the content of a file of measurements.
+def file_bytes(path: Path, where: str, workbooks: bool = False) -> bytes:
+    """Return the content of a file of measurements; a workbook only if ``workbooks`` are read.
 
     Raises
     ------
@@ -151,7 +151,8 @@ def file_bytes(path: Path, where: str) -> bytes:
                                        "Check the path.")) from None
     if not raw.strip():
         raise MeasurementError(must_be("content", where, "a table of readings", "an empty file"))
-    if (workbook := workbook_in(raw)) is not None:
+    if (workbook := workbook_in(raw)) is not None and not (
+            workbooks and workbook == "Excel" and raw.startswith(b"PK")):
         raise MeasurementError(workbook_sentence(where, workbook))
     return raw
 

@@ -9,10 +9,12 @@ of these functions executes code from a file (no unpickling).
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 import re
 import threading
 import warnings
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +24,11 @@ import meshio
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+
+from halbach_fe.core.errors import ExtraMissingError
+
+MAX_SHEET = 200_000_000
+"""Size in bytes of the largest unpacked workbook that is read."""
 
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""
@@ -46,6 +53,41 @@ def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
     with _refusing(), xr.open_dataset(content, group=group, engine="h5netcdf",
                                       phony_dims="sort") as opened:
         return opened.load()
+
+
+def sheet_text(raw: bytes) -> bytes:
+    """Return the first sheet of an Excel workbook (.xlsx) that has cells as CSV in UTF-8.
+
+    Formulas have the values that the workbook was saved with.
+
+    Raises
+    ------
+    ExtraMissingError
+        If openpyxl, which reads it, is not installed.
+    ValueError
+        If the file is damaged, or larger than `MAX_SHEET` cells or bytes.
+    """
+    try:
+        import openpyxl
+    except ImportError:
+        raise ExtraMissingError(
+            "A workbook needs the package openpyxl: pip install 'halbach-fe[spreadsheet]', or save "
+            "the sheet as CSV.") from None
+    with _refusing():
+        with zipfile.ZipFile(io.BytesIO(raw)) as packed:
+            if sum(part.file_size for part in packed.infolist()) > MAX_SHEET:
+                raise ValueError(f"it unpacks to more than {MAX_SHEET} bytes")
+        book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            rows = [["" if cell is None else str(cell) for cell in row]
+                    for row in sheet.iter_rows(values_only=True)]
+            width = max((n for row in rows for n, cell in enumerate(row, 1) if cell), default=0)
+            if width:
+                text = io.StringIO()
+                csv.writer(text, lineterminator="\n").writerows(
+                    [*row, *[""] * width][:width] for row in rows if any(row))
+                return text.getvalue().encode()
+    raise ValueError("it has no sheet with cells")
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

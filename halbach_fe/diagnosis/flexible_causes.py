@@ -210,7 +210,8 @@ def field_family(
 
 
 def instrument_families(
-    points: Floats, time: Floats, nominal: Floats, gradient: Floats, noise_T: float
+    points: Floats, time: Floats, nominal: Floats, gradient: Floats, noise_T: float,
+    timed: bool = True
 ) -> list[Family]:
     """Return all families of what an instrument may do in a map.
 
@@ -218,7 +219,7 @@ def instrument_families(
     ----------
     points : ndarray, shape (n, 3), in m
     time : ndarray, shape (n,)
-        From 0 to 1.
+        From 0 to 1; without ``timed``, the map has no times, and this is the order of its rows.
     nominal : ndarray, shape (n, 3), in T
         What the map shows of the model.
     gradient : ndarray, shape (n, 3, 3), in T/m
@@ -229,7 +230,8 @@ def instrument_families(
     angle, radius = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     found = [_of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
                               np.ptp(points[:, 2]))]
-    coordinates = {"z": points[:, 2], "angle": angle, "radius": radius, "time": time,
+    coordinates = {"z": points[:, 2], "angle": angle, "radius": radius,
+                   "time" if timed else "order": time,
                    "field": np.linalg.norm(nominal, axis=1)}
     if _on_a_line_along_z(points):  # where azimuth and radius are functions of z
         del coordinates["angle"], coordinates["radius"]

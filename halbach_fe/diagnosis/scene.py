@@ -62,6 +62,8 @@ class ScannedMap:
         Which components were not read.
     is_total : bool
         Whether it is a map of |B| alone.
+    timed : bool
+        Whether it has times; else ``time`` is the order of its rows.
     """
 
     name: str
@@ -74,6 +76,7 @@ class ScannedMap:
     rows: slice
     missing: NDArray[np.bool_]
     is_total: bool = False
+    timed: bool = True
 
     def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
         """Tell whether the map can show an effect, and be corrected for it.
@@ -133,7 +136,8 @@ class Campaign:
             found.append(ScannedMap(
                 one.name, one.probe, one.pose, number if listed else None, one.is_validation,
                 points, map_time(one.data), slice(first, first + len(points)),
-                np.isnan(one.data["B_T"].values), is_total_field(one.data)))
+                np.isnan(one.data["B_T"].values), is_total_field(one.data),
+                "time_s" in one.data))
             first += len(points)
         return cls(tuple(found), data)
 

@@ -132,7 +132,8 @@ def families_of(search: Search, update: InferenceResult) -> list[Family]:
         families = instrument_families(
             scene.points[rows], np.concatenate([one.time for one in own]), scene.field[rows],
             scene.gradient[rows],
-            float(np.median(noise[np.isin(update.maps, [one.name for one in own])])))
+            float(np.median(noise[np.isin(update.maps, [one.name for one in own])])),
+            all(one.timed for one in own))
         found += [family.of_map(own[0].name, rows, len(scene.points)) for family in families
                   ] if listed else families
     return found

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outline_part
-from halbach_fe.geometry.surface import Contact, contact_of_prism
+from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outline_part, ring_radii
+from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
 from halbach_fe.study.materials import MU_0
 
 
@@ -210,6 +210,8 @@ class MagnetBlock:
 
     def contact_in_frame(self, points: Floats) -> Contact:
         """Return `contact` of points (n, 3) in m of the block's frame."""
+        if radii := ring_radii(self.outline):
+            return contact_of_tube(*radii, self.z_min, self.z_max, points)
         found = contact_of_prism(self.outline, self.z_min, self.z_max, points)
         for _, part in self.parts[1:]:  # whose edges are on the block's faces
             own = contact_of_prism(part.outline, part.z_min, part.z_max, points).on_edge

@@ -126,6 +126,22 @@ def outline_area(outline: Outline) -> float:
     return total
 
 
+@lru_cache(maxsize=4096)
+def ring_radii(outline: Outline) -> tuple[float, float] | None:
+    """Return inner and outer radius in m of a sector of a whole turn, whose seam is no surface.
+
+    The first of its eight edges and the fifth, straight ones, lie on each other; None for others.
+    """
+    if len(outline) != 8 or [edge.arc for edge in outline] != 2 * [False, True, True, True]:
+        return None
+    out, back = outline[0], outline[4]
+    seam = np.array([out.start, out.end]) - np.array([back.end, back.start])
+    rounding = 1e-12  # relative, of sines and cosines of half a turn
+    if np.abs(seam).max() > rounding * out.length + rounding * back.radius:
+        return None
+    return out.radius, back.radius
+
+
 def places_in(outline: Outline, depth: Floats, width: Floats) -> Floats:
     """Return points inside an outline, on a grid of fractions of its thickness and width.
 

@@ -23,6 +23,9 @@ AGAINST, MANY = -0.5, 0.2
 """Cosine of the angle between two ways below which they are opposite, and share of points with such
 a neighbour that are many."""
 
+OF_REGION = 8
+"""Largest number of points of a region of a scattered map: a region has an inside."""
+
 ENOUGH = 2000
 """Number of points that show how a stage moves."""
 
@@ -36,8 +39,9 @@ def point_spacing(points: Floats) -> float:
 def scan_lines(points: Floats) -> Ints:
     """Return the number of the scan line (n,) of every point (n, 3).
 
-    Scan lines run along the axis along which there are fewest of them. If they are no lines, or
-    too few to hold one out, every point is one.
+    Scan lines run along the axis along which there are fewest of them. A map that a stage has not
+    scanned in lines or circles has regions in place of them: single points among neighbours would
+    test nothing. If there are too few lines or regions to hold one out, every point is one.
     """
     spacing = point_spacing(points)
     best = np.arange(len(points))
@@ -48,7 +52,29 @@ def scan_lines(points: Floats) -> Ints:
         if number.max() < best.max():
             best = number
     few, short = best.max() + 1 < HELD_OUT_EVERY, len(points) < 3 * (best.max() + 1)
-    return np.arange(len(points)) if few or short else best
+    if not (few or short):
+        return best
+    scattered = not few and np.mean(motion(points).any(axis=1)) < 1 / 2
+    regions = _regions(points) if scattered else np.zeros(len(points), int)
+    return regions if regions.max() + 1 >= HELD_OUT_EVERY else np.arange(len(points))
+
+
+def _regions(points: Floats) -> Ints:
+    """Return the number (n,) of the region of every point (n, 3), of at most `OF_REGION` points.
+
+    Each half of the points along their longest extent is halved again.
+    """
+    number = np.zeros(len(points), int)
+    parts = [np.arange(len(points))]
+    while max(map(len, parts)) > OF_REGION:
+        halves = []
+        for part in parts:
+            axis = int(np.argmax(np.ptp(points[part], axis=0)))
+            halves += np.array_split(part[np.argsort(points[part, axis], kind="stable")], 2)
+        parts = halves
+    for region, part in enumerate(parts):
+        number[part] = region
+    return number
 
 
 def motion(points: Floats) -> Floats:

@@ -11,11 +11,13 @@ from halbach_fe.report.words import bayes_factor, decimals
 
 COORDINATES = {
     "z": "z", "angle": "the azimuth", "radius": "the radius", "time": "the time",
+    "order": "the order of the rows",
     "field": "the magnitude of B", "z and angle": "z and the azimuth"}
 """Coordinates in words."""
 
 HALF_WAVES = {"z": (1e3, "mm"), "radius": (1e3, "mm"), "angle": (1.0, "°"), "field": (1e3, "mT"),
-              "time": (100.0, "% of the map's time"), "z and angle": (1e3, "mm along z")}
+              "time": (100.0, "% of the map's time"), "order": (100.0, "% of the map's rows"),
+              "z and angle": (1e3, "mm along z")}
 """Factor and unit of a distance along a coordinate."""
 
 UNKNOWN_ADVICE = {
@@ -30,6 +32,8 @@ UNKNOWN_ADVICE = {
 
 ADVICE_BY_COORDINATE = {
     "time": "The same lines again in another order show whether it goes with the time.",
+    "order": "The map states no times: the same lines again in another order show whether it goes "
+             "with them.",
     "z": "The same lines in another order and with the probe turned by 180° show whether it goes "
          "with the drive along z, the time or the sensor.",
     "angle": "The same circles begun at another angle show whether it goes with the rotary stage.",

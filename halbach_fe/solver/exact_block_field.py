@@ -38,7 +38,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.outline import Outline, ring_radii
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 
@@ -121,7 +121,8 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
             np.array([a, b, (block.z_max - block.z_min) / 2]), cosine, sine, points)
     else:
         share = points_per_thread
-        edges = [(*edge.start, *edge.end) for edge in block.outline if not edge.arc]
+        edges = [(*edge.start, *edge.end) for edge in block.outline if not edge.arc
+                 and not ring_radii(block.outline)]  # charges on both sides of a seam cancel
         arcs = [(edge.radius, *edge.angles) for edge in block.outline if edge.arc]
         tables = [arc_table(sweep) for _, _, sweep in arcs] or [arc_table(0.0)]
         work = partial(

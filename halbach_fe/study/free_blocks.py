@@ -126,7 +126,7 @@ class FreeBlocks(StudyModel):
     size_z_m: tuple[Length | None, ...] = ()
     inner_radius_m: tuple[Length | None, ...] = ()
     outer_radius_m: tuple[Length | None, ...] = ()
-    angle_deg: tuple[Annotated[float, Field(gt=0.0, lt=360.0)] | None, ...] = ()
+    angle_deg: tuple[Annotated[float, Field(gt=0.0, le=360.0)] | None, ...] = ()
     inner_width_m: tuple[Length | None, ...] = ()
     outer_width_m: tuple[Length | None, ...] = ()
     radius_m: tuple[Length | None, ...] = ()

@@ -22,11 +22,8 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import workbook_in
+from halbach_fe.core.numbers import MU_0 as MU_0
 from halbach_fe.core.numbers import parse_number as number_in
-
-MU_0 = 4e-7 * math.pi
-"""Vacuum permeability in T m/A. The value before 2019; it differs from the measured value by
-1.3e-10 (relative)."""
 
 COLUMNS = ("H_A_per_m", "B_T")
 MIN_POINTS = 4

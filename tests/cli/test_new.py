@@ -87,6 +87,25 @@ def test_command_writes_rings_of_their_own_and_free_blocks(tmp_path, capsys):
         assert not (tmp_path / "wrong.toml").exists()
 
 
+@pytest.mark.parametrize("row", [
+    "prism,0,-0.0068,0,,0.013,-0.02 -0.05; 0.02 -0.05; 0.02 0; -0.02 0,,,,0,1.3,0",
+    "sector,0,0,0,,0.0015875,,0.0015875,0.003175,360,0,0,1.32"])
+def test_prisms_counted_from_their_tip_and_a_ring(tmp_path, capsys, row):
+    """The bore of the first was 0.03 mm, and refused; the second's angle had to be below 360."""
+    table, path = tmp_path / "blocks.csv", tmp_path / "study.toml"
+    second = f"b,{row}\n".replace("-0.0068", "0.0068").replace(",,0.013", ",180,0.013")
+    table.write_text(
+        "name,shape,x_m,y_m,z_m,rotation_z_deg,size_z_m,outline_m,inner_radius_m,outer_radius_m,"
+        f"angle_deg,remanence_x_T,remanence_y_T,remanence_z_T\na,{row}\n"
+        + (second if "prism" in row else ""))
+    assert main(["new", str(path), "--free-blocks", str(table)]) == 0
+    magnet = build_magnet(read_study(path))
+    points = points_from(read_study(path).observation.positions)
+    assert not magnet.contains(points).any()
+    assert np.isfinite(magnet.field_T(points)).all()
+    assert "halbach-fe solve" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("solid", [True, False])
 @pytest.mark.parametrize(("places", "bore"), [
     ([(0, 0)], False), ([(0, 0.012), (0, -0.012)], False), ([(0.04, 0), (-0.04, 0)], True)])

@@ -87,6 +87,16 @@ def coordinates_of(points):
     return {family.along for family in found}, found
 
 
+def test_a_map_without_times_has_an_order_of_rows():
+    """It was called the time."""
+    points = np.random.default_rng(2).normal(size=(30, 3))
+    for timed, named, other in ((True, "time", "order"), (False, "order", "time")):
+        found = {family.along for family in instrument_families(
+            points, np.linspace(0, 1, 30), np.ones((30, 3)), np.ones((30, 3, 3)), 1e-5, timed)}
+        assert named in found
+        assert other not in found
+
+
 def test_on_a_line_azimuth_and_radius_are_functions_of_z():
     z = np.linspace(-0.5, 0.5, 60)
     line = np.column_stack([0.07 + 0.001 * z, 0.03 - 0.02 * z, z])

@@ -38,6 +38,7 @@ from halbach_fe.inference.storage import _stored_root, read_posterior
 from halbach_fe.measurement.assembly_order import read_order
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.measurement.field_map import check_readings, field_map, read_map, write_map
+from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import READERS as FORMATS
 from halbach_fe.measurement.formats.files import import_map
@@ -68,6 +69,7 @@ from halbach_fe.study.reader import _with_table, parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.fuzz.contract import Reader
 from tests.fuzz.documents import FREE, RICH, document
+from tests.measurement.foreign_files import fluka, srw
 from tests.measurement.test_import_map import (
     COMSOL,
     FIELD,
@@ -542,6 +544,13 @@ def readers() -> tuple[Reader, ...]:
         replace(foreign, name="import: comsol", seeds=(
             sheet, comsol_grid().encode(), comsol_grid(brackets=True).encode(),
             comsol_sections().encode())),
+        replace(foreign, name="import: srw and fluka", seeds=(srw().encode(), fluka().encode())),
+        Reader("blocks in own columns", "own.csv", (
+            b"id;ring;slot;Jx [mT];Jy [mT];Jz [mT];Volume [cm^3];sd [%]\nA;1;1;1300;0;0;12;0.1\n",
+            b"id,shape,xc [mm],yc [mm],zc [mm],dx [mm],dy [mm],dz [mm],Br [T]\n"
+            b"a,cuboid,1,2,3,10,10,10,1.3\n"),
+            lambda path: import_blocks(path, DeclaredBlocks()), MeasurementError, len,
+            (b"[A m^2]", b"rotation_x", b"#")),
         replace(foreign, name="import: openpmd", seeds=(grid,), tokens=(*HDF5, b"gridSize",
                 b"%T", b"complex", b"magneticField", b"axisLabels", b"unitSI")),
         *(replace(foreign, name=f"import as {name}", read=imported(name),

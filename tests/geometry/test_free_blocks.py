@@ -29,6 +29,7 @@ SHAPES = {
     "cuboid": {"size_x_m": 0.02, "size_y_m": 0.03},
     "sector": {"inner_radius_m": 0.03, "outer_radius_m": 0.05, "angle_deg": 40.0},
     "long sector": {"inner_radius_m": 0.01, "outer_radius_m": 0.02, "angle_deg": 250.0},
+    "ring sector": {"inner_radius_m": 0.01, "outer_radius_m": 0.02, "angle_deg": 360.0},
     "trapezoid": {"size_x_m": 0.03, "inner_width_m": 0.01, "outer_width_m": 0.025},
     "cylinder": {"radius_m": 0.015},
     "polygon": {"sides": 7, "radius_m": 0.02},

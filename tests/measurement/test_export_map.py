@@ -144,10 +144,39 @@ def test_meshes_of_openpmd_beamphysics_are_read(tmp_path):
     assert agrees(imported(legacy))
 
 
+@pytest.mark.parametrize("angles", [1, 4])
+def test_cylindrical_meshes(tmp_path, angles):
+    """Positions r, theta, z and components along them; with a single angle, as the file has it."""
+    path = tmp_path / "mesh.h5"
+    radius, angle, z = [0.01, 0.02], 0.5 + np.arange(angles) * np.pi / 2, [0.1, 0.2, 0.3]
+    r, a, height = (one.ravel() for one in np.meshgrid(radius, angle, z, indexing="ij"))
+    points = np.column_stack([r * np.cos(a), r * np.sin(a), height])
+    field = np.column_stack([0.1 + 2 * points[:, 1], 2 * points[:, 0], 0 * r])
+    turned = np.column_stack([field[:, 0] * np.cos(a) + field[:, 1] * np.sin(a),
+                              field[:, 1] * np.cos(a) - field[:, 0] * np.sin(a), field[:, 2]])
+    with h5py.File(path, "w") as file:
+        file.attrs["externalFieldPath"] = np.bytes_("/mesh/%T/")
+        group = file.create_group("/mesh/01")
+        group.attrs.update({
+            "gridGeometry": np.bytes_("cylindrical"), "eleAnchorPt": np.bytes_("center"),
+            "axisLabels": np.array(["r", "theta", "z"], "S"), "gridSize": (2, angles, 3),
+            "gridSpacing": (0.01, np.pi / 2, 0.1), "gridOriginOffset": (0.01, 0.5, 0.1),
+            "gridLowerBound": (0, 0, 0), "harmonic": 0})
+        for column, name in enumerate(("r", "theta", "z")):
+            node = group.create_dataset(f"magneticField/{name}",
+                                        data=turned[:, column].reshape(2, angles, 3))
+            node.attrs.update({"unitSI": 1.0, "unitDimension": (0, 1, -2, -1, 0, 0, 0)})
+    found = import_map(path, DeclaredFormat())
+    np.testing.assert_allclose(points_of(found.data), points, atol=1e-15)
+    np.testing.assert_allclose(found.data["B_T"], field, atol=1e-15)
+    assert any("rotational symmetry" in said for said in found.imported.remarks) == (angles == 1)
+
+
 @pytest.mark.parametrize(("changes", "asked"), [
     ({"attributes": {"harmonic": 1}}, "a static field"),
     ({"attributes": {"RFphase": 0.5}}, "`RFphase`"),
-    ({"attributes": {"gridGeometry": np.bytes_("cylindrical")}}, "must be rectangular"),
+    ({"attributes": {"gridGeometry": np.bytes_("spherical")}}, "must be rectangular or"),
+    ({"attributes": {"gridGeometry": np.bytes_("cylindrical")}}, "r, theta and z"),
     ({"attributes": {"gridCurvatureRadius": 2.0}}, "a straight grid"),
     ({"attributes": {"gridSpacing": None}}, "`gridSpacing`"),
     ({"attributes": {"gridSize": (3, 2, 4)}}, "shape of magneticField/x"),

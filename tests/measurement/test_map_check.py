@@ -23,6 +23,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
+from halbach_fe.measurement.scan_lines import held_out_lines
 from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows
 from halbach_fe.report.map_check import (
     OPEN_SIGN,
@@ -125,6 +126,21 @@ def test_gradient_of_charges(generator):
         np.sum(reads * charges.field(points, amplitudes), axis=1), rtol=1e-9)
     np.testing.assert_allclose(charges.fields(points) @ amplitudes,
                                charges.field(points, amplitudes), rtol=1e-9)
+
+
+def test_scattered_maps_are_held_out_by_regions(generator):
+    """A single point among neighbours is predicted by them; control: few points, and circles."""
+    points = 0.01 * generator.normal(size=(300, 3))
+    regions = scan_lines(points)
+    sizes = np.bincount(regions)
+    assert 4 <= sizes.min() <= sizes.max() <= 8
+    assert 0.15 < held_out_lines(regions, 5).mean() < 0.25
+    spread = [np.ptp(points[regions == n], axis=0).max() for n in range(len(sizes))]
+    assert np.median(spread) < 0.5 * np.ptp(points, axis=0).max()
+    assert scan_lines(points[:30]).max() == 29
+    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    circle = np.column_stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), 0 * angle])
+    assert scan_lines(circle).max() == 63
 
 
 def test_scan_lines():

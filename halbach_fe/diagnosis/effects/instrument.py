@@ -135,7 +135,7 @@ EFFECTS = (
     # in lines that all go one way a lag is a shift of the map
     _row("lag", "lag of the readings behind the stage", "distance", "m", 3e-4, _plus("lag_m"),
          shown_by=goes_both_ways),
-    _row("drift", "drift of the zeros in time", "x y z", "T", 1e-4, _plus("drift_T")),
+    _row("drift", "drift of the zeros during the scan", "x y z", "T", 1e-4, _plus("drift_T")),
     *(_row(name, f"mapper turned about {COMPONENTS[axis]}", "angle", "rad", 2e-3, _turned(axis))
       for axis, name in enumerate(("mapper_tilt_x", "mapper_tilt_y", "mapper_roll"))),
     *(_row(f"{name}_{COMPONENTS[axis]}", title.format(COMPONENTS[axis]), amplitudes, unit, sd,

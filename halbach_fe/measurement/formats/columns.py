@@ -7,9 +7,13 @@ two names are recognized. A line of units may follow the header.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
+
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be, printable
 from halbach_fe.measurement.field_map import (
     FIELD_COLUMNS,
@@ -33,7 +37,9 @@ from halbach_fe.measurement.formats.text import (
     rows_of,
     uncommented,
 )
+from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
 
+VECTOR = re.compile(r"(?i)vector data\b.*\bB_Vector\b.*")
 RECOGNIZED = 2
 """Smallest number of recognized names in a header. Fewer may be words of a sentence."""
 OWN_COLUMNS = frozenset((*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS))
@@ -42,6 +48,12 @@ MEANING = re.compile(
     r"(?i)\b(?:symmetr\w*|mirror\w*|flip\w*|extend[xyz]?|quadrant|octant|half|scal(?:e|ed|ing)|"
     r"factor|norm[be]?|normali[sz]\w*|offsets?|multipl\w*|cent(?:er|re)|origin)\b")
 """Words of a line above the table that may change the meaning of its numbers."""
+CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+"
+                    r"y[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+z[\s=:]{0,3}([-+\d.e]+)\s*(\w+)")
+"""A point with its coordinates and their unit: centre in lab: x 1 mm, y 2 mm, z 3 mm."""
+MAX_COUNTS = 4
+MAX_HEADER = 20_000
+"""Number of characters of a line that are read as names of columns."""
 MAX_LINE, MAX_REMARKS = 200, 5
 """Number of characters of such a line that are searched, and of such lines that are told."""
 
@@ -60,16 +72,74 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
 def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> ForeignTable:
     """Read a table of columns from lines, as `read` does."""
     start = _first_numbers(lines, declared, where)
-    delimiter = delimiter_of(lines[start][1], declared)
-    count = len(cells_of(lines[start][1], delimiter))
-    values, texts = rows_of(lines[start:], count, delimiter, declared, where)
+    first = _below_counts(lines, start, declared, where)
+    counts, preface = lines[start:first], lines[:first]
+    header = {line.strip() for _, line in preface}  # repeated above every part of some files
+    body = [line for line in lines[first:] if line[1].strip() not in header]
+    delimiter = delimiter_of(body[0][1], declared)
+    remarks: tuple[str, ...] = ()
+    try:
+        values, texts = rows_of(body, len(cells_of(body[0][1], delimiter)), delimiter, declared,
+                                where)
+    except MeasurementError as error:
+        if delimiter != "\t" or declared.delimiter:
+            raise
+        delimiter = None
+        try:
+            values, texts = rows_of(body, len(body[0][1].split()), None, declared, where)
+        except MeasurementError:
+            raise error from None
+        remarks = ("Some cells are separated by several tabs, which were taken for one: then all "
+                   "rows are equally long.",)
+    if counts:
+        remarks += (_counted(counts[0], len(values), where),)
+    values = _without_empty_end(values, texts, lines[:start], delimiter)
+    count = values.shape[1]
     _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
-    columns = _header(lines[:start], count, delimiter, where)
+    columns = _header(preface, count, delimiter, "" if declared.columns else where)
     own = {column.text for column in columns} <= OWN_COLUMNS
     return ForeignTable(
-        columns, values, where, comments="" if own else comments_of(lines[:start]), texts=texts,
-        attributes=attributes_of(lines[:start]) if own else {},
-        remarks=() if own else unused_lines(lines[:start], columns))
+        columns, values, where, comments="" if own else comments_of(preface), texts=texts,
+        attributes=attributes_of(preface) if own else {},
+        remarks=remarks if own else remarks + unused_lines(preface, columns))
+
+
+def _below_counts(
+    lines: Sequence[Line], start: int, declared: DeclaredFormat, where: str
+) -> int:
+    """Return the index of the first row of readings: below a line of one to four counts."""
+    rows = [index for index in range(start, len(lines)) if not is_comment(lines[index][1])][:2]
+    cells = [[cell for cell in cells_of(lines[index][1], delimiter_of(lines[index][1], declared))
+              if cell] for index in rows]
+    if len(rows) < 2 or len(cells[0]) == len(cells[1]) or len(cells[0]) > MAX_COUNTS or not all(
+            re.fullmatch(r"[1-9]\d{0,8}", cell) for cell in cells[0]):
+        return start
+    return rows[1]
+
+
+def _counted(counts: Line, rows: int, where: str) -> str:
+    """Return the sentence about a line of counts, which must agree with the number of rows."""
+    number, line = counts
+    found = [int(cell) for cell in re.findall(r"\d+", line)]
+    if rows not in (math.prod(found), math.prod(found[:3]), *found):
+        raise MeasurementError(must_be(
+            f"line {number}", where, f"a reading, or counts of the {rows} rows below it",
+            f"'{printable(line.strip(), 40)}'",
+            f"Is the file cut short? If the line is none of both, add --skip-lines {number}, and "
+            "--columns, as its header is skipped too."))
+    return f"Line {number} was read as counts of points: there are as many rows."
+
+
+def _without_empty_end(
+    values: Floats, texts: Mapping[int, object], preface: Sequence[Line], delimiter: str | None
+) -> Floats:
+    """Return the columns but for a last one that a delimiter at the end of all rows makes."""
+    last = values.shape[1] - 1
+    if last < 1 or last in texts or not np.isnan(values[:, last]).all() or any(
+            len(cells) == last + 1 and cells[-1] for _, line in preface
+            for cells in _splits(line, delimiter)):
+        return values
+    return values[:, :last]
 
 
 def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
@@ -85,11 +155,25 @@ def unused_lines(preface: Sequence[Line], columns: Sequence[ColumnName]) -> tupl
     """
     names = [re.sub(r"\s", "", column.text) for column in columns if column.text]
     found = [f"Line {number} says '{printable(line.strip(), 80)}', of which nothing was used: "
-             "if it is a shift, state it by --origin-m, and what else it says "
-             "by other options or in the study."
+             + (_shift(line) or "if it is a shift, state it by --origin-m, and what else it says "
+                "by other options or in the study.")
              for number, line in preface if MEANING.search(line[:MAX_LINE])
              and not (names and all(name in re.sub(r"\s", "", line) for name in names))]
     return tuple(found[:MAX_REMARKS])
+
+
+def _shift(line: str) -> str:
+    """Return how to use the centre that a line states; empty if it states none."""
+    found = CENTRE.search(line[:MAX_LINE])
+    unit = unit_symbol(found[6]) if found else ""
+    if not found or kind_of(unit) != "length":
+        return ""
+    try:
+        at = -in_si(np.array([float(found[number]) for number in (1, 3, 5)]), unit)
+    except ValueError:
+        return ""
+    return ("if the magnet's centre is there in the coordinates of the file, add --origin-m="
+            + ",".join(f"{value + 0.0:.9g}" for value in at) + ", which puts it at the origin.")
 
 
 def _first_numbers(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> int:
@@ -112,7 +196,9 @@ def _first_numbers(lines: Sequence[Line], declared: DeclaredFormat, where: str) 
         before = (index, len(cells)) if 2 * found > len(cells) else None
     hint = next((comma for _, line in lines for mark in (";", "\t", None)
                  for cell in cells_of(line, mark) if (comma := comma_hint(cell))), "")
-    raise MeasurementError(must_be("content", where, "a table with lines of numbers", "none", hint))
+    raise MeasurementError(must_be(
+        "content", where, "a table with lines of numbers", "none", hint or "State what separates "
+        "the numbers: --delimiter comma, semicolon, tab or spaces."))
 
 
 def _refuse_lost_rows(
@@ -128,17 +214,21 @@ def _refuse_lost_rows(
                 cells, declared.decimal_comma):
             raise MeasurementError(must_be(
                 f"line {position}", where, "either a reading or a header",
-                f"'{line.strip()[:60]}'", "If it is neither, begin it with #."))
+                f"'{line.strip()[:60]}'",
+                f"If it is neither, begin it with #, or add --skip-lines {position}."))
 
 
 def _header(
     preface: Sequence[Line], count: int, delimiter: str | None, where: str
 ) -> tuple[ColumnName, ...]:
-    """Return the names of the columns; they are empty if there is no header."""
+    """Return the names of the columns; they are empty if there is no header.
+
+    An empty ``where`` stands for a file whose columns the user states: no header is refused.
+    """
     below: list[str] = []
     plain: tuple[ColumnName, ...] = ()
     for number, line in reversed(preface):
-        for cells in _splits(line, delimiter):
+        for cells in map(_with_vector, _splits(line, delimiter)):
             columns = tuple(names.parse(cell) for cell in cells)
             known = sum(bool(column.quantity) for column in columns)
             if len(cells) == count and not below and names.is_units(cells):
@@ -149,7 +239,8 @@ def _header(
             if len(cells) == count and not plain and not is_comment(line):
                 plain = columns
         else:
-            _refuse_other_length(line, number, count, delimiter, where)
+            if where:
+                _refuse_other_length(line, number, count, delimiter, where)
     return plain or (ColumnName(""),) * count
 
 
@@ -158,9 +249,17 @@ def _splits(line: str, delimiter: str | None) -> list[list[str]]:
 
     A header may be separated by spaces even if its rows are separated by commas.
     """
-    text = uncommented(line) if is_comment(line) else line.strip()
-    spaced = _spaced(text)
-    return [spaced] if delimiter is None else [cells_of(text, delimiter), spaced]
+    text = (uncommented(line) if is_comment(line) else line.strip())[:MAX_HEADER]
+    marks = [mark for mark in (delimiter, ",", ";", "\t") if mark and mark in text]
+    split = [cells_of(text, mark) for mark in dict.fromkeys(marks)]
+    return [_spaced(text), *split] if delimiter is None else [*split, _spaced(text)]
+
+
+def _with_vector(cells: list[str]) -> list[str]:
+    """Return names in which a last one of a vector, as of Ansys Maxwell, is that of components."""
+    if cells and VECTOR.fullmatch(cells[-1][:MAX_LINE]):
+        return [*cells[:-1], *names.FIELDS[:3]]
+    return cells
 
 
 def _spaced(text: str) -> list[str]:
@@ -180,9 +279,10 @@ def _refuse_other_length(
     line: str, number: int, count: int, delimiter: str | None, where: str
 ) -> None:
     """Raise MeasurementError for a header with another number of names than there are columns."""
-    for cells in _splits(line, delimiter):
+    for cells in map(_with_vector, _splits(line, delimiter)):
         known = [names.parse(cell).quantity for cell in cells]
         if not is_comment(line) and sum(map(bool, known)) > RECOGNIZED and len(cells) != count:
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",
-                str(len(cells)), "Correct the header."))
+                str(len(cells)), "State what separates them by --delimiter, correct the header, or "
+                "state the columns: --columns NAME,NAME,... takes its place."))

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
-FORMATS = ("columns", "opera", "comsol", "openpmd", "g4beamline", "bdsim")
+FORMATS = ("columns", "opera", "comsol", "openpmd", "g4beamline", "bdsim", "srw", "fluka")
 """Names of the formats of other programs that can be read."""
+
+DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}
+"""What may separate cells; ``spaces`` are any number of spaces and tabs."""
 
 UNKNOWN = "unknown"
 """The component of a column B of which nobody knows which it is."""
@@ -15,8 +19,8 @@ UNKNOWN = "unknown"
 class DeclaredFormat:
     """Statements of the user about the format of a file.
 
-    An empty value states nothing. A statement must agree with the file if the file contains the
-    same information.
+    An empty value states nothing. ``columns`` take the place of the file's header; any other
+    statement must agree with the file if the file contains the same information.
 
     Attributes
     ----------
@@ -35,6 +39,12 @@ class DeclaredFormat:
         Whether numbers have a decimal comma (0,5 is one half).
     encoding : str
         Encoding of a text file.
+    skip_lines : int
+        Number of lines at the beginning that are not read.
+    delimiter : str
+        One of `DELIMITERS`.
+    positions : Path or None
+        A table of x, y and z with a row for each reading of a file that has none.
     """
 
     length_unit: str = ""
@@ -46,3 +56,6 @@ class DeclaredFormat:
     origin_m: tuple[float, float, float] | None = None
     decimal_comma: bool = False
     encoding: str = "utf-8-sig"
+    skip_lines: int = 0
+    delimiter: str = ""
+    positions: Path | None = None

@@ -25,18 +25,20 @@ from halbach_fe.measurement.formats import (
     comsol,
     g4beamline,
     geant4,
+    implied_grid,
     openpmd,
     opera,
 )
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
-from halbach_fe.measurement.formats.text import lines_of
-from halbach_fe.study.types import look_like_mm
+from halbach_fe.measurement.formats.text import lines_of, text_of_table
+from halbach_fe.measurement.formats.units import unit_symbol
+from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
-    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read),
-    strict=True))
+    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read,
+              implied_grid.read_srw, implied_grid.read_fluka), strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
@@ -86,14 +88,17 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
         or which options to add.
     """
     where = f"map {path}"
-    raw = file_bytes(path, where)
+    raw = text_of_table(file_bytes(path, where, workbooks=True), where)
     if not name and (own := _own(path, raw, declared)) is not None:
         return _with_doubt(own, declared)
     name = name or format_of(raw, declared, where)
     if declared.decimal_comma and name in ("opera", "openpmd"):
         raise MeasurementError(must_be("format", where, "one in which numbers may have a decimal "
                                        "comma (--decimal-comma)", name, "Remove the option."))
-    found = to_map(READERS[name](raw, declared, where), declared)
+    table = READERS[name](raw, declared, where)
+    if declared.positions is not None:
+        table = with_positions(table, declared.positions)
+    found = to_map(table, declared)
     data = found.data
     check_readings(data, path)
     data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
@@ -113,6 +118,30 @@ def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
                  else "; and --at is in m." if declared.at else "."))
     return replace(file, imported=replace(
         file.imported, remarks=(*file.imported.remarks, remark)))
+
+
+def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
+    """Return a table of readings with the columns x, y and z of a file of positions.
+
+    Raises
+    ------
+    MeasurementError
+        If the file has no x, y and z with their units, or another number of rows.
+    """
+    where = f"table of positions {path}"
+    found = columns.read(file_bytes(path, where), DeclaredFormat(), where)
+    order = [[column.quantity for column in found.columns].index(name) for name in COMPONENTS
+             if name in [column.quantity for column in found.columns]]
+    if len(order) < len(COMPONENTS) or not all(
+            unit_symbol(found.columns[number].unit) for number in order):
+        raise MeasurementError(must_be("header", where, "with x, y and z and their units, as in "
+                                       "x[mm],y[mm],z[mm]", ",".join(
+                                           column.text for column in found.columns)[:60] or "none"))
+    if len(found.values) != len(table.values):
+        raise MeasurementError(must_be("content", where, f"{len(table.values)} rows, one for each "
+                                       f"reading of {table.where}", str(len(found.values))))
+    return replace(table, columns=(*table.columns, *(found.columns[n] for n in order)),
+                   values=np.hstack([table.values, found.values[:, order]]))
 
 
 def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedFile | None:
@@ -151,6 +180,8 @@ def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
         return "g4beamline"
     if bdsim.is_bdsim(lines):
         return "bdsim"
+    if (implied := implied_grid.format_of(lines)) is not None:
+        return implied
     return "opera" if opera.is_opera(lines) else "columns"
 
 

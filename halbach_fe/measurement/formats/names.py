@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
-from halbach_fe.measurement.formats.units import CLOCK, TIMES, states_no_unit, unit_symbol
+from halbach_fe.measurement.formats.units import (
+    CLOCK,
+    H_FIELDS,
+    TIMES,
+    kind_of,
+    states_no_unit,
+    unit_symbol,
+)
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
@@ -27,7 +35,18 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
     "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
     "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
-    "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"}
+    "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"} | {
+    spelling.format(axis): name for axis, name in zip("xyz", FIELDS[:3], strict=True)
+    for spelling in ("b0{}", "b{}re", "reb{}", "b{}real", "field{}", "{}field", "bfield{}", "mag{}",
+                     "magneticfield{}", "fluxdensity{}", "magneticfluxdensity{}", "b{}mean",
+                     "meanb{}", "b{}avg")} | {
+    spelling.format(axis): axis for axis in "xyz"
+    for spelling in ("position{}", "{}position", "coord{}", "{}coord", "{}coordinate", "stage{}",
+                     "probe{}", "point{}", "points{}", "location{}")} | {
+    f"{of}:{number}": name for of, each in (("points", "xyz"), ("b", FIELDS[:3]))
+    for number, name in enumerate(each)}
+MAGNITUDES = frozenset(("magnitude", "mag", "total", "vectorsum"))
+"""Names of |B| beside columns x, y and z of a field."""
 
 TIME_NAMES = frozenset(("t", "time", "times", "timestamp", "timeofday", "clock", "datetime",
                         "elapsed", "elapsedtime"))
@@ -57,7 +76,8 @@ class ColumnName:
     text : str
         Name as the file spells it.
     quantity : str
-        One of `KNOWN`, `OTHERS` and, if stated, `MOVES`; empty if the name is not recognized.
+        One of `KNOWN`, `OTHERS` and, if stated, `MOVES`; Hx to Hphi of a column of H; empty if the
+        name is not recognized.
     unit : str
         Text of the unit as the file spells it; may be empty.
     """
@@ -67,21 +87,36 @@ class ColumnName:
     unit: str = ""
 
 
+@lru_cache(maxsize=1024)  # lines of many words are read as headers too
 def parse(text: str, stated: bool = False) -> ColumnName:
     """Return quantity and unit of the name of a column, which the user may have ``stated``."""
     text = text.strip().strip('"').strip()
     if len(text) > MAX_NAME:
         return ColumnName(f"{text[:MAX_NAME]}...")
-    base, unit = _split(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
+    base, unit = split_unit(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
     key = _key(base)
-    quantity = ALIASES.get(key) or _other_quantity(base, key, unit.strip()) or (
+    quantity = _measured(key, unit_symbol(unit)) or _other_quantity(base, key, unit.strip()) or (
         key if stated and key in STATED else "")
     return ColumnName(text, quantity, unit.strip())
 
 
+def _measured(key: str, unit: str) -> str:
+    """Return which position or field a name is: x in T is Bx, and Hx in A/m is Hx."""
+    of_h = f"b{key[1:]}"
+    if unit.rpartition(" ")[2] in H_FIELDS and key.startswith("h") and ALIASES.get(of_h) in FIELDS:
+        return f"H{ALIASES[of_h][1:]}"
+    quantity = ALIASES.get(key, "")
+    return f"B{quantity}" if quantity in POSITIONS and kind_of(unit) == "field" else quantity
+
+
 def _key(base: str) -> str:
-    """Return a name without spaces, in lower case, and without the physics of mf.Bx."""
-    return re.sub(r"[\s_]", "", PREFIX.sub("", base.lower(), count=1))
+    """Return a name without spaces, in lower case, and without the physics of mf.Bx.
+
+    B.x is Bx, and no x of something.
+    """
+    joined = re.sub(r"[\s_.\-]", "", base.lower())
+    return joined if joined in ALIASES else re.sub(
+        r"[\s_]", "", PREFIX.sub("", base.lower(), count=1))
 
 
 def _other_quantity(base: str, key: str, unit: str) -> str:
@@ -107,7 +142,7 @@ def noise_of(base: str, key: str) -> str | None:
     rest = [word for word in words if word not in NOISE_WORDS]
     if len(rest) == len(words):
         return None
-    return ALIASES.get(_key(_split("_".join(rest))[0])) if rest else "B"
+    return ALIASES.get(_key(split_unit("_".join(rest))[0])) if rest else "B"
 
 
 def is_clock(column: ColumnName) -> bool:
@@ -120,11 +155,11 @@ def is_time(column: ColumnName) -> bool:
 
     T in a unit of temperature is a temperature.
     """
-    name, unit = _split(column.text)
+    name, unit = split_unit(column.text)
     return _key(name) in TIME_NAMES and unit.strip(" °").lower() not in TEMPERATURES
 
 
-def _split(text: str) -> tuple[str, str]:
+def split_unit(text: str) -> tuple[str, str]:
     """Split a name into the quantity and the unit, which is empty if the name has none."""
     if found := BRACKETS.fullmatch(text):
         return found[1], found[2]

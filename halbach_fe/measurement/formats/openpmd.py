@@ -30,6 +30,8 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
 TESLA = (0.0, 1.0, -2.0, -1.0, 0.0, 0.0, 0.0)
 """Unit dimension of a flux density: powers of m, kg, s, A, K, mol and cd."""
+AXES: dict[str, tuple[str, ...]] = {"rectangular": COMPONENTS, "cylindrical": ("r", "theta", "z")}
+"""Axes of the geometries that are read; theta is in rad."""
 MAX_POINTS = 10_000_000
 """Largest number of points that is read. A small file may state any number, for which memory would
 be allocated."""
@@ -117,37 +119,47 @@ def _table(mesh: Any, where: str) -> ForeignTable:
         origin, lower, size, spacing, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     labels = tuple(map(str, np.atleast_1d(attributes["axisLabels"])))
+    names = AXES[attributes["gridGeometry"]]
     scale = float(attributes.get("fieldScale", 1.0))
     field = np.column_stack([
-        scale * _component(mesh["magneticField"], name, labels, size, where).ravel()
-        for name in COMPONENTS])
+        scale * _component(mesh["magneticField"], name, names, labels, size, where).ravel()
+        for name in names])
     anchor = str(attributes["eleAnchorPt"])
-    columns = [ColumnName(name, name, "m") for name in COMPONENTS] + [
-        ColumnName(f"B{name}", f"B{name}", "T") for name in COMPONENTS]
-    return ForeignTable(tuple(columns), np.hstack([points, field]), where,
-                        anchor="" if anchor == "center"
-                 else f"the '{anchor[:20]}' of the element, from which it counts,")
+    own = [{"theta": "phi"}.get(name, name) for name in names]
+    columns = [ColumnName(name, name, "rad" if name == "phi" else "m") for name in own] + [
+        ColumnName(f"B{name}", f"B{name}", "T") for name in own]
+    symmetric = names != COMPONENTS and size[1] == 1
+    return ForeignTable(
+        tuple(columns), np.hstack([points, field]), where,
+        anchor="" if anchor == "center"
+        else f"the '{anchor[:20]}' of the element, from which it counts,",
+        remarks=("The file is of a field with rotational symmetry about z: the map has its points "
+                 "once, at the angle of the file.",) if symmetric else ())
 
 
 def _check(attributes: Mapping[str, Any], where: str) -> None:
-    """Raise MeasurementError unless the mesh is a static field on a rectangular grid."""
+    """Raise MeasurementError unless the mesh is a static field on a grid of `AXES`."""
     needed = ("gridGeometry", "eleAnchorPt", "axisLabels", "gridSize", "gridSpacing",
               "gridOriginOffset", "gridLowerBound", "harmonic")
     for name in needed:
         if name not in attributes:
             raise MeasurementError(must_be("attribute", where, f"`{name}`", "a mesh without it"))
     allowed: dict[str, tuple[Any, str]] = {
-        "gridGeometry": ("rectangular", "rectangular"), "harmonic": (0, "0, a static field"),
+        "harmonic": (0, "0, a static field"),
         "gridCurvatureRadius": (0, "0, a straight grid"), "RFphase": (0, "0, a static field"),
         "gridUnitSI": (1, "1, in metres")}
     for name, (value, expected) in allowed.items():
         if name in attributes and attributes[name] != value:
             raise MeasurementError(must_be(f"`{name}`", where, expected,
                                            f"{str(attributes[name])[:40]}"))
+    geometry = str(attributes["gridGeometry"])
+    if geometry not in AXES:
+        raise MeasurementError(must_be("`gridGeometry`", where, " or ".join(AXES), geometry[:40]))
     labels = sorted(map(str, np.atleast_1d(attributes["axisLabels"])))
-    if labels != list(COMPONENTS):
-        raise MeasurementError(must_be("`axisLabels`", where, "x, y and z in some order",
-                                       ", ".join(labels)[:40]))
+    if labels != sorted(AXES[geometry]):
+        raise MeasurementError(must_be(
+            "`axisLabels`", where, "{}, {} and {} in some order".format(*AXES[geometry]),
+            ", ".join(labels)[:40]))
 
 
 def _vector(attributes: Mapping[str, Any], name: str, where: str) -> Floats:
@@ -160,9 +172,10 @@ def _vector(attributes: Mapping[str, Any], name: str, where: str) -> Floats:
 
 
 def _component(
-    record: Any, name: str, labels: tuple[str, ...], size: list[int], where: str
+    record: Any, name: str, names: tuple[str, ...], labels: tuple[str, ...], size: list[int],
+    where: str
 ) -> Floats:
-    """Return a component (nx, ny, nz) in T; zeros if the file does not have it."""
+    """Return a component in T along the axes ``names``; zeros if the file does not have it."""
     if name not in record:
         return np.zeros(size)
     node = record[name]
@@ -171,8 +184,8 @@ def _component(
                                        "that of a flux density",
                                        str(tuple(node.attrs["unitDimension"]))[:60]))
     if _text(node.attrs.get("gridDataOrder", "C")) == "F":
-        labels = tuple(reversed(COMPONENTS))
-    order = [COMPONENTS.index(label) for label in labels]
+        labels = tuple(reversed(names))
+    order = [names.index(label) for label in labels]
     expected = tuple(size[axis] for axis in order)
     constant = isinstance(node, h5py.Group)
     shape = tuple(int(count) for count in (node.attrs["shape"] if constant else node.shape))

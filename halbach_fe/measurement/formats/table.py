@@ -23,16 +23,14 @@ from halbach_fe.measurement.formats.text import Line, comma_hint
 from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
-           "field": "--field-unit T, mT, uT, G or kG", "angle": "--angle-unit deg or rad",
+           "field": "--field-unit T, mT, uT, G, kG or A/m, or a factor, as in '1e-7 T'",
+           "angle": "--angle-unit deg or rad",
            "time": "--columns ...t[s], t[min], t[h] or t[hhmmss]"}
 MAX_NUMBER = 1e30
 """Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
 would overflow."""
 MOST_RAD = 4 * np.pi
 """Largest angle of a position, two turns: larger ones are in degrees."""
-
-KINDS = {"length": units.LENGTHS, "field": units.FIELDS, "angle": units.ANGLES,
-         "time": units.TIMES}
 
 
 @dataclass(frozen=True)
@@ -112,10 +110,11 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         other, or if the values are too large for a map of a permanent magnet.
     """
     columns = _with_times(_columns(table, declared), table)
-    used = _used(columns, table, declared)
-    missing = _missing(used, columns, table, declared)
+    missing: list[str] = []
+    used = _used(columns, table, declared, missing)
+    missing += _missing(used, columns, table, declared)
     unit_of: dict[str, str] = {}
-    for kind in KINDS:
+    for kind in OPTIONS:
         unit_of |= _units(kind, used, columns, table, declared, missing)
     if missing:
         raise MeasurementError(must_be(
@@ -149,17 +148,18 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
     data.attrs |= table.attributes
     if declared.component == UNKNOWN:
         data = undirected(data)
-    lengths = {unit for name, unit in unit_of.items() if unit in units.LENGTHS}
-    fields = {unit for name, unit in unit_of.items() if unit in units.FIELDS}
+    lengths, fields = ({unit for name, unit in unit_of.items() if _kind(name) == kind}
+                       for kind in ("length", "field"))
     ignored = tuple(column.text for index, column in enumerate(columns)
                     if index not in used.values() and column.text)
-    remarks = (*table.remarks, *_remarks(columns, used, unit_of, table, declared))
+    remarks = (*table.remarks, *_overridden(columns, table, declared),
+               *_remarks(columns, used, unit_of, table, declared))
     return ImportedMap(data, tuple(sorted(lengths)), tuple(sorted(fields)), ignored,
                        int((~read).sum()), "Br" in si, remarks)
 
 
 def _in_si(used: dict[str, int], unit_of: dict[str, str], table: ForeignTable) -> dict[str, Floats]:
-    """Return all columns that have a unit of `KINDS`, but times, in SI units."""
+    """Return all columns that have a unit of `units.KINDS`, but times, in SI units."""
     si = {}
     for name, column in used.items():
         if name in ("t", "scan"):
@@ -278,7 +278,8 @@ def _remarks(
     table: ForeignTable, declared: DeclaredFormat
 ) -> list[str]:
     """Return sentences about columns that were recognized though the user did not state them."""
-    said = []
+    said = ["The columns of H were read as B = mu_0 H, as it is in air."] if any(
+        unit.rpartition(" ")[2] in units.H_FIELDS for unit in unit_of.values()) else []
     noise = [name for name in names.NOISE if name in used]
     own = any(column.text in ("sigma_T", "sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
               for column in columns)
@@ -323,46 +324,64 @@ def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[Col
 
 
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
-    """Return the file's columns with the names and units that the user states."""
+    """Return the file's columns with the names and units that the user states instead."""
     if not declared.columns:
-        return table.columns
-    if len(declared.columns) != len(table.columns):
+        return _of_h(table.columns)
+    count = len(table.columns) - (len(COMPONENTS) if declared.positions is not None else 0)
+    if len(declared.columns) != count:
         raise MeasurementError(must_be(
-            "--columns", table.where, f"of {len(table.columns)} columns, as the file has",
+            "--columns", table.where, f"of {count} columns, as the file has",
             f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
-    for text, column in zip(declared.columns, table.columns, strict=True):
+    for text, column in zip(declared.columns, table.columns[:count], strict=True):
         stated = ColumnName("") if text == "-" else names.parse(text, stated=True)
-        if text != "-" and not stated.quantity:
+        if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
             raise MeasurementError(must_be(
                 "--columns", table.where,
                 f"made of {', '.join((*names.KNOWN, *names.STATED))} and -", f"'{text}'"))
-        if text != "-" and column.quantity not in ("", *names.OTHERS, stated.quantity) and not (
-                column.quantity == "B" and stated.quantity in names.FIELDS):
-            raise _contradiction(table, f"column '{column.text}'", column.quantity,
-                                 f"--columns {stated.quantity}")
-        in_file = units.unit_symbol(column.unit)  # brackets may also hold a remark: Z (stage)
-        if in_file and stated.unit and in_file != units.unit_symbol(stated.unit):
-            raise _contradiction(table, f"unit of column '{column.text}'", column.unit,
-                                 f"--columns {text}")
         found.append(ColumnName(column.text or stated.text, stated.quantity,
-                                stated.unit if stated.unit and not in_file else column.unit))
-    return tuple(found)
+                                stated.unit or column.unit))
+    return (*found, *table.columns[count:])
+
+
+def _overridden(
+    columns: Sequence[ColumnName], table: ForeignTable, declared: DeclaredFormat
+) -> list[str]:
+    """Return sentences about what --columns states otherwise than the header."""
+    found = []
+    for text, column, own in zip(declared.columns, columns, table.columns, strict=False):
+        name = own.quantity not in ("", *names.OTHERS, column.quantity) and text != "-"
+        unit = units.unit_symbol(own.unit)
+        if (name and own.quantity != "B") or (column.quantity and unit and unit
+                                              != units.unit_symbol(column.unit)):
+            found.append(f"'{own.text}' of the header was read as {text}, as --columns says.")
+    return found
+
+
+def _of_h(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
+    """Return the columns, those of H as of B if there is no other B."""
+    of_b = any(column.quantity in (*names.FIELDS, "B", names.TOTAL) for column in columns)
+    return tuple(replace(column, quantity="" if of_b else f"B{column.quantity[1:]}")
+                 if column.quantity.startswith("H") else column for column in columns)
 
 
 def _used(
-    columns: Sequence[ColumnName], table: ForeignTable, declared: DeclaredFormat
+    columns: Sequence[ColumnName], table: ForeignTable, declared: DeclaredFormat,
+    missing: list[str]
 ) -> dict[str, int]:
-    """Return the index of the column of each quantity that the map uses."""
+    """Return the index of the column of each quantity that the map uses.
+
+    Quantities of several columns are added to the descriptions in ``missing``.
+    """
     used: dict[str, int] = {}
     for index, column in enumerate(columns):
         if not column.quantity:
             continue
         if column.quantity in used:
-            raise MeasurementError(must_be(
-                "header", table.where, f"with one column {column.quantity}",
-                f"'{columns[used[column.quantity]].text}' and '{column.text}'",
-                "Choose one with --columns; - ignores a column."))
+            missing.append(f"its one column {column.quantity}: '"
+                           f"{columns[used[column.quantity]].text}' or '{column.text}' (--columns, "
+                           "- to ignore a column)")
+            continue
         used[column.quantity] = index
     components = [name for name in names.FIELDS if name in used]
     if declared.component and used:
@@ -399,6 +418,8 @@ def _missing(
                 ("length", "positions", declared.length_unit or table.length_unit),
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
     missing = []
+    if (hint := _of_field(used, columns)) is not None:
+        return [hint]
     wanted = ("r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
     absent = [name for name in wanted if name not in used and name not in declared.at
               and f"d{name}" not in used]
@@ -418,10 +439,28 @@ def _missing(
     return missing
 
 
+def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None:
+    """Return what to do with x, y and z beside no field: in logs of meters they are the field."""
+    kinds = {_kind(name) for name in used}
+    if not {"x", "y", "z"} <= set(used) or "field" in kinds or any(
+            units.kind_of(units.unit_symbol(columns[used[name]].unit)) for name in "xyz"):
+        return None
+    stated = ["-"] * len(columns)
+    for name in "xyz":
+        stated[used[name]] = f"B{name}[T]"
+    magnitude = any(column.text.lower() in names.MAGNITUDES for column in columns)
+    return ("whether x, y and z are positions, so that there is no field"
+            f" (--columns), or {'rather, beside a magnitude, ' if magnitude else ''}the field, so "
+            f"that there are no positions (--columns={','.join(stated)}, with the unit, and "
+            "--positions TABLE: x, y and z of every row; or --at x=0,y=0,z=0)")
+
+
 def _by_option(absent: Sequence[str]) -> str:
     """Return the options that provide absent coordinates."""
     if "r" in absent or "phi" in absent:
         return "--columns"
+    if len(absent) == len(COMPONENTS):
+        return "--positions TABLE with a row x, y, z for each reading, or --columns"
     return f"--at {','.join(f'{name}=0' for name in absent)} in m, or --columns"
 
 
@@ -429,7 +468,7 @@ def _units(
     kind: str, used: dict[str, int], columns: Sequence[ColumnName], table: ForeignTable,
     declared: DeclaredFormat, missing: list[str]
 ) -> dict[str, str]:
-    """Return the unit of each column of a kind, one of `KINDS`.
+    """Return the unit of each column of a kind, one of `units.KINDS`.
 
     Columns without a unit are added to the descriptions in ``missing``.
     """
@@ -454,9 +493,12 @@ def _units(
                 found[name] = "hhmmss"
                 continue
         unit = text if kind == "time" and text in units.TIMES else units.unit_symbol(text)
-        if not units.states_no_unit(text) and unit not in KINDS[kind]:
-            raise MeasurementError(must_be(
-                f"unit of {name}", table.where, f"one of {', '.join(KINDS[kind])}", f"'{text}'"))
+        if not units.states_no_unit(text) and (not unit or (
+                kind != "time" and units.kind_of(unit) != kind)):
+            stated = next(iter(units.KINDS[kind]))
+            missing.append(f"the unit of {name}, as '{text[:20]}' is none of "
+                           f"{', '.join(units.KINDS[kind])} (--columns ...{name}[{stated}])")
+            continue
         if unit and option and unit != option and name not in names.NOISE:
             raise _contradiction(table, f"unit of {name}", unit, f"--{kind}-unit {option}")
         of = found.get(name.removeprefix("sigma_")) or next(
@@ -471,7 +513,7 @@ def _units(
 
 
 def _kind(name: str) -> str:
-    """Return the kind of unit of a quantity, one of `KINDS`."""
+    """Return the kind of unit of a quantity, one of `units.KINDS`."""
     if name in ("phi", "t", "scan"):
         return {"phi": "angle", "t": "time", "scan": ""}[name]
     return "length" if name in (*names.POSITIONS, *names.MOVES) else "field"

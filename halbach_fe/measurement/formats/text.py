@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 from collections.abc import Sequence
 
 import numpy as np
 
+from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.files import workbook_in
 from halbach_fe.core.numbers import MAX_CELL
 from halbach_fe.core.numbers import parse_number as number_in
-from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.declared import DELIMITERS, DeclaredFormat
 
 COMMENTS = "#%!"
 """Characters that begin a comment."""
@@ -33,8 +36,10 @@ def lines_of(raw: bytes, declared: DeclaredFormat, where: str) -> list[Line]:
     MeasurementError
         If the content is not text in the declared encoding, or all lines are blank.
     """
+    marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    default = declared.encoding == DeclaredFormat.encoding
     try:
-        text = raw.decode(declared.encoding)
+        text = raw.decode("utf-16" if marked and default else declared.encoding)
     except LookupError:
         raise MeasurementError(must_be("encoding", where, "one of text (--encoding)",
                                        f"'{declared.encoding}'")) from None
@@ -42,20 +47,38 @@ def lines_of(raw: bytes, declared: DeclaredFormat, where: str) -> list[Line]:
         raise MeasurementError(must_be(
             "encoding", where, declared.encoding.removesuffix("-sig").upper(), "other bytes",
             "Is it text? Then name its encoding (--encoding latin-1, utf-16).")) from None
-    found = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    found = [(number, line) for number, line in enumerate(text.splitlines(), 1)
+             if line.strip() and number > declared.skip_lines]
     if not found:
         raise MeasurementError(must_be("content", where, "a table of readings", "blank lines"))
     return found
 
 
+def text_of_table(raw: bytes, where: str) -> bytes:
+    """Return the content of a file, of a workbook its first sheet as CSV.
+
+    Raises
+    ------
+    MeasurementError
+        If a workbook cannot be read.
+    """
+    if workbook_in(raw) is None:
+        return raw
+    try:
+        return untrusted.sheet_text(raw)
+    except ValueError as error:
+        raise MeasurementError(must_be("content", where, "a whole workbook", f"'{error}'",
+                                       "Save the sheet as CSV.")) from None
+
+
 def is_comment(line: str) -> bool:
-    """Return whether a line starts with #, % or !."""
-    return line.lstrip()[:1] in COMMENTS
+    """Return whether a line starts with #, %, ! or //."""
+    return line.lstrip()[:1] in COMMENTS or line.lstrip().startswith("//")
 
 
 def uncommented(line: str) -> str:
     """Return a comment without the characters that begin it."""
-    return line.strip().lstrip(COMMENTS).strip()
+    return line.strip().lstrip(f"{COMMENTS}/").strip()
 
 
 def comments_of(lines: Sequence[Line]) -> str:
@@ -69,6 +92,8 @@ def delimiter_of(line: str, declared: DeclaredFormat) -> str | None:
 
     None stands for spaces. With a decimal comma, a comma is no delimiter.
     """
+    if declared.delimiter:
+        return DELIMITERS[declared.delimiter]
     for mark in ";\t" if declared.decimal_comma else ";\t,":
         if mark in line:
             return mark
@@ -95,7 +120,7 @@ def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
         cell = cell.replace(",", "")
     if not cell or cell.lower() == "nan":
         return np.nan
-    return number_in(cell)
+    return number_in(cell.replace("*^", "e"))  # as Mathematica writes exponents
 
 
 def numbers_among(cells: Sequence[str], decimal_comma: bool = False) -> int:
@@ -149,8 +174,11 @@ def rows_of(
             continue
         cells = cells_of(line, delimiter)
         if len(cells) != columns:
-            raise MeasurementError(must_be(f"line {position}", where, f"{columns} values",
-                                           str(len(cells)), "Is the file cut short?"))
+            raise MeasurementError(must_be(
+                f"line {position}", where, f"{columns} values", str(len(cells)),
+                "Is the file cut short? Else remove the line, or begin it with #; if the table "
+                f"begins below it, add --skip-lines {position}; if cells are separated otherwise, "
+                "--delimiter."))
         row = [_number_or_none(cell, declared.decimal_comma) for cell in cells]
         for column, value in enumerate(row):
             if value is None:

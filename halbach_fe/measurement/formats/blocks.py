@@ -1,0 +1,358 @@
+"""Import of tables of blocks as people have them: own names of columns, mm, degrees, J in mT.
+
+A table with positions becomes one of free blocks (`halbach_fe.study.free_blocks`), any other one of
+measured blocks (`halbach_fe.measurement.block_table`). The strength of a block may be its moment,
+its polarization J, or its magnetization M; with the volume each follows from the others. As for
+maps, nothing is guessed, and one message lists all that is missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be, printable
+from halbach_fe.core.files import file_bytes
+from halbach_fe.core.numbers import MU_0
+from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.formats import names, units
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.text import (
+    Line,
+    cells_of,
+    delimiter_of,
+    is_comment,
+    lines_of,
+    number_in_cell,
+    text_of_table,
+    uncommented,
+)
+from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
+from halbach_fe.study.free_blocks import SIZES, FreeBlocks
+from halbach_fe.study.free_blocks_file import validated_blocks
+from halbach_fe.study.types import COMPONENTS
+
+TEXTS = ("serial", "type", "ring", "slot", "shape", "material")
+VECTORS = {
+    "moment": "moment", "polarization": "field", "magnetization": "field"}
+"""Kind of the unit of each strength."""
+_WORDS = {
+    "serial": "serial serialno serialnumber id blockid magnetid magnet block label name no nr "
+              "number index",
+    "type": "type kind blocktype class", "ring": "ring layer ringno", "slot": "slot slotno place",
+    "shape": "shape geometry form", "material": "material grade", "volume": "volume vol v",
+    "temperature": "temperature temp t", "sigma": "sigma sd std stdev uncertainty error",
+    "moment": "moment magneticmoment m dipolemoment",
+    "polarization": "j br remanence polarization", "magnetization": "magnetization mag",
+    "sides": "sides corners", "angle": "angle openingangle sectorangle",
+    "radius": "radius", "inner_radius": "innerradius rin ri r1", "outer_radius":
+    "outerradius rout ro r2", "inner_width": "innerwidth", "outer_width": "outerwidth"}
+WORDS = {word: name for name, words in _WORDS.items() for word in words.split()} | {
+    spelling.format(axis): f"{name}_{axis}" for axis in COMPONENTS for name, spellings in {
+        "at": ("{}", "x{}", "pos{}", "{}pos", "position{}", "center{}", "centre{}", "{}center",
+               "{}centre", "{}c"),
+        "size": ("size{}", "{}size", "d{}", "l{}", "dim{}", "length{}"),
+        "rotation": ("rotation{}", "rot{}", "r{}", "rotvec{}"),
+        "moment": ("m{}", "moment{}"), "polarization": (
+            "j{}", "br{}", "remanence{}", "polarization{}", "b{}"),
+        "magnetization": ("magnetization{}", "mag{}")}.items() for spelling in spellings} | {
+    "length": "size_x", "width": "size_y", "height": "size_z", "thickness": "size_z"}
+"""Quantities by the names of columns, without spaces and marks, in lower case."""
+LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
+KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys(
+    LENGTHS, "length") | {
+    f"{name}_{axis}": kind for axis in COMPONENTS for name, kind in (
+        ("at", "length"), ("size", "length"), ("rotation", "angle"), *VECTORS.items())} | VECTORS
+"""Kinds of the units of quantities that have one."""
+QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
+CELSIUS_OF_ZERO_K = -273.15
+
+
+@dataclass(frozen=True)
+class DeclaredBlocks(DeclaredFormat):
+    """Statements of the user about a table of blocks.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
+        magnet) along which each component of the strength lies, as ``-y``.
+    along_block : bool
+        Whether components of the strength of free blocks lie along the block's own axes.
+    fixed : mapping of str to str
+        Value and unit of quantities for which the table has no column, such as ``12 cm^3``.
+    """
+
+    axes: tuple[str, str, str] = ("x", "y", "z")
+    along_block: bool = False
+    fixed: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Cells by quantity, unit of each, and numbers of the lines; SI values on demand."""
+
+    cells: dict[str, list[str]]
+    unit: dict[str, str]
+    lines: tuple[int, ...]
+    where: str
+    decimal_comma: bool
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.cells
+
+    def si(self, name: str) -> Floats:
+        """Return the numbers (n,) of a quantity in SI units, angles in rad; NaN where empty."""
+        found = np.array([_number(cell, name, line, self) for cell, line in zip(
+            self.cells[name], self.lines, strict=True)])
+        return units.in_si(found, self.unit[name]) if name in KIND else found
+
+    def vector(self, name: str) -> Floats:
+        """Return the vectors (n, 3) of a strength, that along x if it has a single column."""
+        if name in self.cells:
+            return np.outer(self.si(name), [1.0, 0.0, 0.0])
+        return np.column_stack([self.si(f"{name}_{axis}") for axis in COMPONENTS])
+
+
+def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBlocks:
+    """Read a table of blocks in own columns and units, text or a workbook.
+
+    Raises
+    ------
+    MeasurementError
+        If something is missing (one message lists all of it), a cell is not what it must be, or a
+        table with positions makes no free blocks.
+    """
+    where = f"table of blocks {path}"
+    raw = text_of_table(file_bytes(path, where, workbooks=True), where)
+    table = _table(lines_of(raw, declared, where), declared, where)
+    free = any(f"at_{axis}" in table for axis in COMPONENTS)
+    missing = _missing(table, free)
+    if missing:
+        raise MeasurementError(must_be(
+            "content", where, "complete", f"a table that does not say {'; '.join(missing)}",
+            "A column can be named by --columns, and a value that all blocks share be given by "
+            "--fixed; nothing is guessed."))
+    if free:
+        return _free_blocks(table, declared)
+    digest = hashlib.sha256(raw).hexdigest()
+    return _measured_blocks(table, declared, {
+        "imported_from": printable(path.name, 255), "imported_sha256": digest})
+
+
+def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Table:
+    """Return the cells of a table, whose header is the first line that names two quantities."""
+    delimiter = delimiter_of(max((line for _, line in lines), key=lambda one: sum(
+        one.count(mark) for mark in ",;\t")), declared)
+    rows = [(number, cells_of(uncommented(line) if is_comment(line) else line, delimiter),
+             is_comment(line)) for number, line in lines]
+    start = next((n for n, (_, cells, _) in enumerate(rows) if _names(cells)), None)
+    if start is None and declared.columns:
+        start = -1
+    if start is None:
+        raise MeasurementError(must_be("header", where, f"made of {', '.join(QUANTITIES)}",
+                                       "no line that names two of them",
+                                       "State the columns by --columns."))
+    header = [quantity_of(text) if text != "-" else ("", "")
+              for text in declared.columns or rows[start][1]]
+    if unknown := [text for text, (name, _) in zip(declared.columns, header, strict=False)
+                   if text != "-" and not name]:
+        raise MeasurementError(must_be("--columns", where, f"made of {', '.join(QUANTITIES)} and -",
+                                       f"'{unknown[0]}'"))
+    body = [row for row in rows[start + 1:] if not row[2]]
+    for number, row, _ in body:
+        if len(row) != len(header):
+            raise MeasurementError(must_be(f"line {number}", where, f"of {len(header)} cells, as "
+                                           "the header", str(len(row))))
+    if not body:
+        raise MeasurementError(must_be("content", where, "at least one block", "none"))
+    cells: dict[str, list[str]] = {}
+    unit: dict[str, str] = {}
+    for column, (name, said) in enumerate(header):
+        if name and name in cells:
+            raise MeasurementError(must_be("header", where, f"with one column {name}", "two",
+                                           "Choose one with --columns; - ignores a column."))
+        if name:
+            cells[name], unit[name] = [one[1][column] for one in body], said
+    for name, text in declared.fixed.items():
+        value, _, said = text.partition(" ")
+        value = value.replace(".", ",") if declared.decimal_comma else value
+        cells[name] = [value if name in KIND or name == "temperature" else text] * len(body)
+        unit[name] = said
+    kinds = {"length": declared.length_unit, "field": declared.field_unit,
+             "angle": declared.angle_unit}
+    for name in unit:
+        unit[name] = units.unit_symbol(unit[name]) or (
+            unit[name] if unit[name] else kinds.get(KIND.get(name, ""), ""))
+    return _Table(cells, unit, tuple(one[0] for one in body), where, declared.decimal_comma)
+
+
+def _names(cells: Sequence[str]) -> bool:
+    """Return whether cells are a header: two of them name quantities."""
+    return sum(bool(quantity_of(cell)[0]) for cell in cells) > 1
+
+
+def quantity_of(text: str) -> tuple[str, str]:
+    """Return the quantity and the unit of the name of a column; empty texts if it is unknown."""
+    text = text.strip().strip('"')[:names.MAX_NAME]
+    base, unit = names.split_unit(text)
+    if not unit and "_" in text:  # moment_A_m2
+        parts = text.split("_")
+        for n in range(1, len(parts)):
+            if units.unit_symbol(" ".join(parts[n:])):
+                base, unit = "_".join(parts[:n]), " ".join(parts[n:])
+                break
+    key = re.sub(r"[\s_.|-]", "", base.lower())
+    name = base if base in QUANTITIES else WORDS.get(key, "")
+    if name.startswith("moment") and units.kind_of(units.unit_symbol(unit)) == "field":
+        name = name.replace("moment", "magnetization")  # Mx in A/m
+    return name, unit.strip()
+
+
+def _number(cell: str, name: str, line: int, table: _Table) -> float:
+    """Return the number in a cell; NaN if it is empty."""
+    try:
+        return number_in_cell(cell, table.decimal_comma)
+    except ValueError:
+        raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
+                                       f"'{cell[:40]}'")) from None
+
+
+def _strength(table: _Table) -> str:
+    """Return which strength a table has; empty if it has none."""
+    return next((name for name in VECTORS if name in table or all(
+        f"{name}_{axis}" in table for axis in COMPONENTS)), "")
+
+
+def _missing(table: _Table, free: bool) -> list[str]:
+    """Return what the table does not say."""
+    missing = []
+    if "serial" not in table:
+        missing.append("the serial or name of each block (a column serial)")
+    strength = _strength(table)
+    if not strength and "material" not in table:
+        missing.append("its strength (columns moment_x, moment_y, moment_z, or polarization_x ..., "
+                       "or magnetization_x ...)")
+    if free:
+        missing += [f"{axis} of each block (a column at_{axis})" for axis in COMPONENTS
+                    if f"at_{axis}" not in table]
+        if "shape" not in table:
+            missing.append(f"the shape (--fixed shape=cuboid, or one of {', '.join(SIZES)})")
+    else:
+        if "sigma" not in table:
+            missing.append("the standard deviation of a moment (a column sigma, or --fixed "
+                           "'sigma=0.001 A m^2' or 'sigma=0.2 %')")
+        if "type" not in table and not {"ring", "slot"} <= set(table.cells):
+            missing.append("ring and slot, or the type of the blocks (--fixed type=1)")
+    sizes = all(f"size_{axis}" in table for axis in COMPONENTS)
+    if strength and (strength == "moment") == free and "volume" not in table and not sizes:
+        missing.append("the volume (a column, or --fixed 'volume=12 cm^3')")
+    for name, unit in table.unit.items():
+        kind = KIND.get(name)
+        if kind and units.kind_of(unit) != kind and not (name == "sigma" and unit in (
+                "%", *units.FIELDS)):
+            missing.append(f"the unit of {name} (one of {', '.join(units.KINDS[kind])}"
+                           + (f", not '{unit[:20]}')" if unit else ")"))
+    return missing
+
+
+def _volume(table: _Table) -> Floats:
+    """Return the volumes (n,) in m^3, of the sizes if there is no column; NaN if neither is."""
+    if "volume" in table:
+        return table.si("volume")
+    sizes = [table.si(f"size_{axis}") for axis in COMPONENTS if f"size_{axis}" in table]
+    return np.asarray(np.prod(sizes, axis=0)) if len(sizes) == len(COMPONENTS) else np.full(
+        len(table.lines), np.nan)
+
+
+def _turned(vectors: Floats, axes: Sequence[str]) -> Floats:
+    """Return vectors (n, 3) whose components lie along named axes, along x, y and z."""
+    found = np.empty_like(vectors)
+    for column, axis in enumerate(axes):
+        sign = -1.0 if axis.startswith("-") else 1.0
+        found[:, COMPONENTS.index(axis[-1])] = sign * vectors[:, column]
+    return found
+
+
+def _measured_blocks(
+    table: _Table, declared: DeclaredBlocks, attributes: Mapping[str, str]
+) -> BlockTable:
+    """Return the table of measured blocks."""
+    strength = _strength(table)
+    vectors = _turned(table.vector(strength), declared.axes)
+    volume = _volume(table)
+    moment = vectors if strength == "moment" else vectors * (volume / MU_0)[:, None]
+    if table.unit["sigma"] == "%":
+        sigma = np.array([_number(cell, "sigma", line, table) for cell, line in zip(
+            table.cells["sigma"], table.lines, strict=True)])
+        sigma = sigma / 100 * np.linalg.norm(moment, axis=1)
+    else:
+        sigma = table.si("sigma")
+        if table.unit["sigma"] in units.FIELDS:
+            sigma = sigma * volume / MU_0
+    count = len(table.lines)
+    place = {name: np.array([0 if not cell else _whole(cell, name, line, table)
+                             for cell, line in zip(table.cells[name], table.lines, strict=True)])
+             if name in table else np.zeros(count, int) for name in ("ring", "slot")}
+    temperature = table.si("temperature") if "temperature" in table else np.full(count, np.nan)
+    if table.unit.get("temperature") in ("K", "kelvin"):
+        temperature = temperature + CELSIUS_OF_ZERO_K
+    return BlockTable(tuple(table.cells["serial"]), tuple(table.cells.get("type", [""] * count)),
+                      place["ring"], place["slot"], moment, sigma, volume, temperature,
+                      dict(attributes), table.where)
+
+
+def _whole(cell: str, name: str, line: int, table: _Table) -> int:
+    """Return the whole number from 1 in a cell; workbooks write 3 as 3.0."""
+    value = _number(cell, name, line, table)
+    if not (value >= 1 and value == int(value)):
+        raise MeasurementError(must_be(f"{name} in line {line}", table.where,
+                                       "a whole number from 1", f"'{cell[:40]}'"))
+    return int(value)
+
+
+def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
+    """Return the table of free blocks."""
+    columns: dict[str, list[object]] = {"name": [
+        re.sub(r"[^A-Za-z0-9_-]", "-", cell) for cell in table.cells["serial"]]}
+    for name in ("type", "shape", "material"):
+        if name in table:
+            columns[name] = [cell or None for cell in table.cells[name]]
+    for name in ("ring", "slot", "sides"):
+        if name in table:
+            columns[name] = [_whole(cell, name, line, table) if cell else None for cell, line in
+                             zip(table.cells[name], table.lines, strict=True)]
+    for name in table.cells:
+        own = name.removeprefix("at_") if name.startswith("at_") else name
+        own, values = (f"{own}_deg", np.degrees) if KIND.get(name) == "angle" else (
+            f"{own}_m", np.asarray)
+        if own in FREE_COLUMNS:
+            columns[own] = [None if np.isnan(value) else value
+                            for value in np.round(values(table.si(name)), 12).tolist()]
+    strength = _strength(table)
+    if strength:
+        vectors = table.vector(strength)
+        if strength == "moment":
+            vectors = vectors * (MU_0 / _volume(table))[:, None]
+        if strength in table:
+            columns["remanence_T"] = vectors[:, 0].tolist()
+        else:
+            vectors = _turned(vectors, declared.axes)
+            if declared.along_block:
+                turns = np.column_stack([
+                    table.si(f"rotation_{axis}") if f"rotation_{axis}" in table
+                    else np.zeros(len(vectors)) for axis in COMPONENTS])
+                vectors = Rotation.from_rotvec(np.nan_to_num(turns)).apply(vectors)
+            for axis, values in zip(COMPONENTS, vectors.T, strict=True):
+                columns[f"remanence_{axis}_T"] = values.tolist()
+    try:
+        return validated_blocks(columns, table.where)
+    except StudyError as error:
+        raise MeasurementError(str(error)) from None

@@ -1,0 +1,281 @@
+"""Small files in the public formats of programs and instruments, each with what it must become.
+
+All hold the field of `FIELD` at `POINTS`, built here; none is a copy of a file.
+"""
+
+from __future__ import annotations
+
+import codecs
+from dataclasses import dataclass, field
+
+import numpy as np
+
+AXES = [-0.01, 0.0, 0.01], [-0.01, 0.0, 0.01], [-0.02, -0.01, 0.0, 0.01, 0.02]
+POINTS = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1).reshape(-1, 3)
+"""z changes fastest; x, y and z of a point are in m."""
+FIELD = np.column_stack([0.1 + 2 * POINTS[:, 1], 2 * POINTS[:, 0], 0.05 + 0 * POINTS[:, 2]])
+"""B in T, another along every axis."""
+LENGTH = np.linalg.norm(FIELD, axis=1)
+LINE = np.column_stack([0 * LENGTH, 0 * LENGTH, 1e-3 * np.arange(len(LENGTH))])
+"""Points in m of a line along z."""
+BY_X = np.lexsort(POINTS.T)
+"""Order of the points in which x changes fastest."""
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """A file, the options with which it is read, and what is said of it without them.
+
+    ``stated`` are the options of `DeclaredFormat`; without any the file reads as it is. ``asked``
+    are texts that the refusal without options must contain. ``points`` (n, 3) in m and ``field``
+    (n, 3) in T are right, in any order.
+    """
+
+    name: str
+    text: str | bytes
+    stated: dict = field(default_factory=dict)
+    asked: tuple[str, ...] = ()
+    points: np.ndarray = field(default_factory=lambda: POINTS)
+    field: np.ndarray = field(default_factory=lambda: FIELD)
+
+
+def table(separator="\t", columns=None, order=None, number="{:.12g}", end=""):
+    """Return rows of numbers; ``columns`` are arrays (45,)."""
+    columns = mm_T() if columns is None else columns
+    rows = np.column_stack(columns)
+    rows = rows if order is None else rows[order]
+    return "".join(separator.join(number.format(value) for value in row) + end + "\n"
+                   for row in rows)
+
+
+def mm_T(length=1e3, tesla=1.0):
+    """Return the columns x, y, z, Bx, By, Bz in other units."""
+    return [*(length * POINTS.T), *(tesla * FIELD.T)]
+
+
+def comma(text):
+    """Return a table with decimal commas."""
+    return text.replace(".", ",")
+
+
+def thousands(columns):
+    """Return a CSV table with quoted numbers whose thousands are separated."""
+    return "".join(",".join(f'"{value:,.3f}"' for value in row) + "\n"
+                   for row in np.column_stack(columns))
+
+
+def clock(n):
+    """Return the time of day of reading ``n`` at intervals of 2 s."""
+    return f"10:{n * 2 // 60:02d}:{n * 2 % 60:02d}"
+
+
+def with_text(rows, before="{n},", after=""):
+    """Return rows with cells before and after them, in which n is the number and t the time."""
+    return "".join(before.format(n=n, t=clock(n)) + row + after.format(n=n, t=clock(n)) + "\n"
+                   for n, row in enumerate(rows.splitlines()))
+
+
+def srw(comment="#"):
+    """Return a file of SRW; the third number sign is part of the format."""
+    head = ["Bx [T], By [T], Bz [T] on 3D mesh: inmost loop vs X, outmost loop vs Z"]
+    for axis, values in zip("XYZ", AXES, strict=True):
+        head += [f"{values[0]} #initial {axis} position [m]", f"0.01 #step of {axis} [m]",
+                 f"{len(values)} #number of points vs {axis}"]
+    return "".join(f"{comment}{line}\n" for line in head) + table("\t", FIELD.T, BY_X)
+
+
+def fluka(free=True):
+    """Return cards of FLUKA with the field in T on a grid in cm."""
+    def card(name, what, last=""):
+        if free:
+            return ", ".join([f"{name:10}", *(f"{v:.6E}" if v is not None else "" for v in what),
+                              last]) + "\n"
+        return f"{name:10}" + "".join(f"{v:10.3E}" if v is not None else " " * 10
+                                      for v in what) + last + "\n"
+
+    none = (None,) * 3
+    text = ("FREE\n" if free else "* a comment\n") + card("MGNCREAT", (300.0, *none[:2], *none),
+                                                          "MAGNET")
+    text += card("MGNCREAT", (*none, 3, 3, 5), "&")
+    text += card("MGNCREAT", (-1, -1, -2, 1, 1, 2), "&&")
+    rows = FIELD[BY_X]
+    for n in range(0, len(rows), 2):
+        pair = [*rows[n], *(rows[n + 1] if n + 1 < len(rows) else none)]
+        text += card("MGNDATA", pair, "&&")
+    return text
+
+
+MM_T_OPTIONS = {"length_unit": "mm", "field_unit": "T"}
+SIX = ("x", "y", "z", "Bx", "By", "Bz")
+BARE = ("--columns x,y,z,Bx,By,Bz", "--length-unit", "--field-unit")
+UNITS = ("--length-unit", "--field-unit")
+M_T = mm_T(1.0)
+DASHES = "-" * 78 + "\n"
+CARTESIAN = table(" ", M_T)
+LVM = ("LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nSeparator\tTab\n"
+       "Decimal_Separator\t.\nMulti_Headings\tNo\nX_Columns\tOne\nTime_Pref\tRelative\n"
+       "***End_of_Header***\t\n\nChannels\t6\nSamples\t45\t45\t45\t45\t45\t45\n"
+       "***End_of_Header***\t\t\t\t\t\t\t\n")
+LVM_COLUMNS = ("-", "x[mm]", "y[mm]", "z[mm]", "Bx[T]", "By[T]", "Bz[T]", "-")
+METER = ("Header Information\nInstrument serial number:,0001\nProbe temperature:,24.1\n\n"
+         "time elapsed,date,time,magnitude,x,y,z,set point,input state\n")
+METER_ROWS = "".join(f"{n},06/01/20,{clock(n)}.00,{LENGTH[n]:.9g},{b[0]:.9g},{b[1]:.9g},{b[2]:.9g},"
+                     "0.0,0\n" for n, b in enumerate(FIELD))
+TRIPLE = ("x[mm]", "y[mm]", "z[mm]", "Bx[T]", "By[T]", "Bz[T]")
+
+FILES = [
+    # programs of field computation
+    Foreign("CST, V.s/m^2", "  x [mm]  y [mm]  z [mm]  x [V.s/m^2]  y [V.s/m^2]  z [V.s/m^2]\n"
+            + DASHES + table("  ")),
+    Foreign("CST, parts of complex numbers", "x [mm] y [mm] z [mm] BxRe [Vs/m^2] BxIm [Vs/m^2] "
+            "ByRe [Vs/m^2] ByIm [Vs/m^2] BzRe [Vs/m^2] BzIm [Vs/m^2]\n" + DASHES + table(
+                "  ", [*mm_T()[:3], FIELD[:, 0], 0 * LENGTH, FIELD[:, 1], 0 * LENGTH, FIELD[:, 2],
+                       0 * LENGTH])),
+    Foreign("CST, H in A/m", "x [mm]  y [mm]  z [mm]  Hx [A/m]  Hy [A/m]  Hz [A/m]\n" + table(
+        "  ", mm_T(1e3, 1 / (4e-7 * np.pi)), number="{:.15g}")),
+    Foreign("Ansys Maxwell .fld", "Grid Output Min: [-10mm -10mm -20mm] Max: [10mm 10mm 20mm] Grid "
+            "Size: [10mm 10mm 10mm]\nX, Y, Z, Vector data \"B_Vector\"\n" + CARTESIAN,
+            {"length_unit": "m", "field_unit": "T"}, UNITS),
+    Foreign("Ansys Maxwell, CSV of a report", '"X [mm]","Y [mm]","Z [mm]","Bx [tesla]",'
+            '"By [tesla]","Bz [tesla]"\n' + table(",")),
+    Foreign("COMSOL, spreadsheet", "% Model: magnet.mph\n% Version: COMSOL 6.1\n% Dimension: 3\n"
+            "% Nodes: 45\n% Expressions: 3\n% Length unit: mm\n"
+            "% x y z mf.Bx (T) mf.By (T) mf.Bz (mT)\n" + table(
+                " ", [*mm_T()[:5], 1e3 * FIELD[:, 2]])),
+    Foreign("COMSOL, mfnc in mT with commas", "% Model,magnet.mph\n% Version,COMSOL 6.0\n"
+            "% Dimension,3\n% Nodes,45\n% Expressions,3\n% Length unit,m\n"
+            "% x,y,z,mfnc.Bx (mT),mfnc.By (mT),mfnc.Bz (mT)\n" + table(",", mm_T(1.0, 1e3))),
+    Foreign("Opera, TABLE in cm and gauss", " 3 3 5 1\n 1 X [CM]\n 2 Y [CM]\n 3 Z [CM]\n"
+            " 4 BX [GAUSS]\n 5 BY [GAUSS]\n 6 BZ [GAUSS]\n 0\n" + table(" ", mm_T(100, 1e4))),
+    Foreign("TOSCA, without units", " 3 3 5 1\n 1 X [LENGU]\n 2 Y [LENGU]\n 3 Z [LENGU]\n"
+            " 4 BX [FLUXU]\n 5 BY [FLUXU]\n 6 BZ [FLUXU]\n 0\n" + table(" ", mm_T(100, 1e4)),
+            {"length_unit": "cm", "field_unit": "G"}, UNITS),
+    Foreign("Radia, ObjGeo fields of a notebook", "x[mm] y[mm] z[mm] bx by bz\n" + table(" "),
+            {"field_unit": "T"}, ("--field-unit",)),
+    Foreign("Radia, brackets of a printed list", table(", ").replace("\n", ",\n"),
+            {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("SRW", srw()),
+    Foreign("SRW, spaces after the comments", srw("# ")),
+    Foreign("FLUKA, free", fluka()),
+    Foreign("FLUKA, fixed", fluka(free=False)),
+    Foreign("G4beamline", "param normB=1.0\ngrid X0=-10 Y0=-10 Z0=-20 nX=3 nY=3 nZ=5 dX=10 dY=10 "
+            "dZ=10\ndata\n" + table(" ")),
+    Foreign("BDSIM", "xmin> -1\nxmax> 1\nnx> 3\nymin> -1\nymax> 1\nny> 3\nzmin> -2\nzmax> 2\n"
+            "nz> 5\n! X Y Z Fx Fy Fz\n" + table(" ", mm_T(100), BY_X)),
+    Foreign("counts above the rows", "#-----\n\t3\t3\t5\n# x\ty\tz\tBx\tBy\tBz\tpermeability\n"
+            + table("\t", [*mm_T(), 0 * LENGTH + 1.26e-6]), MM_T_OPTIONS, UNITS),
+    Foreign("number of points above the rows", "45\n" + table(" "),
+            {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("ParaView, CSV", "B:0,B:1,B:2,Points:0,Points:1,Points:2\n" + table(
+        ",", [*FIELD.T, *POINTS.T]), {"length_unit": "m", "field_unit": "T"}, UNITS),
+    Foreign("OpenFOAM-like CSV", "x,y,z,B_x,B_y,B_z\n" + table(",", M_T),
+            {"length_unit": "m", "field_unit": "T"}, UNITS),
+    Foreign("OpenFOAM, xy of a sample line", "# z  B_x  B_y  B_z\n" + table(
+        "\t", [LINE[:, 2], *FIELD.T]), {
+            "length_unit": "m", "field_unit": "T", "at": {"x": 0.0, "y": 0.0}},
+        ("--at x=0,y=0", *UNITS), LINE),
+    Foreign("Elmer, SaveLine with indices", table(" ", [np.arange(1, 46), *M_T]),
+            {"length_unit": "m", "field_unit": "T", "columns": ("-", *SIX)},
+            ("its 7 columns",)),
+    Foreign("FEMM, a line in mm of the plane", "x (mm),y (mm),Bx (T),By (T)\n" + table(
+        ",", [1e3 * LINE[:, 2], LINE[:, 0], FIELD[:, 0], FIELD[:, 1]]), {"at": {"z": 0.0}},
+        ("--at z=0",), LINE[:, [2, 1, 0]], FIELD * [1, 1, np.nan]),
+    Foreign("Mathematica, numbers with *^", table(
+        " ", number="{:.9e}").replace("e", "*^"),
+            {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("MATLAB, writematrix", table(","), {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("MATLAB, writetable", "X_mm,Y_mm,Z_mm,Bx_T,By_T,Bz_T\n" + table(",")),
+    Foreign("MATLAB, save -ascii", table("   ", number="{:.7e}"),
+            {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("Origin, long names and units below", "X\tY\tZ\tBx\tBy\tBz\nmm\tmm\tmm\tmT\tmT\tmT\n"
+            + table("\t", mm_T(1e3, 1e3))),
+    Foreign("numpy, savetxt", "# x(mm) y(mm) z(mm) Bx(G) By(G) Bz(G)\n" + table(
+        " ", mm_T(1e3, 1e4), number="{:.18e}")),
+    Foreign("pandas, CSV with an index", ",x [mm],y [mm],z [mm],Bx [T],By [T],Bz [T]\n" + with_text(
+        table(","))),
+    Foreign("pandas, text of a frame", "   x   y   z   Bx  By  Bz\n" + with_text(
+        table("  "), "{n}  "), {**MM_T_OPTIONS, "columns": ("-", *SIX)}, ("of 7 names",)),
+    Foreign("Fortran, numbers with D", table(" ", number="{:.8E}").replace("E", "D"),
+            {**MM_T_OPTIONS, "columns": SIX}, ("numbers",)),
+    # instruments
+    Foreign("Lake Shore, log without positions", METER + METER_ROWS,
+            {"columns": ("-", "-", "-", "-", "Bx[T]", "By[T]", "Bz[T]", "-", "-"),
+             "positions": True}, ("--positions", "Bx[T],By[T],Bz[T]")),
+    Foreign("F.W. Bell, one component in kG", "Position (inch),Field (kG)\n" + table(
+        ",", [LINE[:, 2] / 0.0254, 10 * FIELD[:, 0]]),
+        {"columns": ("z[inch]", "Bx[kG]"), "at": {"x": 0.0, "y": 0.0}}, ("--columns",), LINE,
+        FIELD * [1, np.nan, np.nan]),
+    Foreign("Metrolab, probe in mG with a date", "Date,Time,X (mm),Y (mm),Z (mm),B (mG),Bx (mG),"
+            "By (mG),Bz (mG),T (C)\n" + with_text(table(",", [
+                *mm_T()[:3], 1e7 * LENGTH, *(1e7 * FIELD.T)]), "2024-05-31,{t},", ",24.5")),
+    Foreign("Senis, mapper with a preamble", "Mapper;3MH6\nScan;plane\n\nX [mm];Y [mm];Z [mm];"
+            "Bx [mT];By [mT];Bz [mT];T [°C]\n" + table(";", [*mm_T(1e3, 1e3), 24 + 0 * LENGTH])),
+    Foreign("LabVIEW, lvm", LVM + "X_Value\tx\ty\tz\tHall 1\tHall 2\tHall 3\tComment\n" + with_text(
+        table("\t"), "{n}.000000\t", "\t"), {"columns": LVM_COLUMNS}, ("--columns",)),
+    Foreign("LabVIEW, lvm with decimal commas", LVM + "X_Value\tx\ty\tz\tHall 1\tHall 2\tHall 3\t"
+            "Comment\n" + comma(with_text(table("\t"), "{n}.000000\t", "\t")),
+            {"columns": LVM_COLUMNS, "decimal_comma": True}, ("--decimal-comma",)),
+    Foreign("ROS bag, CSV", "%time,field.header.seq,field.position.x,field.position.y,"
+            "field.position.z,field.magnetic_field.x,field.magnetic_field.y,field.magnetic_field.z"
+            "\n" + with_text(table(",", M_T), "15{n:02d}000000000000000,{n},"),
+            {"columns": ("-", "-", *(f"{n}[{u}]" for n, u in zip(
+                SIX, ("m",) * 3 + ("T",) * 3, strict=True)))}, ("--columns",)),
+    Foreign("ROS, echo of a topic", "time,.pose.position.x,.pose.position.y,.pose.position.z,"
+            "magnetic_field.x,magnetic_field.y,magnetic_field.z\n" + with_text(table(",", M_T)),
+            {"columns": ("t[s]", *(f"{n}[{u}]" for n, u in zip(
+                SIX, ("m",) * 3 + ("T",) * 3, strict=True)))}, ("--columns",)),
+    Foreign("phone app, uT and times", "Time (s),X (m),Y (m),Z (m),Magnetic Field x (uT),"
+            "Magnetic Field y (uT),Magnetic Field z (uT)\n" + with_text(
+                table(",", mm_T(1.0, 1e6)), "{n}.5,")),
+    Foreign("stage of an open mapper", "# COSI log\n# date: 2018-01-01\n"
+            "# X[mm],Y[mm],Z[mm],B0_x[mT],B0_y[mT],B0_z[mT],B0_abs[mT]\n" + table(
+                ",", [*mm_T(1e3, 1e3), 1e3 * LENGTH])),
+    Foreign("names with commas above tabs", "X [mm], Y [mm], Z [mm], Bx [mT], By [mT], Bz [mT]\n"
+            + table("\t", mm_T(1e3, 1e3))),
+    Foreign("counts of an ADC, 1e-7 T", "x[mm],y[mm],z[mm],Bx,By,Bz\n" + table(",", mm_T(1e3, 1e7)),
+            {"field_unit": "1e-7 T"}, ("--field-unit",)),
+    Foreign("a factor in every column", "x[mm],y[mm],z[mm],Bx,By,Bz\n" + table(
+        ",", mm_T(1e3, 1e7)), {"columns": (*SIX[:3], "Bx[1e-7 T]", "By[1e-7 T]", "Bz[0.1 uT]")},
+        ("--field-unit",)),
+    Foreign("nT of a magnetometer", "x (cm);y (cm);z (cm);Bx (nT);By (nT);Bz (nT)\n" + table(
+        ";", mm_T(100, 1e9))),
+    Foreign("oersted", "x [cm] y [cm] z [cm] Hx [Oe] Hy [Oe] Hz [Oe]\n" + table(
+        " ", mm_T(100, 1e4))),
+    Foreign("Wb/m^2", "x (m) y (m) z (m) Bx (Wb/m^2) By (Wb/m^2) Bz (Wb/m2)\n" + table(" ", M_T)),
+    # spreadsheets
+    Foreign("semicolons and decimal commas", "x [mm];y [mm];z [mm];Bx [mT];By [mT];Bz [mT]\n"
+            + comma(table(";", mm_T(1e3, 1e3), number="{:.3f}")), {"decimal_comma": True},
+            ("--decimal-comma",)),
+    Foreign("byte order mark of UTF-8", codecs.BOM_UTF8 + (
+        "x [mm],y [mm],z [mm],Bx [T],By [T],Bz [T]\n" + table(",")).encode()),
+    Foreign("UTF-16 of a spreadsheet", (
+        "x [mm]\ty [mm]\tz [mm]\tBx [T]\tBy [T]\tBz [T]\n" + table("\t")).encode("utf-16")),
+    Foreign("latin-1, µT", ("x [mm];y [mm];z [mm];Bx [µT];By [µT];Bz [µT]\n" + table(
+        ";", mm_T(1e3, 1e6))).encode("latin-1"), {"encoding": "latin-1"}, ("--encoding latin-1",)),
+    Foreign("line ends of DOS", ("x [mm],y [mm],z [mm],Bx [T],By [T],Bz [T]\n" + table(
+        ",")).replace("\n", "\r\n")),
+    Foreign("quoted cells and thousands", '"X [um]","Y [um]","Z [um]","Bx [uT]","By [uT]","Bz [uT]"'
+            "\n" + thousands(mm_T(1e6, 1e6))),
+    Foreign("commas at the end of all rows", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(
+        ",", end=",")),
+    Foreign("a doubled tab", "x[mm]\ty[mm]\tz[mm]\tBx[T]\tBy[T]\tBz[T]\n" + table("\t").replace(
+        "\t", "\t\t", 1)),
+    Foreign("header again above every scan", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n".join(
+        ["", *("".join(table(",").splitlines(True)[n:n + 5]) for n in range(0, 45, 5))])),
+    Foreign("blank lines between scans", "# x[mm] y[mm] z[mm] Bx[T] By[T] Bz[T]\n" + "\n\n".join(
+        "".join(table(" ").splitlines(True)[n:n + 5]) for n in range(0, 45, 5))),
+    Foreign("comments of C", "// map of the body\n// x[mm] y[mm] z[mm] Bx[T] By[T] Bz[T]\n"
+            + table(" ")),
+    Foreign("a preamble of numbers", "2024 5 31 10 24 30\n300 1 2\nx[mm] y[mm] z[mm] Bx[T] By[T] "
+            "Bz[T]\n" + table(" "), {"skip_lines": 2}, ("--skip-lines",)),
+    Foreign("tabs and spaces mixed", "x[mm] y[mm] z[mm] Bx[T] By[T] Bz[T]\n" + table(
+        " \t ").replace(" \t ", "  ", 7)),
+    Foreign("semicolons in a remark", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T],remark\n" + with_text(
+        table(","), "", ",arm 2; up"), {"delimiter": "comma"}, ("--delimiter",)),
+    Foreign("units that nobody knows", "x[ft],y[ft],z[ft],Bx[T],By[T],Bz[T]\n" + table(",", mm_T(
+        1 / 0.3048)), {"columns": (*(f"{n}[12 inch]" for n in "xyz"), *SIX[3:])},
+        ("'ft' is none of", "--columns")),
+    Foreign("the middle twice", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
+            + "0,0,0,0.1,1e-6,0.05\n", points=np.vstack([POINTS, [[0, 0, 0]]]),
+            field=np.vstack([FIELD, [[0.1, 1e-6, 0.05]]])),
+]

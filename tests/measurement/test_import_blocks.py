@@ -1,0 +1,134 @@
+"""Tables of blocks as people have them become tables of measured or of free blocks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import MeasurementError
+from halbach_fe.measurement.block_table import read_blocks
+from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
+from halbach_fe.study.free_blocks_file import read_free_blocks
+
+MU_0 = 4e-7 * np.pi
+MOMENT = np.array([[12.0, 0.1, -0.2], [-11.9, 0.3, 0.05]])
+"""In A m^2, of blocks of 12 cm^3, in the axes of the block."""
+VOLUME = 1.2e-5
+J = MU_0 * MOMENT / VOLUME
+
+
+def imported(tmp_path, text, **declared):
+    path = tmp_path / "own.txt"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return import_blocks(path, DeclaredBlocks(**declared))
+
+
+def rows(values, before=("A1;1;1;", "A2;1;2;"), after=""):
+    return "".join(start + ";".join(f"{value:.9g}" for value in row) + after + "\n"
+                   for start, row in zip(before, values, strict=True))
+
+
+@pytest.mark.parametrize(("text", "declared"), [
+    ("Serial No;Ring;Slot;mx [A m^2];my [A m^2];mz [A m^2];sigma [mA m^2]\n"
+     + rows(MOMENT, after=";12"), {}),
+    ("id;layer;place;Jx [mT];Jy [mT];Jz [mT];Volume [cm^3];sd [%]\n"
+     + rows(1e3 * J, after=";12;0.1"), {}),
+    ("id;ring;slot;Mx [kA/m];My [kA/m];Mz [kA/m]\n" + rows(MOMENT / VOLUME / 1e3),
+     {"fixed": {"volume": "12 cm^3", "sigma": "0.1 %"}}),
+    ("# coil 7\nMagnet;Ring;Slot;Moment z (emu);Moment x (emu);Moment y (emu)\n"
+     + rows(1e3 * MOMENT), {"axes": ("x", "y", "z"), "fixed": {"sigma": "0.012 A m^2"},
+                            "columns": ("serial", "ring", "slot", "moment_x[emu]", "moment_y[emu]",
+                                        "moment_z[emu]")}),
+    ("id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\n"
+     + rows(MOMENT[:, [2, 1, 0]] * [1, -1, 1]),
+     {"axes": ("z", "-y", "x"), "fixed": {"sigma": "0.1 %"}}),
+    ("id;ring;slot;length [mm];width [mm];height [mm];Br_x [T];Br_y [T];Br_z [T]\n"
+     + "".join(f"A{n};1;{n};20;20;30;" + ";".join(f"{v:.9g}" for v in j) + "\n"
+               for n, j in enumerate(J, 1)), {"fixed": {"sigma": "0.1 %"}}),
+    (("id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\n" + rows(MOMENT)).replace(".", ","),
+     {"decimal_comma": True, "fixed": {"sigma": "0.012 A m^2"}})])
+def test_moments(tmp_path, text, declared):
+    """Negative control: the moments in other axes."""
+    found = imported(tmp_path, text, **declared)
+    np.testing.assert_allclose(found.moment, MOMENT, rtol=1e-7)
+    np.testing.assert_allclose(found.sigma, 0.012, rtol=0.01)  # 0.1 % of 12.0 and of 11.9
+    assert found.serial == ("A1", "A2")
+    assert found.places == [(1, 1), (1, 2)]
+    assert not np.allclose(found.moment, MOMENT[:, ::-1], rtol=1e-7)
+
+
+def test_more_blocks_than_slots(tmp_path):
+    """Spare blocks have a type and no place."""
+    found = imported(tmp_path, "id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2];T [K]\n"
+                     + rows([*MOMENT, MOMENT[0]], ("A1;1;1;", "A2;1;2;", "S3;;;"), ";293.15"),
+                     fixed={"type": "1", "sigma": "0.1 %"})
+    assert found.places == [(1, 1), (1, 2), (0, 0)]
+    np.testing.assert_allclose(found.temperature, 20.0)
+
+
+def test_all_that_is_missing_in_one_message(tmp_path):
+    with pytest.raises(MeasurementError) as caught:
+        imported(tmp_path, "ring;slot;Jx;Jy;Jz\n1;1;1;0;0\n")
+    for asked in ("serial", "sigma", "the volume", "the unit of polarization_x"):
+        assert asked in str(caught.value)
+    with pytest.raises(MeasurementError, match="names two of them"):
+        imported(tmp_path, "a;b;c\n1;2;3\n")
+    with pytest.raises(MeasurementError, match="a number"):
+        imported(tmp_path, "id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;1;x;0;0\n",
+                 fixed={"sigma": "0.1 %"})
+
+
+FREE = ("Name;Shape;xc [mm];yc [mm];zc [mm];Rot x (deg);Rot y (deg);Rot z (deg);dx [mm];dy [mm];"
+        "dz [mm];")
+
+
+@pytest.mark.parametrize(("header", "values", "declared"), [
+    ("Jx [mT];Jy [mT];Jz [mT]", (0.0, 1300.0, 0.0), {}),
+    ("Mx [A/m];My [A/m];Mz [A/m]", (0.0, 1.3 / MU_0, 0.0), {}),
+    ("mx [A m^2];my [A m^2];mz [A m^2]", (0.0, 1.3 * 6e-6 / MU_0, 0.0), {}),
+    ("Jx [T];Jy [T];Jz [T]", (1.3, 0.0, 0.0), {"along_block": True}),
+    ("Jx [T];Jy [T];Jz [T]", (1.3, 0.0, 0.0), {"axes": ("y", "-x", "z")}),
+    ("Br [mT]", (1300.0,), {})])
+def test_free_blocks(tmp_path, header, values, declared):
+    """A cuboid that is turned by 90° about z, magnetized along y of the magnet."""
+    table = imported(tmp_path, FREE + header + "\nb 1;cuboid;10;-20;5;0;0;90;10;20;30;"
+                     + ";".join(f"{value:.12g}" for value in values) + "\n", **declared)
+    assert (table.name, table.x_m, table.y_m, table.z_m) == (
+        ("b-1",), (0.01,), (-0.02,), (0.005,))
+    assert (table.size_x_m, table.size_y_m, table.size_z_m) == ((0.01,), (0.02,), (0.03,))
+    assert table.rotation_z_deg == (90.0,)
+    if len(values) == 1:  # along its own x axis
+        assert table.remanence_T == (1.3,)
+    else:
+        np.testing.assert_allclose([table.remanence_x_T, table.remanence_y_T, table.remanence_z_T],
+                                   [[0], [1.3], [0]], atol=1e-9)
+
+
+def test_workbooks_and_the_command(tmp_path, capsys):
+    """The same sheet for blocks and for a map; a damaged workbook is refused."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["id", "ring", "slot", "mx [A m^2]", "my [A m^2]", "mz [A m^2]"])
+    for number, moment in enumerate(MOMENT.tolist(), 1):
+        book.active.append([f"A{number}", 1, number, *moment])
+    book.save(tmp_path / "own.xlsx")
+    out = tmp_path / "blocks.csv"
+    assert main(["import-blocks", str(tmp_path / "own.xlsx"), "-o", str(out),
+                 "--fixed", "sigma=0.1 %"]) == 0
+    np.testing.assert_allclose(read_blocks(out).moment, MOMENT)
+    free = tmp_path / "own.csv"
+    free.write_text(FREE + "Br [mT]\nb;cuboid;10;0;0;0;0;0;10;20;30;1300\n")
+    assert main(["import-blocks", str(free), "-o", str(tmp_path / "free.csv")]) == 0
+    assert read_free_blocks(tmp_path / "free.csv")["remanence_T"] == [1.3]
+    book = openpyxl.Workbook()
+    for row in (["x [mm]", "y [mm]", "z [mm]", "Bx [mT]"], [1, 2, 3, 100.5], [1, 2, 4, 101]):
+        book.active.append(row)
+    book.save(tmp_path / "map.xlsx")
+    assert main(["import-map", str(tmp_path / "map.xlsx"), "-o", str(tmp_path / "map.csv")]) == 0
+    assert "0.001,0.002,0.003,0.1005" in (tmp_path / "map.csv").read_text()
+    raw = (tmp_path / "map.xlsx").read_bytes()
+    (tmp_path / "map.xlsx").write_bytes(raw[:-200])
+    capsys.readouterr()
+    assert main(["import-map", str(tmp_path / "map.xlsx"), "-o", str(tmp_path / "no.csv")]) == 4
+    assert "Save the sheet as CSV" in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,143 @@
+"""B and H on lines, inside blocks too, their integrals and kicks, against magpylib."""
+
+from __future__ import annotations
+
+import csv
+
+import magpylib
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+
+from halbach_fe.cli import main
+from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.response.field_on_lines import Lines, field_on_lines
+from halbach_fe.solver.session import NOT_KEPT
+from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.reader import parse_study
+from tests.conftest import DIPOLE, changed
+
+MU_0 = 4e-7 * np.pi
+SIZE, PLACES, STRENGTH = 0.02, ((0.0, 0.03, 0.0), (0.0, -0.03, 0.0)), ((0, 1.3, 0), (0.2, 1.2, 0.1))
+RELATIVE_SD = 0.01
+
+
+def magnet_of(permeability=1.0):
+    columns = {"name": ["a", "b"], "shape": ["cuboid"] * 2, **{
+        f"size_{axis}_m": [SIZE] * 2 for axis in "xyz"}, **{
+        f"{axis}_m": [place[n] for place in PLACES] for n, axis in enumerate("xyz")}, **{
+        f"remanence_{axis}_T": [one[n] for one in STRENGTH] for n, axis in enumerate("xyz")}}
+    return build_magnet(parse_study(changed(DIPOLE, dimension=3, mesh__block_size_m=0.01, array={
+        "free_blocks": columns, "recoil_permeability": permeability})))
+
+
+def blocks():
+    return magpylib.Collection([magpylib.magnet.Cuboid(
+        polarization=one, dimension=(SIZE,) * 3, position=place)
+        for one, place in zip(STRENGTH, PLACES, strict=True)])
+
+
+def solved(lines, inside=False, permeability=1.0):
+    """All magnetizations share one factor with a standard deviation of 1 %."""
+    magnet = magnet_of(permeability)
+    nominal = magnet.nominal_magnetization
+    known = Gaussian(nominal, RELATIVE_SD * nominal[:, None])
+    return field_on_lines(magnet, lines, known, NOT_KEPT, inside)
+
+
+def straight(count=401, across=(0.0,), other=(0.0,)):
+    return Lines(np.array([0.001, 0, -0.2]), np.array([0.001, 0, 0.2]),
+                 (np.array(across), np.array(other)), count)
+
+
+def test_b_and_h_inside_blocks():
+    """Negative control: mu_0 H, without the polarization, is another field."""
+    lines = Lines(np.array([0.003, -0.06, 0.002]), np.array([0.004, 0.06, 0.001]),
+                  (np.zeros(1), np.zeros(1)), 50)
+    found = solved(lines, inside=True)
+    points = lines.points[0]
+    expected, strength = blocks().getB(points), blocks().getH(points)
+    assert set(found.in_block[0]) == {"", "a", "b"}
+    np.testing.assert_allclose(found.mean[0], expected, atol=1e-12)
+    np.testing.assert_allclose(found.strength[0][0], strength, atol=1e-5)
+    np.testing.assert_allclose(found.sd[0], RELATIVE_SD * np.abs(expected), atol=1e-12)
+    np.testing.assert_allclose(found.strength[1][0], RELATIVE_SD * np.abs(strength), atol=1e-5)
+    assert np.abs(MU_0 * found.strength[0] - found.mean).max() > 1.0
+
+
+def test_integrals():
+    """Simpson's rule at 401 points of a line of 0.4 m is exact to 1e-6 here."""
+    found = solved(straight())
+    z = np.linspace(-0.2, 0.2, 8001)
+    field = blocks().getB(np.column_stack([0 * z + 0.001, 0 * z, z]))
+    for order, expected in ((1, simpson(field, x=z, axis=0)),
+                            (2, simpson((0.2 - z)[:, None] * field, x=z, axis=0))):
+        mean, sd = found.integrals(order)
+        np.testing.assert_allclose(mean[0], expected, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(sd[0], RELATIVE_SD * np.abs(expected), rtol=1e-3, atol=1e-9)
+        assert np.abs(expected).max() > 1e-4
+
+
+def test_kicks():
+    """The potential against the double integral of magpylib's field, its bar, and its slope."""
+    found = solved(straight(across=(-2e-4, 0, 2e-4), other=(-2e-4, 0, 2e-4)))
+    z = np.linspace(-0.2, 0.2, 8001)
+    step = z[1] - z[0]
+
+    def potential(x, y):
+        field = blocks().getB(np.column_stack([0 * z + 0.001 + x, 0 * z + y, z]))[:, :2]
+        inner = np.cumsum(field, axis=0) * step - field * step / 2
+        return (inner**2).sum() * step
+
+    mean, sd = found.kick_potential()
+    np.testing.assert_allclose(mean[4], potential(0, 0), rtol=5e-4)  # of 401 points, 1.2e-4
+    np.testing.assert_allclose(sd, 2 * RELATIVE_SD * mean, rtol=1e-9)  # Phi is quadratic in B
+    for kick, (x, y) in zip(found.kicks(), ((2e-4, 0), (0, 2e-4)), strict=True):
+        slope = (potential(x, y) - potential(-x, -y)) / 4e-4
+        np.testing.assert_allclose(kick[1, 1], -slope / 2, rtol=1e-3, atol=1e-9)
+
+
+def test_axes_of_lines():
+    for end, expected in (((0, 0, 1), np.eye(3)), ((1, 0, 0), [[0, 1, 0], [0, 0, 1], [1, 0, 0]])):
+        lines = Lines(np.zeros(3), np.array(end, float), (np.zeros(1), np.zeros(1)), 3)
+        np.testing.assert_allclose(lines.axes, expected, atol=1e-15)
+
+
+def test_what_is_refused():
+    lines = Lines(np.array([0.0, 0.03, 0.0]), np.array([0.0, 0.1, 0.0]),
+                  (np.zeros(1), np.zeros(1)), 5)
+    with pytest.raises(StudyError, match="add --inside"):
+        solved(lines)
+    with pytest.raises(StudyError, match="recoil_permeability = 1"):
+        solved(lines, inside=True, permeability=1.05)
+    edge = Lines(np.array([0.01, 0.04, -0.02]), np.array([0.01, 0.04, 0.02]),
+                 (np.zeros(1), np.zeros(1)), 5)
+    with pytest.raises(StudyError, match="edge"):
+        solved(edge, inside=True)
+
+
+def test_command(tmp_path, capsys):
+    (tmp_path / "b.csv").write_text(
+        "name,shape,x_m,y_m,z_m,size_x_m,size_y_m,size_z_m,remanence_T\n"
+        "a,cuboid,0.04,0,0,0.02,0.02,0.02,1.3\n")
+    (tmp_path / "s.toml").write_text(
+        'name = "s"\ndimension = 3\narray = { recoil_permeability = 1.0, free_blocks = { file = '
+        '"b.csv" } }\nmesh = { block_size_m = 0.005 }\n[observation]\nquantity = "flux_density"\n'
+        'positions = { kind = "points", points_m = [[0, 0, 0]] }\n')
+    words = ["field", str(tmp_path / "s.toml"), "--from-m", "0", "0", "-0.1", "--to-m", "0", "0",
+             "0.1", "-o", str(tmp_path / "out")]
+    assert main([*words, "--across-m", "0.001", "0.001", "--lines", "3", "--count", "51"]) == 0
+    with (tmp_path / "out/field.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 9 * 51
+    source = magpylib.magnet.Cuboid(polarization=(1.3, 0, 0), dimension=(0.02,) * 3,
+                                    position=(0.04, 0, 0))
+    row = rows[4 * 51 + 20]
+    np.testing.assert_allclose([float(row[f"B{axis}_T"]) for axis in "xyz"], source.getB(
+        [float(row[f"{axis}_m"]) for axis in "xyz"]), atol=1e-12)
+    assert float(row["sd_Bx_T"]) > 0
+    text = (tmp_path / "out/kick_map.txt").read_text()
+    assert text.count("START") == 2
+    assert main([*words, "--count", "2"]) == 2
+    assert "at least 3 points" in " ".join(capsys.readouterr().err.split())
