@@ -84,6 +84,8 @@ class SortedBlocks(ShownInNotebook):
         Description of the order of the given table.
     alike : dict of str to tuple of int
         Slots that could take the same blocks, by a name for their type.
+    limit : float or None
+        Limit of all |c_n| in units of 1e-4, or of the rms deviation in ppm.
     left_over : int
         Number of blocks without a slot.
     has_choice : bool
@@ -100,6 +102,7 @@ class SortedBlocks(ShownInNotebook):
     random: Floats
     own_order: str
     alike: dict[str, tuple[int, ...]]
+    limit: float | None = None
 
     @property
     def left_over(self) -> int:

@@ -16,16 +16,12 @@ from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.design.ring_design import Designed
-from halbach_fe.design.shim_tray import FilledTray
-from halbach_fe.design.shimming import Shim
-from halbach_fe.design.sorting import SortedBlocks
-from halbach_fe.design.tolerance import HomogeneityTolerance, Tolerance
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report import assembly, ring_design, shim_tray
+from halbach_fe.report import assembly, ring_design
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.demagnetization import worst_block_table
 from halbach_fe.report.diagnosis import change_table, found_table
@@ -33,13 +29,10 @@ from halbach_fe.report.diagnosis_answer import answer as answer_of_diagnosis
 from halbach_fe.report.forces import force_rows
 from halbach_fe.report.homogeneity import homogeneity_rows
 from halbach_fe.report.multipoles import multipole_figure
-from halbach_fe.report.page import geometry_figure, own_style
+from halbach_fe.report.page import geometry_figure, own_style, page_of
 from halbach_fe.report.plan import plan_table
 from halbach_fe.report.prediction import prediction_profile_figure
-from halbach_fe.report.shimming import move_table
 from halbach_fe.report.solution import field_figure
-from halbach_fe.report.sorting import order_table
-from halbach_fe.report.tolerance import quantile_table
 from halbach_fe.report.verification import answer as answer_of_verification
 from halbach_fe.report.verification import difference_table
 from halbach_fe.response.discretization_error import Verification
@@ -63,7 +56,10 @@ def html_of(result: object) -> str:
 
 @singledispatch
 def _html_of(result: object) -> str:
-    raise TypeError(f"a {type(result).__name__} has no figure or table")
+    page = page_of(result)
+    return words(page.answer) + "".join(
+        [picture(page.figures[name][0](), page.figures[name][1]) for name in page.shown]
+        or map(table, page.tables.values()))
 
 
 @_html_of.register
@@ -118,11 +114,6 @@ def _(result: Designed) -> str:
 
 
 @_html_of.register
-def _(result: FilledTray) -> str:
-    return table(shim_tray.homogeneity_rows(result)) + table(shim_tray.rows(result))
-
-
-@_html_of.register
 def _(verification: Verification) -> str:
     return words(answer_of_verification(verification)) + table(difference_table(verification))
 
@@ -130,21 +121,6 @@ def _(verification: Verification) -> str:
 @_html_of.register
 def _(plan: MeasurementPlan) -> str:
     return table(plan_table(plan))
-
-
-@_html_of.register
-def _(shim: Shim) -> str:
-    return table(move_table(shim))
-
-
-@_html_of.register
-def _(assignment: SortedBlocks) -> str:
-    return table(order_table(assignment))
-
-
-@_html_of.register
-def _(tolerance: Tolerance | HomogeneityTolerance) -> str:
-    return table(quantile_table(tolerance))
 
 
 @_html_of.register

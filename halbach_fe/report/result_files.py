@@ -9,7 +9,6 @@ from pathlib import Path
 
 from halbach_fe.api import HomogeneityResult, MultipoleTables
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.errors import must_be
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.core.versions import version
 from halbach_fe.design.assembly import Assembly
@@ -17,15 +16,12 @@ from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.forces import Forces
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.design.ring_design import Designed
-from halbach_fe.design.shim_tray import FilledTray
-from halbach_fe.design.shimming import Shim
-from halbach_fe.design.sorting import SortedBlocks
-from halbach_fe.design.tolerance import HomogeneityTolerance, Tolerance
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import write_study, write_summary
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
+from halbach_fe.report import shim_tray, shimming, sorting, tolerance  # noqa: F401 each registers its page
 from halbach_fe.report.assembly import write_assembly
 from halbach_fe.report.campaign import write_campaign_page
 from halbach_fe.report.demagnetization import write_demagnetization
@@ -34,13 +30,10 @@ from halbach_fe.report.forces import write_forces
 from halbach_fe.report.homogeneity import write_homogeneity
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.multipoles import write_multipoles
+from halbach_fe.report.page import page_of, write_files
 from halbach_fe.report.plan import write_plan
 from halbach_fe.report.ring_design import write_design
-from halbach_fe.report.shim_tray import write_shim_tray
-from halbach_fe.report.shimming import write_shim
 from halbach_fe.report.solution import write_solution_report
-from halbach_fe.report.sorting import write_sorted
-from halbach_fe.report.tolerance import write_tolerance
 from halbach_fe.report.verification import write_verification
 from halbach_fe.response.discretization_error import Verification
 from halbach_fe.response.solution import Solution, write_solution
@@ -53,11 +46,9 @@ OWNERS: dict[type, tuple[str, str]] = {
     Diagnosis: ("diagnose", "corrected_study"), Verification: ("verify", "magnet.study"),
     MultipoleTables: ("multipoles", "magnet.study"),
     HomogeneityResult: ("homogeneity", "magnet.study"), Forces: ("forces", "magnet.study"),
-    FilledTray: ("shim-tray", "magnet.study"), Designed: ("design", "study"),
+    Designed: ("design", "study"),
     Assembly: ("cad", "magnet.study"),
-    MeasurementPlan: ("plan", "magnet.study"), Shim: ("shim", "result.study"),
-    SortedBlocks: ("sort", "study"), Tolerance: ("tolerance", "study"),
-    HomogeneityTolerance: ("tolerance", "study"),
+    MeasurementPlan: ("plan", "magnet.study"),
     DemagnetizationMap: ("demagnetization", "magnet.study"),
     SimulatedCampaign: ("simulate-measurement", "study")}
 """The command that writes each result too, and where the result has its study."""
@@ -106,9 +97,9 @@ Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
     """
     owner = next((OWNERS[kind] for kind in type(result).__mro__ if kind in OWNERS), None)
     if owner is None:
-        raise TypeError(must_be(
-            "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
-            f"a {type(result).__name__}"))
+        page = page_of(result)
+        with result_folder(Path(folder), f"halbach-fe {page.command}", page.study.name):
+            return write_files(page, Path(folder))
     command, study = owner
     with result_folder(Path(folder), f"halbach-fe {command}", attrgetter(study)(result).name):
         return _write(result, folder)
@@ -167,12 +158,6 @@ def _(result: Forces, folder: str | Path) -> Path:
 
 
 @_write.register
-def _(result: FilledTray, folder: str | Path) -> Path:
-    write_shim_tray(result, Path(folder), provenance())
-    return Path(folder) / "shim_tray.html"
-
-
-@_write.register
 def _(result: Assembly, folder: str | Path) -> Path:
     write_assembly(result, Path(folder), provenance())
     return Path(folder) / "assembly.html"
@@ -189,25 +174,6 @@ def _(result: Designed, folder: str | Path) -> Path:
 def _(result: MeasurementPlan, folder: str | Path) -> Path:
     write_plan(result.magnet, result, Path(folder))
     return Path(folder) / "plan.html"
-
-
-@_write.register
-def _(result: Shim, folder: str | Path) -> Path:
-    text = study_text(result.study)
-    write_shim(result, result.result, text, Path(folder))
-    return Path(folder) / "shim.html"
-
-
-@_write.register
-def _(result: SortedBlocks, folder: str | Path) -> Path:
-    write_sorted(result, None, Path(folder))
-    return Path(folder) / "sort.html"
-
-
-@_write.register
-def _(result: Tolerance | HomogeneityTolerance, folder: str | Path) -> Path:
-    write_tolerance(result, Path(folder))
-    return Path(folder) / "tolerance.html"
 
 
 @_write.register
