@@ -11,26 +11,17 @@ from functools import singledispatch
 from matplotlib.figure import Figure
 
 from halbach_fe.api import HomogeneityResult, MultipoleTables
-from halbach_fe.design.assembly import Assembly
-from halbach_fe.design.demagnetization import DemagnetizationMap
-from halbach_fe.design.forces import Forces
-from halbach_fe.design.measurement_plan import MeasurementPlan
-from halbach_fe.design.ring_design import Designed
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report import assembly, ring_design
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.demagnetization import worst_block_table
 from halbach_fe.report.diagnosis import change_table, found_table
 from halbach_fe.report.diagnosis_answer import answer as answer_of_diagnosis
-from halbach_fe.report.forces import force_rows
 from halbach_fe.report.homogeneity import homogeneity_rows
 from halbach_fe.report.multipoles import multipole_figure
 from halbach_fe.report.page import geometry_figure, own_style, page_of
-from halbach_fe.report.plan import plan_table
 from halbach_fe.report.prediction import prediction_profile_figure
 from halbach_fe.report.solution import field_figure
 from halbach_fe.report.verification import answer as answer_of_verification
@@ -99,33 +90,8 @@ def _(result: HomogeneityResult) -> str:
 
 
 @_html_of.register
-def _(result: Forces) -> str:
-    return table(force_rows(result))
-
-
-@_html_of.register
-def _(result: Assembly) -> str:
-    return table(assembly.kind_rows(result)) + table(assembly.plate_rows(result))
-
-
-@_html_of.register
-def _(result: Designed) -> str:
-    return table(ring_design.design_rows(result)) + table(ring_design.ring_rows(result))
-
-
-@_html_of.register
 def _(verification: Verification) -> str:
     return words(answer_of_verification(verification)) + table(difference_table(verification))
-
-
-@_html_of.register
-def _(plan: MeasurementPlan) -> str:
-    return table(plan_table(plan))
-
-
-@_html_of.register
-def _(demagnetization: DemagnetizationMap) -> str:
-    return table(worst_block_table(demagnetization.by_block()))
 
 
 @_html_of.register

@@ -92,8 +92,8 @@ class View(NamedTuple):
 class Section:
     """Texts, tables and figures of a page in their order."""
 
-    parts: Sequence[str | Text | Table | Drawn | View | Markup]
-    """A plain string is a paragraph, markup is taken as it is."""
+    parts: Sequence[str | Text | Table | Drawn | View | Callable[[], Markup]]
+    """A plain string is a paragraph; a function returns HTML that only the page has."""
     title: str = ""
     """What stands above them; empty if nothing does."""
     folded: bool | None = None
@@ -122,8 +122,8 @@ class Page:
     all sections."""
     shown: tuple[str, ...] = ()
     """Figures that a notebook shows in place of tables."""
-    files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
-    """How each further file is written, by name."""
+    files: Mapping[str, Callable[[Path], object] | None] = field(default_factory=dict)
+    """How each further file is written, by name; None if the one before it is written with it."""
     new_study: tuple[str, Study, str] | None = None
     """File of a changed study, the study, and the note that says in it what was changed."""
     stem: str = ""
@@ -182,7 +182,8 @@ def write_files(page: Page, folder: Path, text: str | None = None) -> Path:
     ``text`` is that of the study's file, if there is one: a changed study keeps its comments.
     """
     for name, write in page.files.items():
-        write(folder / name)
+        if write is not None:
+            write(folder / name)
     if page.new_study is not None:
         name, study, note = page.new_study
         write_edited(folder / name, study_text(page.study) if text is None else text,

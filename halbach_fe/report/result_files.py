@@ -11,28 +11,18 @@ from halbach_fe.api import HomogeneityResult, MultipoleTables
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.core.versions import version
-from halbach_fe.design.assembly import Assembly
-from halbach_fe.design.demagnetization import DemagnetizationMap
-from halbach_fe.design.forces import Forces
-from halbach_fe.design.measurement_plan import MeasurementPlan
-from halbach_fe.design.ring_design import Designed
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import write_study, write_summary
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.report import shim_tray, shimming, sorting, tolerance  # noqa: F401 each registers its page
-from halbach_fe.report.assembly import write_assembly
 from halbach_fe.report.campaign import write_campaign_page
-from halbach_fe.report.demagnetization import write_demagnetization
 from halbach_fe.report.diagnosis import write_diagnosis_report
-from halbach_fe.report.forces import write_forces
 from halbach_fe.report.homogeneity import write_homogeneity
 from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.multipoles import write_multipoles
 from halbach_fe.report.page import page_of, write_files
-from halbach_fe.report.plan import write_plan
-from halbach_fe.report.ring_design import write_design
 from halbach_fe.report.solution import write_solution_report
 from halbach_fe.report.verification import write_verification
 from halbach_fe.response.discretization_error import Verification
@@ -45,11 +35,7 @@ OWNERS: dict[type, tuple[str, str]] = {
     Solution: ("solve", "magnet.study"), InferenceResult: ("infer", "study"),
     Diagnosis: ("diagnose", "corrected_study"), Verification: ("verify", "magnet.study"),
     MultipoleTables: ("multipoles", "magnet.study"),
-    HomogeneityResult: ("homogeneity", "magnet.study"), Forces: ("forces", "magnet.study"),
-    Designed: ("design", "study"),
-    Assembly: ("cad", "magnet.study"),
-    MeasurementPlan: ("plan", "magnet.study"),
-    DemagnetizationMap: ("demagnetization", "magnet.study"),
+    HomogeneityResult: ("homogeneity", "magnet.study"),
     SimulatedCampaign: ("simulate-measurement", "study")}
 """The command that writes each result too, and where the result has its study."""
 
@@ -149,37 +135,6 @@ def _(result: MultipoleTables, folder: str | Path) -> Path:
 def _(result: HomogeneityResult, folder: str | Path) -> Path:
     write_homogeneity(result, Path(folder), provenance())
     return Path(folder) / "homogeneity.html"
-
-
-@_write.register
-def _(result: Forces, folder: str | Path) -> Path:
-    write_forces(result, Path(folder), provenance())
-    return Path(folder) / "forces.html"
-
-
-@_write.register
-def _(result: Assembly, folder: str | Path) -> Path:
-    write_assembly(result, Path(folder), provenance())
-    return Path(folder) / "assembly.html"
-
-
-@_write.register
-def _(result: Designed, folder: str | Path) -> Path:
-    text = study_text(result.study)
-    write_design(result, text, Path(folder), provenance())
-    return Path(folder) / "design.html"
-
-
-@_write.register
-def _(result: MeasurementPlan, folder: str | Path) -> Path:
-    write_plan(result.magnet, result, Path(folder))
-    return Path(folder) / "plan.html"
-
-
-@_write.register
-def _(result: DemagnetizationMap, folder: str | Path) -> Path:
-    write_demagnetization(result, Path(folder))
-    return Path(folder) / "demagnetization.html"
 
 
 @_write.register

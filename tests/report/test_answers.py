@@ -397,7 +397,7 @@ def test_every_page_has_an_answer():
     found = {path.stem: answers_in(path.read_text())
              for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
     assert not [name for name, answers in found.items() if not all(answers)]
-    assert sum(map(len, found.values())) > 20
+    assert sum(map(len, found.values())) > 5  # the others are made of a Page, which has one
     assert not all(answers_in("write_page(path, template, pictures, study)"))  # the control
 
 
@@ -673,7 +673,7 @@ def test_scattered_points_have_maps_and_no_profile(given, scattered):
 def test_a_plan_lists_its_positions_in_mm_and_names_its_two_deviations(given, tmp_path):
     """The table has what plan.csv has; blocks and patterns are two quantities with two names."""
     found = hf.plan(given.magnet, given.session, points=6)
-    plan.write_plan(given.magnet, found, tmp_path)
+    write_files(plan.page(found), tmp_path)
     rows = plan.chosen_table(found)
     stored = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True)
     # 1 µm is the last digit of the table
