@@ -58,6 +58,10 @@ own_style = style.context("default")
 need LaTeX, or a font that is not there."""
 
 
+Figures = Mapping[str, tuple[Callable[[], Figure], str]]
+"""How figures are drawn, and their captions, by file name."""
+
+
 class Text(NamedTuple):
     """A paragraph; words between backticks are code."""
 
@@ -117,7 +121,7 @@ class Page:
     """What terminal and notebooks show, by title. The first table is in page.json too."""
     rows: Sequence[Mapping[str, str]] = ()
     """The table of page.json, if it is another one."""
-    figures: Mapping[str, tuple[Callable[[], Figure], str]] = field(default_factory=dict)
+    figures: Figures = field(default_factory=dict)
     """How each figure is drawn, and its caption, by file name. Those that no section has come after
     all sections."""
     shown: tuple[str, ...] = ()
@@ -126,6 +130,8 @@ class Page:
     """How each further file is written, by name; None if the one before it is written with it."""
     new_study: tuple[str, Study, str] | None = None
     """File of a changed study, the study, and the note that says in it what was changed."""
+    stored: bool = True
+    """Whether the summary is a file, too."""
     stem: str = ""
     """Name of .html and .json; that of the command if it is empty."""
     provenance: Mapping[str, str] = field(default_factory=dict)
@@ -140,7 +146,7 @@ class Page:
     def beside(self) -> list[str]:
         """Names of the files beside the page and its figures."""
         study = [] if self.new_study is None else [self.new_study[0]]
-        return [*study, *self.files, f"{self.name}.json"]
+        return [*study, *self.files, *([f"{self.name}.json"] if self.stored else [])]
 
     @property
     def unplaced(self) -> list[str]:
@@ -188,10 +194,10 @@ def write_files(page: Page, folder: Path, text: str | None = None) -> Path:
         name, study, note = page.new_study
         write_edited(folder / name, study_text(page.study) if text is None else text,
                      [(study, note)])
-    write_text(folder / f"{page.name}.json",
-               json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
-    pictures = save({name: (draw(), caption) for name, (draw, caption) in page.figures.items()},
-                    folder)
+    if page.stored:
+        write_text(folder / f"{page.name}.json",
+                   json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
+    pictures = save(page.figures, folder)
     path = folder / f"{page.name}.html"
     write_page(path, "page.html.j2", pictures, page.study, page.provenance, answer=page.answer,
                rows=page.rows or next(iter(page.tables.values()), ()), page=page,
@@ -204,17 +210,19 @@ def linearized(study: Study) -> list[str]:
     return (["The iron is linearized about the nominal magnet."] if is_nonlinear(study) else [])
 
 
-def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Picture]:
+def save(
+    figures: Mapping[str, tuple[Figure | Callable[[], Figure], str]], folder: Path
+) -> list[Picture]:
     """Write figures as PNG files into a folder, and return them for a page.
 
     Parameters
     ----------
     figures : mapping
-        Figure and caption by file name.
+        Figure, or how it is drawn, and caption, by file name.
     """
     pictures = []
     for name, (figure, caption) in figures.items():
-        png = png_of(figure)
+        png = png_of(figure() if callable(figure) else figure)
         with atomic(folder / name) as temporary:
             temporary.write_bytes(png)
         pictures.append(Picture(base64.b64encode(png).decode(), caption, name))
