@@ -320,7 +320,7 @@ def _templates() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.globals |= {"is_nonlinear": is_nonlinear, "faults_of": faults_in_words}
+    environment.globals |= {"faults_of": faults_in_words}
     environment.filters |= {"units_kept": units_kept, "with_code": _with_code}
     environment.tests |= {kind.__name__.lower(): lambda part, kind=kind: isinstance(part, kind)
                           for kind in (Text, Table, Drawn, View)}

@@ -154,7 +154,7 @@ def _of_the_instrument(study: Study) -> str:
 def page(plan: MeasurementPlan) -> Page:
     """Return the page of the positions to measure."""
     magnet, summary, rows = plan.magnet, plan_summary(plan), plan_table(plan)
-    chosen, beside, count = chosen_table(plan), "plan" in plan_table(plan)[0], len(plan.parameters)
+    chosen, beside, count = chosen_table(plan), "plan" in rows[0], len(plan.parameters)
     what = ("the largest expected information about the "
             f"{count} components of the magnetizations" if plan.deviation is None else
             f"the largest fall of the sd of the deviation of |B| in {plan.deviation.region.text}")
@@ -175,7 +175,7 @@ def page(plan: MeasurementPlan) -> Page:
         Section([
             "In this order: if you stop early, what is measured tells most. plan.csv has them in "
             "m, in the axes of the study.", Table(chosen, "numbers")],
-            "The positions to measure", folded=len(chosen) > MOST_UNFOLDED)],
+            "The positions to measure", folded=len(chosen) > 30)],
         {title: rows},
         figures={
             "plan_positions.png": (
@@ -198,10 +198,6 @@ def page(plan: MeasurementPlan) -> Page:
             "order": range(1, len(plan.points) + 1),
             **{f"{axis}_m": plan.points[:, number] for number, axis in enumerate("xyz")},
             "information_nats": plan.gain}, {})})
-
-
-MOST_UNFOLDED = 30
-"""Largest number of positions that are listed before the list is unfolded."""
 
 
 def chosen_table(plan: MeasurementPlan) -> list[dict[str, str]]:

@@ -44,9 +44,6 @@ T = TypeVar("T")
 SLOTS_A_ROW = 8
 """Largest number of slots in a row of the table of places."""
 
-MOST_UNFOLDED = 12
-"""Largest number of rows of that table that are shown before it is unfolded."""
-
 LITTLE = 0.05
 """Part of the rms below which the gain of sorting is called hardly worth the work."""
 
@@ -254,7 +251,7 @@ def page(found: SortedBlocks) -> Page:
                 _summary(found), [
         Section(["Blocks go only into slots of their own type."]),
         Section([by_serial, Table(places)], "Which block goes where",
-                folded=len(places) > MOST_UNFOLDED),
+                folded=len(places) > 12),
         Section([_convention(found), Table(rows, "turned" if in_a_region else "numbers")], title),
         *([Section([
             "Each is put into its slot as it was measured, and then turned about its own axes. "
