@@ -21,7 +21,6 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SMALL,
-    Drawn,
     Page,
     Section,
     Table,
@@ -293,7 +292,6 @@ def page(found: Forces) -> Page:
         "finished magnet; how it varies inside the block is left out."]
     return Page(
         "forces", "forces on the blocks", found.magnet.study, answer(found), _summary(found), [
-            Section([Drawn("forces.png")]),
             Section([
                 Table(rows),
                 f"Forces are those of the field of all other blocks{', of the iron' * iron} and of "

@@ -347,7 +347,6 @@ def page(found: HomogeneityResult) -> Page:
     return Page(
         "homogeneity", "homogeneity", found.magnet.study, answer(found),
         homogeneity_summary(found), [
-            Section([Drawn("homogeneity.png")]),
             Section([remarks, Table(rows, "turned")], f"The field in {region}"),
             *([Section([
                 "The largest ones, on the sphere's surface, in ppm of the mean field. "

@@ -122,8 +122,8 @@ class Page:
     rows: Sequence[Mapping[str, str]] = ()
     """The table of page.json, if it is another one."""
     figures: Figures = field(default_factory=dict)
-    """How each figure is drawn, and its caption, by file name. Those that no section has come after
-    all sections."""
+    """How each figure is drawn, and its caption, by file name. Of those that no section has, the
+    first of all stands below the answer, and the others after all sections."""
     shown: tuple[str, ...] = ()
     """Figures that a notebook shows in place of tables."""
     files: Mapping[str, Callable[[Path], object] | None] = field(default_factory=dict)

@@ -201,7 +201,7 @@ def page(found: Designed) -> Page:
                " Only the best design has radii between those that the study lists.")
     return Page("design", "design", found.study, answer(found), _summary(found), [
         Section([Text("The designed rings take the place of the array of the study.", "small"),
-                 Drawn("rings.png"), Drawn("slices.png")]),
+                 Drawn("slices.png")]),
         Section([
             Drawn("front.png"), Table(rows),
             f"{SIZES} The search itself works for the component along the main field, which "

@@ -187,7 +187,7 @@ def page(found: FilledTray) -> Page:
         "after.png": (partial(slices_figure, after, found.after.mean_T, largest),
                       text.format("the filled tray"))}
     return Page("shim-tray", "shim tray", found.magnet.study, answer(found), _summary(found), [
-        Section([Table(fields, "turned"), *map(Drawn, figures)]),
+        Section([Table(fields, "turned"), Drawn("before.png"), Drawn("after.png")]),
         Section([
             "Angles of a magnet's polarization are counter-clockwise as seen from +z: from the "
             "radius of its place outwards, and from the x axis. Empty places are left out.",

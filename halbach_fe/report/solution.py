@@ -143,7 +143,7 @@ def page(solution: Solution) -> Page:
         "solve", "the nominal magnet", study, answer(solution, multipoles), solution.summary(), [
             Section([view]), Section([Table(rows)], "The field at the study's positions"),
             *sections_of_stray(solution.stray_field), *_sections_of_circles(solution, multipoles),
-            Section([*map(Drawn, figures)], "Pictures"),
+            Section([*map(Drawn, [*figures][1:])], "Pictures"),
             Section([Table([{"quantity": name, "value": value}
                             for name, value in magnet_rows(magnet)])], "Model")],
         {"The field at the study's positions": rows,

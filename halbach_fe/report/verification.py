@@ -224,7 +224,7 @@ def page(found: Verification) -> Page:
     columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
-        [*changes, Section([view]), Section([*map(Drawn, figures)], "Pictures"),
+        [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
          Section([Table([{"quantity": name, "value": value} for name, value in model.items()])],
                  "Model")],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
