@@ -27,13 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.design.assembly import cad
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.report.assembly import (
-        answer,
-        assembly_summary,
-        kind_rows,
-        plate_rows,
-        write_assembly,
-    )
+    from halbach_fe.report.assembly import page
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
@@ -41,12 +35,4 @@ def run(arguments: argparse.Namespace) -> int:
     common.own_folder(arguments, "halbach-fe cad", magnet.name)
     plan = cad(magnet, blocks)
     with common.progress_bar("solids") as show:
-        write_assembly(plan, arguments.output, common.digests(
-            {"study file": arguments.study, "blocks": arguments.blocks}), show)
-    if arguments.json:
-        common.print_json(assembly_summary(plan))
-    else:
-        common.print_table(kind_rows(plan), "Blocks to order")
-        common.print_table(plate_rows(plan), "Plates to make")
-        common.say_answer(arguments, answer(plan), arguments.output / "assembly.html")
-    return 0
+        return common.finish(arguments, page(plan, show))

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from halbach_fe.measurement.block_table import BlockTable
     from halbach_fe.report.answer import Answer
+    from halbach_fe.report.page import Page
     from halbach_fe.response.multipoles import MultipoleReference
     from halbach_fe.response.resource_estimate import Estimate
     from halbach_fe.solver.getdp_cache import Cache
@@ -543,6 +544,7 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
 
     The folder becomes that of this verb and ``study``; shipped studies own theirs already.
     """
+    from halbach_fe.report.answer import inputs_of_command, known_inputs
     from halbach_fe.solver.dask_cluster import connected
     from halbach_fe.solver.getdp import getdp_or_none
     from halbach_fe.solver.session import Session
@@ -550,6 +552,7 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
     getdp = getdp_or_none(arguments.getdp)
     if study is not None:
         own_folder(arguments, f"halbach-fe {arguments.verb}", study.name, solving=True)
+    arguments.at_end.enter_context(known_inputs({"GetDP": getdp.version, **inputs_of_command()}))
     with progress_bar("solving") as show, ExitStack() as stack:
         opened = Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
@@ -636,6 +639,22 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total)
 
         yield show
+
+
+def finish(arguments: argparse.Namespace, page: Page) -> int:
+    """Write the files of a result, and print it as JSON, or its tables and its answer; return 0."""
+    from halbach_fe.report.page import write_files
+
+    path = write_files(page, arguments.output, arguments.study.read_text(encoding="utf-8-sig"))
+    if arguments.json:
+        print_json(page.summary)
+        return 0
+    for title, rows in page.tables.items():
+        print_table(rows, title)
+    if page.new_study is not None:
+        say(f"Study: {arguments.output / page.new_study[0]}")
+    say_answer(arguments, page.answer, path)
+    return 0
 
 
 def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None = None) -> None:

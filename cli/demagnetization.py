@@ -24,23 +24,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Compute the map, write the results, print the blocks with the smallest margin."""
     from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.report.demagnetization import (
-        answer,
-        demagnetization_summary,
-        worst_block_table,
-        write_demagnetization,
-    )
+    from halbach_fe.report.demagnetization import page
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
     with common.session(arguments, magnet.study) as session:
         result = demagnetization_map(magnet, session, arguments.across or ACROSS)
-    write_demagnetization(result, arguments.output)
-    summary = demagnetization_summary(result)
-    if arguments.json:
-        common.print_json(summary)
-    else:
-        common.print_table(worst_block_table(result.by_block()),
-                           "Blocks with the smallest margin")
-        common.say_answer(arguments, answer(result), arguments.output / "demagnetization.html")
-    return 0
+    return common.finish(arguments, page(result))

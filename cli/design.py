@@ -23,26 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Search, write the results, print the answer and the tables."""
     from halbach_fe.design.ring_design import design_rings
-    from halbach_fe.report.ring_design import (
-        answer,
-        design_rows,
-        design_summary,
-        ring_rows,
-        write_design,
-    )
+    from halbach_fe.report.ring_design import page
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
     with common.session(arguments, study) as session:
         found = design_rings(study, session, region_of(arguments), arguments.seed)
-    write_design(found, arguments.study.read_text(encoding="utf-8-sig"), arguments.output,
-                 {"GetDP": session.getdp.version, **common.digests(
-                     {"study file": arguments.study})})
-    if arguments.json:
-        common.print_json(design_summary(found))
-    else:
-        common.print_table(design_rows(found), f"Designs, by their field in {found.region.text}")
-        common.print_table(ring_rows(found), "The rings of the best design")
-        common.say(f"Study: {arguments.output / 'study.designed.toml'}")
-        common.say_answer(arguments, answer(found), arguments.output / "design.html")
-    return 0
+    return common.finish(arguments, page(found))

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.design.forces import forces
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.assembly_order import read_order
-    from halbach_fe.report.forces import answer, force_rows, forces_summary, write_forces
+    from halbach_fe.report.forces import page
     from halbach_fe.solver.separate_blocks import present_blocks
     from halbach_fe.study.reader import read_study
 
@@ -48,11 +48,4 @@ def run(arguments: argparse.Namespace) -> int:
     with common.session(arguments, magnet.study) as session:
         found = forces(magnet, session, order, arguments.density_kg_per_m3,
                        arguments.price_per_kg)
-    write_forces(found, arguments.output, common.digests(
-        {"study file": arguments.study, "order of assembly": arguments.order}))
-    if arguments.json:
-        common.print_json(forces_summary(found))
-    else:
-        common.print_table(force_rows(found), "Largest forces in place")
-        common.say_answer(arguments, answer(found), arguments.output / "forces.html")
-    return 0
+    return common.finish(arguments, page(found))

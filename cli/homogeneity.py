@@ -75,14 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import homogeneity
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.report.homogeneity import (
-        answer,
-        harmonic_rows,
-        homogeneity_rows,
-        homogeneity_summary,
-        write_homogeneity,
-    )
-    from halbach_fe.report.stray_field import stray_rows
+    from halbach_fe.report.homogeneity import page
     from halbach_fe.response.homogeneity import SHOWN_DEGREES
     from halbach_fe.study.reader import read_study
 
@@ -94,16 +87,4 @@ def run(arguments: argparse.Namespace) -> int:
     with common.session(arguments, study) as session:
         found = homogeneity(magnet, session, region, posterior,
                             arguments.degrees or SHOWN_DEGREES, data)
-    write_homogeneity(found, arguments.output, {
-        "GetDP": session.getdp.version, **common.digests(
-            {"study file": arguments.study, "posterior": arguments.posterior,
-             "map": arguments.measurements})})
-    if arguments.json:
-        common.print_json(homogeneity_summary(found))
-    else:
-        common.print_table(homogeneity_rows({**found.by_name, **found.of_map}),
-                           f"The field in {found.model.region.text}")
-        common.print_table(harmonic_rows(found), "Spherical harmonics in ppm of the mean field")
-        common.print_table(stray_rows(found.stray_field), "Outside of the magnet")
-        common.say_answer(arguments, answer(found), arguments.output / "homogeneity.html")
-    return 0
+    return common.finish(arguments, page(found))

@@ -9,6 +9,7 @@ figures.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 from halbach_fe.cli import common
 
@@ -26,30 +27,12 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import multipoles
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.report.multipoles import (
-        multipole_rows,
-        multipoles_summary,
-        place_of,
-        write_multipoles,
-    )
+    from halbach_fe.report.multipoles import page
     from halbach_fe.study.reader import read_study
 
-    study, limit = read_study(arguments.study), arguments.limit_units
+    study = read_study(arguments.study)
     magnet = build_magnet(study)
     posterior = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
     with common.session(arguments, study) as session:
         found = multipoles(magnet, session, common.reference(arguments), posterior)
-    tables = found.tables
-    answer = write_multipoles(study, tables, limit, arguments.output, {
-        "GetDP": session.getdp.version, **common.digests(
-            {"study file": arguments.study, "posterior": arguments.posterior})},
-        found.disagreement, found.left_out)
-    if arguments.json:
-        common.print_json(multipoles_summary(study, tables, limit))
-    else:
-        for model, columns in tables:
-            common.print_table(multipole_rows(columns), "Multipoles in units of 1e-4, " + (
-                "integrated along z" if model.integrated else
-                "of the cross-section" if model.z is None else f"on {place_of(model)}"))
-        common.say_answer(arguments, answer, arguments.output / "multipoles.html")
-    return 0
+    return common.finish(arguments, page(replace(found, limit=arguments.limit_units)))

@@ -24,18 +24,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Choose the positions, write the results, print a summary."""
     from halbach_fe.design.measurement_plan import plan_measurement
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.report.plan import answer, plan_summary, plan_table, write_plan
+    from halbach_fe.report.plan import page
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
     with common.session(arguments, magnet.study) as session:
         plan = plan_measurement(magnet, session, arguments.points)
-    write_plan(magnet, plan, arguments.output)
-    if arguments.json:
-        common.print_json(plan_summary(plan))
-    else:
-        rows = plan_table(plan)
-        common.print_table(rows, "The plan beside the positions of the study (* with equally many "
-                           "positions)" if "plan" in rows[0] else "What the readings leave unknown")
-        common.say_answer(arguments, answer(plan), arguments.output / "plan.html")
-    return 0
+    return common.finish(arguments, page(plan))

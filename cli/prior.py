@@ -24,17 +24,11 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.block_prior import prior_from_blocks
     from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.report.prior import answer, prior_summary, type_table, write_prior
+    from halbach_fe.report.prior import page
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
     table = read_blocks(arguments.blocks)
     common.own_folder(arguments, "halbach-fe prior", magnet.study.name)
     prior = prior_from_blocks(magnet, table)
-    write_prior(magnet, prior, arguments.output)
-    if arguments.json:
-        common.print_json(prior_summary(magnet, prior))
-    else:
-        common.print_table(type_table(prior), "Measured blocks relative to the nominal, by type")
-        common.say_answer(arguments, answer(prior), arguments.output / "prior.html")
-    return 0
+    return common.finish(arguments, page(magnet, prior))

@@ -52,15 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.measurement.campaign import refuse_several_maps
-    from halbach_fe.report.shimming import (
-        answer,
-        move_table,
-        move_title,
-        shim_summary,
-        table_title,
-        value_table,
-        write_shim,
-    )
+    from halbach_fe.report.shimming import page
     from halbach_fe.study.reader import read_study
 
     if arguments.stock and not arguments.replace:
@@ -84,11 +76,4 @@ def run(arguments: argparse.Namespace) -> int:
                      arguments.seed, arguments.limit_ppm, arguments.cycles)
     if result.disagreement:
         common.say(f"warning: Model and measurement disagree. {result.disagreement}")
-    write_shim(moves, result, arguments.study.read_text(encoding="utf-8-sig"), arguments.output)
-    if arguments.json:
-        common.print_json(shim_summary(moves, result))
-    else:
-        common.print_table(move_table(moves), move_title(moves, result))
-        common.print_table(value_table(moves), table_title(moves))
-        common.say_answer(arguments, answer(moves, result), arguments.output / "shim.html")
-    return 0
+    return common.finish(arguments, page(moves))

@@ -27,14 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.design.shim_tray import shim_tray
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.report.shim_tray import (
-        LISTED,
-        answer,
-        homogeneity_rows,
-        rows,
-        shim_tray_summary,
-        write_shim_tray,
-    )
+    from halbach_fe.report.shim_tray import page
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
@@ -43,15 +36,4 @@ def run(arguments: argparse.Namespace) -> int:
     with common.session(arguments, study) as session:
         found = replace(shim_tray(magnet, session, stored["posterior"], region),
                         disagreement=stored.disagreement)
-    write_shim_tray(found, arguments.output, {"GetDP": session.getdp.version, **common.digests(
-        {"study file": arguments.study, "posterior": arguments.posterior})})
-    if arguments.json:
-        common.print_json(shim_tray_summary(found))
-    else:
-        common.print_table(homogeneity_rows(found), f"The field in {found.model.region.text}")
-        table = rows(found)
-        common.print_table(table[:LISTED], "The tray" if len(table) <= LISTED else
-                           f"The first {LISTED} of {len(table)} magnets")
-        common.say(f"Table: {arguments.output / 'shim_tray.csv'}")
-        common.say_answer(arguments, answer(found), arguments.output / "shim_tray.html")
-    return 0
+    return common.finish(arguments, page(found))

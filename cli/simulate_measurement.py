@@ -10,13 +10,12 @@ changed afterwards.
 from __future__ import annotations
 
 import argparse
-
-import numpy as np
+from dataclasses import replace
 
 from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
-from halbach_fe.measurement.instrument import by_stated_units, check_total_field
+from halbach_fe.measurement.instrument import check_total_field
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.hidden_effects import (
     EFFECTS,
@@ -25,7 +24,7 @@ from halbach_fe.synthetic.hidden_effects import (
     signature,
 )
 from halbach_fe.synthetic.ngsolve_reaction import Elements
-from halbach_fe.synthetic.simulate import COIL_SD, simulate_campaign, write_campaign
+from halbach_fe.synthetic.simulate import COIL_SD, simulate_campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +72,7 @@ def _effect(text: str) -> RequestedEffect:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate the campaign, write the results, print a summary."""
-    from halbach_fe.report.campaign import answer, campaign_table, write_campaign_page
+    from halbach_fe.report.campaign import page
 
     study = read_study(arguments.study)
     magnet = build_magnet(study)  # refuses, as every command does, what cannot be built
@@ -98,24 +97,6 @@ def run(arguments: argparse.Namespace) -> int:
         campaign = simulate_campaign(study, arguments.seed, arguments.coil_sd, arguments.hide,
                                      arguments.hide_random, elements, progress, placed,
                                      arguments.component == "abs")
-    written = write_campaign(campaign, arguments.output)
-    # the files are in the units and along the axes that the study states, unless another unit is
-    # hidden in them; the page is in m and T
-    readings, held_out = (None if data is None else by_stated_units(study.instrument, data)
-                          for data in (campaign.readings, campaign.held_out))
-    assert readings is not None
-    write_campaign_page(study, readings, held_out, campaign.blocks,
-                        arguments.output, [common.digest(path) for path in written])
-    summary = {
-        "study": study.name, "points": campaign.readings.sizes["point"],
-        "readings": int(np.isfinite(campaign.without_noise).sum()),
-        "blocks": len(campaign.blocks), "model": campaign.truth["model"],
-        "truth_sha256": campaign.readings.attrs["truth_sha256"],
-        "files": [str(path) for path in written]}
-    if arguments.json:
-        common.print_json(summary)
-    else:
-        common.print_table(campaign_table(study, readings, held_out), "What was measured")
-        common.say_answer(arguments, answer(study, readings, held_out, len(campaign.blocks)),
-                          arguments.output / "campaign.html")
-    return 0
+    made = page(campaign)
+    return common.finish(arguments, replace(made, summary={**made.summary, "files": [
+        str(arguments.output / name) for name in made.files]}))

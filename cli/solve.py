@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 from halbach_fe.cli import common
 from halbach_fe.cli.streams import say
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Solve the field, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.response.solution import solve, study_observation, write_solution
+    from halbach_fe.response.solution import solve, study_observation
     from halbach_fe.solver.formulation_choice import choose_route
     from halbach_fe.solver.session import newton_history
     from halbach_fe.study.reader import read_study
@@ -48,26 +49,15 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"{len(magnet.blocks)} blocks: first their field at the positions and far outside.")
     with common.session(arguments, magnet.study) as session:
         solution = solve(magnet, session)
-    write_solution(solution, arguments.output)
-    summary = solution.summary() | {
-        "seconds": round(time.monotonic() - started, 2), "output": str(arguments.output)}
+    seconds = round(time.monotonic() - started, 2)
     if many:
-        say(f"Solved in {summary['seconds']} s, and written; now the page, which draws a part of "
-            "the blocks.")
-    from halbach_fe.report.solution import field_table, write_solution_report
-    from halbach_fe.report.stray_field import stray_rows
+        say(f"Solved in {seconds} s; now its files and the page, which draws a part of the blocks.")
+    from halbach_fe.report.solution import page
 
-    answer = write_solution_report(solution, arguments.output, {
-        "study file": common.digest(arguments.study), "GetDP": solution.getdp,
-        "method": magnet.study.solver.method,
-        "points, readings": f"{len(solution.points)}, {len(solution.readings)}",
-        "solved in": f"{summary['seconds']} s"})
+    summary: dict[str, object] = {"seconds": seconds, "output": str(arguments.output)}
     if magnet.is_nonlinear and choose_route(magnet, solution.points) != "moments":
         summary["newton_residuals"] = newton_history(arguments.output)
-    if arguments.json:
-        common.print_json(summary)
-    else:
-        common.print_table(field_table(solution), "The field at the study's positions")
-        common.print_table(stray_rows(solution.stray_field), "Outside of the magnet")
-        common.say_answer(arguments, answer, arguments.output / "report.html")
-    return 0
+    made = page(solution)
+    return common.finish(arguments, replace(
+        made, summary={**made.summary, **summary},
+        provenance={**made.provenance, "solved in": f"{seconds} s"}))

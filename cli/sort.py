@@ -9,6 +9,7 @@ figures.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 from halbach_fe.cli import common
 
@@ -31,13 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.design.objective import check_objective
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.report.sorting import (
-        answer,
-        order_table,
-        sort_summary,
-        table_title,
-        write_sorted,
-    )
+    from halbach_fe.report.sorting import page
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
@@ -47,11 +42,5 @@ def run(arguments: argparse.Namespace) -> int:
                         arguments.limit_ppm)
         assignment = sort(magnet, table, session, common.reference(arguments), arguments.seed, show,
                           arguments.turns)
-    limit = arguments.limit_units or arguments.limit_ppm
-    write_sorted(assignment, limit, arguments.output)
-    if arguments.json:
-        common.print_json(sort_summary(assignment, limit))
-    else:
-        common.print_table(order_table(assignment), table_title(assignment))
-        common.say_answer(arguments, answer(assignment), arguments.output / "sort.html")
-    return 0
+    return common.finish(arguments, page(replace(
+        assignment, limit=arguments.limit_units or arguments.limit_ppm)))

@@ -31,13 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.api import tolerance
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.report.tolerance import (
-        answer,
-        quantile_table,
-        table_title,
-        tolerance_summary,
-        write_tolerance,
-    )
+    from halbach_fe.report.tolerance import page
     from halbach_fe.study.reader import read_study
 
     magnet = build_magnet(read_study(arguments.study))
@@ -45,10 +39,4 @@ def run(arguments: argparse.Namespace) -> int:
     with common.session(arguments, magnet.study) as session:
         result = tolerance(magnet, session, blocks, common.reference(arguments), arguments.draws,
                            arguments.limit_units, arguments.seed, arguments.limit_ppm)
-    write_tolerance(result, arguments.output)
-    if arguments.json:
-        common.print_json(tolerance_summary(result))
-    else:
-        common.print_table(quantile_table(result), table_title(result))
-        common.say_answer(arguments, answer(result), arguments.output / "tolerance.html")
-    return 0
+    return common.finish(arguments, page(result))

@@ -22,8 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Estimate the error, write the results, print a summary."""
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.report.verification import answer, difference_table, write_verification
-    from halbach_fe.report.words import flux_density
+    from halbach_fe.report.verification import page
     from halbach_fe.response.discretization_error import verify
     from halbach_fe.response.resource_estimate import estimate_verify
     from halbach_fe.study.reader import read_study
@@ -36,14 +35,4 @@ def run(arguments: argparse.Namespace) -> int:
     with common.session(arguments, magnet.study) as session:
         verification = verify(magnet, session, say=lambda purpose: (
             None if exact else common.say(f"solving {purpose}")))
-    write_verification(magnet, verification, arguments.output, {
-        "GetDP": session.getdp.version, "study file": common.digest(arguments.study)})
-    if arguments.json:
-        common.print_json(verification.plain())
-    else:
-        common.print_table(
-            difference_table(verification),
-            f"Changes of B in ppm of {flux_density(verification.main_field_T, 4)}, route "
-            f"{verification.route.replace('_', ' ')}")
-        common.say_answer(arguments, answer(verification), arguments.output / "verification.html")
-    return 0
+    return common.finish(arguments, page(verification))

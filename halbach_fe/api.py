@@ -83,6 +83,8 @@ class MultipoleTables(ShownInNotebook):
         if that is not known.
     left_out : tuple of str
         Sentences about references without a main multipole, which have no table.
+    limit : float or None
+        Largest unwanted multipole that is allowed, in units of 1e-4 of the main one.
 
     Examples
     --------
@@ -97,6 +99,7 @@ class MultipoleTables(ShownInNotebook):
     tables: Sequence[tuple[MultipoleModel, Mapping[str, Multipoles]]]
     disagreement: str | None = None
     left_out: tuple[str, ...] = ()
+    limit: float | None = None
 
 
 @dataclass(frozen=True)

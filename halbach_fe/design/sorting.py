@@ -86,6 +86,8 @@ class SortedBlocks(ShownInNotebook):
         Slots that could take the same blocks, by a name for their type.
     doubts : tuple of str
         Sentences about a table that may be of another magnet, see `MeasuredPrior`.
+    limit : float or None
+        Limit of all |c_n| in units of 1e-4, or of the rms deviation in ppm.
     left_over : int
         Number of blocks without a slot.
     has_choice : bool
@@ -103,6 +105,7 @@ class SortedBlocks(ShownInNotebook):
     own_order: str
     alike: dict[str, tuple[int, ...]]
     doubts: tuple[str, ...] = ()
+    limit: float | None = None
 
     @property
     def left_over(self) -> int:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
+from markupsafe import Markup
 
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.pace import Progress
 from halbach_fe.design.assembly import Assembly
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.assembly_sheets import common_beginning, drawing, height_mm, sheets
-from halbach_fe.report.page import write_page
-from halbach_fe.report.solids import holder_name, write_solids
+from halbach_fe.report.page import Page, Section, Table, csv_file, page_of, rendered
+from halbach_fe.report.solids import holder_name, solid_names, write_solids
 from halbach_fe.report.words import counted
 
 SHORTEST_MM = 1e-3
@@ -62,7 +60,7 @@ def answer(assembly: Assembly) -> Answer:
                   "halbach-fe forces STUDY -o DIR")
 
 
-def kind_rows(assembly: Assembly) -> list[dict[str, str]]:
+def _kind_rows(assembly: Assembly) -> list[dict[str, str]]:
     """Return a row of text for every kind of blocks."""
     graded = any(kind.material for kind in assembly.kinds)
     ordered_as = assembly.ordered_as
@@ -78,7 +76,7 @@ def kind_rows(assembly: Assembly) -> list[dict[str, str]]:
             for kind, first in zip(assembly.kinds, ordered_as, strict=True)]
 
 
-def plate_rows(assembly: Assembly) -> list[dict[str, str]]:
+def _plate_rows(assembly: Assembly) -> list[dict[str, str]]:
     """Return a row of text for every plate."""
     return [{"holder": str(plate.number), "files": f"{holder_name(plate)}.step, .stl",
              "to make": str(len(plate.heights_m)), "pockets": str(len(plate.blocks[0])),
@@ -89,7 +87,7 @@ def plate_rows(assembly: Assembly) -> list[dict[str, str]]:
              + "\u00a0mm"} for plate in assembly.plates]
 
 
-def plate_diameters(assembly: Assembly) -> str:
+def _diameters(assembly: Assembly) -> str:
     """Return the diameters of the plates in words; all have the same."""
     if not assembly.plates:
         return ""
@@ -116,7 +114,7 @@ def spacers(assembly: Assembly) -> str:
     return f"The spacers between neighbouring plates are {length}\u00a0mm long."
 
 
-def assembly_summary(assembly: Assembly, files: Sequence[str] = ()) -> dict[str, object]:
+def _summary(assembly: Assembly) -> dict[str, object]:
     """Return the content of assembly.json."""
     return {
         "study": assembly.magnet.name, "blocks": len(assembly.blocks),
@@ -132,10 +130,10 @@ def assembly_summary(assembly: Assembly, files: Sequence[str] = ()) -> dict[str,
                     "thickness_m": plate.thickness_m, "floor_m": plate.floor_m,
                     "thinnest_wall_m": plate.wall_m}
                    for plate in assembly.plates],
-        "without_holder": list(assembly.reasons), "files": list(files)}
+        "without_holder": list(assembly.reasons), "files": solid_names(assembly)}
 
 
-def columns(assembly: Assembly) -> dict[str, Iterable[object]]:
+def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
     """Return the columns of assembly.csv, with a row for every block."""
     blocks = assembly.blocks
     middle = np.array([one.block.middle for one in blocks])
@@ -154,24 +152,49 @@ def columns(assembly: Assembly) -> dict[str, Iterable[object]]:
         "way_round": [one.way_round for one in blocks]}
 
 
-def write_assembly(
-    assembly: Assembly, folder: Path, provenance: Mapping[str, str],
-    progress: Progress = lambda done, total: None,
-) -> None:
-    """Write the solids, assembly.csv, assembly.json and assembly.html."""
-    files = write_solids(assembly, folder, progress)
-    with atomic(folder / "assembly.csv") as temporary:
-        write_csv(columns(assembly), {"study": assembly.magnet.name, "frame": FRAME}, temporary)
-    write_text(folder / "assembly.json", json.dumps(
-        assembly_summary(assembly, files), indent=1, allow_nan=False) + "\n")
+@page_of.register
+def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> Page:
+    """Return the page of what is to be ordered and made; its files are the solids, too."""
+    kinds, plates = _kind_rows(assembly), _plate_rows(assembly)
+    upside_down = ("" if not kinds or "to order" not in kinds[0] else " Kinds that differ only in "
+                   "the sign of the magnetization along y and z are the same block, turned about x "
+                   "by 180°: upside down.")
+    first, *solids = solid_names(assembly)
+    return Page("cad", "assembly", assembly.magnet.study, answer(assembly), _summary(assembly), [
+        Section([
+            Table(kinds), "Sizes are along the block's own x × y × z: in a ring x points outwards, "
+            "or along the magnetization where cubes turn with it, and z along the magnet. The "
+            f"magnetization points to the north pole.{upside_down}"], "Blocks to order"),
+        *([Section([Table(plates), _of_the_plates(assembly)], "Plates to make")] if plates else []),
+        Section(["Magnets attract one another from decimetres away: `halbach-fe forces` computes "
+                 "what each block feels while it is inserted.", partial(_sheets, assembly)])],
+        {"Blocks to order": kinds, "Plates to make": plates}, stem="assembly", files={
+            first: lambda path: write_solids(assembly, path.parent, progress),
+            **dict.fromkeys(solids),
+            "assembly.csv": csv_file(_columns(assembly), {
+                "study": assembly.magnet.name, "frame": FRAME})})
+
+
+def _of_the_plates(assembly: Assembly) -> str:
+    """Say what the files of the plates hold, and how plates lie above one another."""
+    holder, through = assembly.holder, any(not plate.floor_m for plate in assembly.plates)
+    mark = (", and the notch in each pocket is where the north pole of its block goes"
+            if holder.mark_m else "")
+    number = (" The number of the holder is engraved into the upper face."
+              if holder.engraving_m else "")
+    return (f"{_diameters(assembly)} The STEP and STL files are in mm. Every file of a plate has "
+            "its lower face at z = 0. Pockets are open at the top"
+            f"{', and go through where there is no floor' * through}; the large notch in the outer "
+            "edge is at the angle 0 (the x axis), the small one beside it on the side of larger "
+            f"angles{mark}.{number} {spacers(assembly)}")
+
+
+def _sheets(assembly: Assembly) -> Markup:
+    """Return a drawing of every plate, with the blocks in their places, as HTML."""
     ordered_as = dict(zip((kind.number for kind in assembly.kinds), assembly.ordered_as,
                           strict=True))
     prefix = common_beginning([one.serial for one in assembly.blocks])
-    write_page(folder / "assembly.html", "assembly.html.j2", [], study=assembly.magnet.study,
-               provenance=provenance, answer=answer(assembly), kinds=kind_rows(assembly),
-               plates=plate_rows(assembly), diameters=plate_diameters(assembly),
-               prefix=prefix, holder=assembly.holder,
-               measured=any(one.serial for one in assembly.blocks),
-               files=["assembly.csv", "assembly.json", *files],
-               spacers=spacers(assembly),
-               sheets=[drawing(sheet, prefix, ordered_as) for sheet in sheets(assembly)])
+    return Markup(rendered(
+        "assembly.html.j2", prefix=prefix, holder=assembly.holder,
+        measured=any(one.serial for one in assembly.blocks),
+        sheets=[drawing(sheet, prefix, ordered_as) for sheet in sheets(assembly)]))

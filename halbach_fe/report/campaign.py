@@ -5,8 +5,7 @@ They show only what a measurement would give, and nothing of the hidden truth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -14,8 +13,8 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
+from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
@@ -23,17 +22,24 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SECOND,
+    Page,
+    Section,
+    Table,
+    View,
     geometry_figure,
-    own_style,
-    save,
+    page_of,
     stacked_axes,
-    write_page,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-from halbach_fe.synthetic.simulate import observed_components, point_noise
+from halbach_fe.synthetic.simulate import (
+    SimulatedCampaign,
+    campaign_files,
+    observed_components,
+    point_noise,
+)
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)
 
@@ -61,43 +67,56 @@ def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, bloc
         + (" --held-out DIR/held-out.csv" if held_out is not None else "") + " -o DIR")
 
 
-@own_style
-def write_campaign_page(
-    study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: BlockTable,
-    folder: Path, files: Sequence[str],
-) -> None:
-    """Write campaign.html and its figures.
+@page_of.register
+def page(campaign: SimulatedCampaign) -> Page:
+    """Return the page of a simulated campaign.
 
-    Parameters
-    ----------
-    readings : xarray.Dataset
-        The simulated field map.
-    held_out : xarray.Dataset or None
-        The simulated readings that are held out.
-    blocks : BlockTable
-        The simulated measurements of single blocks.
-    files : sequence of str
-        Names and digests of the campaign's files.
+    Its files are in the units and along the axes that the study states, the page is in m and T.
     """
+    study, blocks = campaign.study, len(campaign.blocks)
+    readings, held_out = _as_read(campaign)
     maps = {"map": readings} | ({} if held_out is None else {"held out": held_out})
     magnet, points = build_magnet(study), points_of(readings)
-    figures = {
-        "campaign_field.png": (
-            _field_figure(study, maps), "The readings of the map"),
-        "campaign_geometry.png": (
-            geometry_figure(magnet, points, None if held_out is None else points_of(held_out)),
-            f"The nominal blocks of the first ring, {'the iron, ' if magnet.iron else ''}and the "
-            "points of the map and the held-out points")}
-    magnitude = np.linalg.norm(list(_columns(study, readings).values()), axis=0)
-    write_page(
-        folder / "campaign.html", "campaign.html.j2", save(figures, folder), study=study,
-        provenance={"source": "simulated", "SHA-256 of the truth": readings.attrs["truth_sha256"]},
-        answer=answer(study, readings, held_out, len(blocks)),
-        rows=campaign_table(study, readings, held_out), blocks=len(blocks),
-        files=files, view=view_of_nominal_magnet(magnet, ViewPoints(
-            points, 1e3 * magnitude, "points of the map", "magnitude of the<br>readings in mT",
-            "magnitude of the readings %{customdata:.5g} mT",
-            (1e3 * float(magnitude.min()), 1e3 * float(magnitude.max())))))
+    magnitude = 1e3 * np.linalg.norm(list(_columns(study, readings).values()), axis=0)
+    view = View(lambda: view_of_nominal_magnet(magnet, ViewPoints(
+        points, magnitude, "points of the map", "magnitude of the<br>readings in mT",
+        "magnitude of the readings %{customdata:.5g} mT",
+        (float(magnitude.min()), float(magnitude.max())))),
+        "points of the map by the magnitude of the readings")
+    rows, secret = campaign_table(study, readings, held_out), readings.attrs["truth_sha256"]
+    return Page(
+        "simulate-measurement", "a simulated measurement campaign", study,
+        answer(study, readings, held_out, blocks), {
+            "study": study.name, "points": readings.sizes["point"],
+            "readings": int(np.isfinite(campaign.without_noise).sum()), "blocks": blocks,
+            "model": campaign.truth["model"], "truth_sha256": secret},
+        [Section([
+            "Magnetizations were drawn at random, the field was computed with programs other than "
+            "halbach-fe, and noise was added. The true magnetizations and hidden effects are in "
+            "`truth/truth.json`.", Table(rows, "numbers"),
+            f"{blocks} single blocks have simulated measurements in a Helmholtz coil. The points "
+            "are shown at the positions that the map states; a campaign may contain a hidden error "
+            "of these positions. The picture shows the blocks with their nominal geometry and "
+            "magnetization.", view], "What was simulated")],
+        {"What was measured": rows},
+        figures={
+            "campaign_field.png": (
+                partial(_field_figure, study, maps), "The readings of the map"),
+            "campaign_geometry.png": (
+                partial(geometry_figure, magnet, points,
+                        None if held_out is None else points_of(held_out)),
+                "The nominal blocks of the first ring, "
+                f"{'the iron, ' if magnet.iron else ''}and the points of the map and the held-out "
+                "points")},
+        files=campaign_files(campaign), stored=False, stem="campaign",
+        provenance={"source": "simulated", "SHA-256 of the truth": secret})
+
+
+def _as_read(campaign: SimulatedCampaign) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Return the map and the held-out one in m and T, as whoever reads them gets them."""
+    convert = partial(by_stated_units, campaign.study.instrument)
+    return (convert(campaign.readings),
+            None if campaign.held_out is None else convert(campaign.held_out))
 
 
 def campaign_table(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.demagnetization import LINEAR, SHARES, DemagnetizationMap, knee, write_vtu
 from halbach_fe.geometry.blocks import block_in_words
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
 from halbach_fe.report.page import (
@@ -25,11 +22,15 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    Page,
+    Section,
+    Table,
+    Text,
+    View,
+    csv_file,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    page_of,
 )
 from halbach_fe.report.words import place_of
 from halbach_fe.study.model import is_nonlinear
@@ -132,34 +133,56 @@ def _limit_in_words(found: DemagnetizationMap, share: float) -> str:
     return f"{part} never passes the knee" if share else "no cell ever passes the knee"
 
 
-@own_style
-def write_demagnetization(found: DemagnetizationMap, folder: Path) -> None:
-    """Write demagnetization.json, .csv (a row per block), .vtu (cells), .html and the figures."""
-    summary, rows = demagnetization_summary(found), found.by_block()
-    write_text(folder / "demagnetization.json",
-               json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    with atomic(folder / "demagnetization.csv") as temporary:
-        write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
-            "study": found.study.name, "temperature_C": str(found.material.temperature_C),
-        }, temporary)
-    write_vtu(found, folder / "demagnetization.vtu")
-    pictures = save({
-        "demagnetization_map.png": (
-            _map_figure(found), "H along the magnetization in the blocks; cells past the knee, if "
-            "any, are outlined"),
-        "demagnetization_temperature.png": (
-            _temperature_figure(found), "Share of the magnet's volume past the knee against the "
-            "temperature"),
-        "demagnetization_blocks.png": (
-            _slots_figure(found), "H along the magnetization by slot: mean of each block, and "
-            "smallest value in any of its cells"),
-    }, folder)
-    write_page(folder / "demagnetization.html", "demagnetization.html.j2", pictures,
-               study=found.study, summary=summary, material=found.material, answer=answer(found),
-               rows=worst_block_table(rows), blocks=len(rows), view=_view(found, rows))
+@page_of.register
+def page(found: DemagnetizationMap) -> Page:
+    """Return the page of the margins of the blocks."""
+    summary, blocks, material = demagnetization_summary(found), found.by_block(), found.material
+    rows = _worst_block_table(blocks)
+    reference_C = f"{material.reference_temperature_C:g} °C"
+    of_all = f"{len(rows)} of {len(blocks)} blocks; all are in demagnetization.csv. "
+    return Page("demagnetization", "demagnetization margin", found.study, answer(found), summary, [
+        Section([
+            "H is the field strength in the nominal magnet along each block's magnetization, in "
+            f"{len(found.along)} cells. It is the exact field of the blocks in vacuum plus the "
+            "finite-element field that the permeability of the blocks and the iron add. At this "
+            f"temperature the knee is at |H| = {1e-3 * knee(material, material.temperature_C):.0f} "
+            f"kA/m: {material.squareness:g} times the intrinsic coercivity, which is "
+            f"{1e-3 * material.intrinsic_coercivity_A_per_m:.0f} kA/m at {reference_C} and changes "
+            f"by {100 * material.coercivity_coefficient_per_K:g} % per kelvin (the remanence by "
+            f"{100 * material.remanence_coefficient_per_K:g} %).",
+            Text("H diverges logarithmically at the edges of blocks, so that the smallest margin "
+                 "falls slightly with smaller cells (--across); shares of the volume do not. Not "
+                 "modelled: fields across the easy axis, which demagnetize less, and the field "
+                 "change that the loss of one cell causes in others"
+                 f"{_SCALED if is_nonlinear(found.study) else ''}.", "small"),
+            View(partial(_view, found, blocks), "blocks by their smallest margin to the knee")]),
+        Section([
+            f"{of_all if len(blocks) > len(rows) else ''}H_cJ needed is the smallest intrinsic "
+            f"coercivity at {reference_C} with which no cell of the block is past the knee at "
+            f"{material.temperature_C:g} °C.",
+            Table(rows, "numbers")], "Blocks with the smallest margins")],
+        {"Blocks with the smallest margin": rows},
+        figures={
+            "demagnetization_map.png": (
+                partial(_map_figure, found), "H along the magnetization in the blocks; cells past "
+                "the knee, if any, are outlined"),
+            "demagnetization_temperature.png": (
+                partial(_temperature_figure, found), "Share of the magnet's volume past the knee "
+                "against the temperature"),
+            "demagnetization_blocks.png": (
+                partial(_slots_figure, found), "H along the magnetization by slot: mean of each "
+                "block, and smallest value in any of its cells")},
+        files={
+            "demagnetization.csv": csv_file(
+                {key: [row[key] for row in blocks] for key in blocks[0]}, {
+                    "study": found.study.name, "temperature_C": str(material.temperature_C)}),
+            "demagnetization.vtu": partial(write_vtu, found)})
 
 
-def worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+_SCALED = ". At other temperatures the field of the iron is scaled with the remanence"
+
+
+def _worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,20 +13,20 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.forces import STANDARD_GRAVITY, Forces, Loads
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
     SMALL,
+    Page,
+    Section,
+    Table,
+    csv_file,
     figure_of,
-    own_style,
-    save,
-    write_page,
+    page_of,
 )
 from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_error
 from halbach_fe.study.types import COMPONENTS
@@ -169,7 +168,7 @@ def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
     return f"{text} {_numbers(unit)}"
 
 
-def force_rows(found: Forces) -> list[dict[str, str]]:
+def _rows(found: Forces) -> list[dict[str, str]]:
     """Return a row of text for each of the largest forces in place."""
     rows = []
     for number in np.argsort(-found.in_place.magnitude, kind="stable")[:LISTED]:
@@ -186,7 +185,7 @@ def force_rows(found: Forces) -> list[dict[str, str]]:
     return rows
 
 
-def forces_summary(found: Forces) -> dict[str, object]:
+def _summary(found: Forces) -> dict[str, object]:
     """Return the content of forces.json."""
     def largest(loads: Loads) -> dict[str, object]:
         number = int(np.argmax(loads.magnitude))
@@ -203,7 +202,7 @@ def forces_summary(found: Forces) -> dict[str, object]:
         "price_per_kg": found.price_per_kg, "cost": found.cost}
 
 
-def force_columns(found: Forces) -> dict[str, Iterable[object]]:
+def _columns(found: Forces) -> dict[str, Iterable[object]]:
     """Return the columns of forces.csv."""
     columns: dict[str, Iterable[object]] = {
         "block": [block.name for block in found.blocks],
@@ -284,18 +283,27 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
              ylim=(-reach, reach), title=f"ring {ring}")
 
 
-@own_style
-def write_forces(found: Forces, folder: Path, provenance: Mapping[str, str]) -> None:
-    """Write forces.csv, forces.json, forces.html and its figure."""
-    write_text(folder / "forces.json",
-               json.dumps(forces_summary(found), indent=1, allow_nan=False) + "\n")
-    with atomic(folder / "forces.csv") as temporary:
-        write_csv(force_columns(found), {"study": found.magnet.name}, temporary)
-    pictures = save({"forces.png": (
-        forces_figure(found), "Above: forces in place in the ring of the largest one; arrows show "
-        "their part in the plane, numbers are slots. Below: forces in the order of the assembly")},
-        folder)
-    write_page(folder / "forces.html", "forces.html.j2", pictures, study=found.magnet.study,
-               provenance=provenance, answer=answer(found), rows=force_rows(found), found=found,
-               imbalance=_newton(found.imbalance_N),
-               permeable=not found.magnet.is_vacuum)
+@page_of.register
+def page(found: Forces) -> Page:
+    """Return the page of the forces on the blocks."""
+    iron, rows = bool(found.magnet.iron), _rows(found)
+    permeable = [] if found.magnet.is_vacuum else [
+        "Every block has the mean of the polarization that its permeability gives it in the "
+        "finished magnet; how it varies inside the block is left out."]
+    return Page(
+        "forces", "forces on the blocks", found.magnet.study, answer(found), _summary(found), [
+            Section([
+                Table(rows),
+                f"Forces are those of the field of all other blocks{', of the iron' * iron} and of "
+                "external sources on a block; torques are about its middle. ± is the error of the "
+                "quadrature. The last two columns are the force on the block when it is inserted, "
+                "with only the blocks before it in place, and its place in that order"
+                f"{'; the iron is not there yet' * iron}. The forces of all blocks on each other "
+                f"add up to {_newton(found.imbalance_N)}; Newton's third law makes it zero.",
+                *permeable], "The largest forces in place")],
+        {"Largest forces in place": rows},
+        figures={"forces.png": (
+            partial(forces_figure, found), "Above: forces in place in the ring of the largest one; "
+            "arrows show their part in the plane, numbers are slots. Below: forces in the order of "
+            "the assembly")},
+        files={"forces.csv": csv_file(_columns(found), {"study": found.magnet.name})})

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -18,21 +17,22 @@ from numpy.typing import NDArray
 
 from halbach_fe.api import HomogeneityResult
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
     POSTERIOR,
     PUBLISHED,
     SMALL,
+    Drawn,
+    Page,
+    Section,
+    Table,
+    csv_file,
     figure_of,
-    own_style,
-    save,
-    write_page,
+    page_of,
 )
-from halbach_fe.report.stray_field import stray_pictures, stray_section
+from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import decimals, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 from halbach_fe.study.model import Study
@@ -319,36 +319,40 @@ def harmonics_figure(known: Homogeneity) -> Figure:
     return figure
 
 
-@own_style
-def write_homogeneity(
-    found: HomogeneityResult, folder: Path, provenance: Mapping[str, str]
-) -> None:
-    """Write homogeneity.json, harmonics.csv, homogeneity.html and its figures."""
+@page_of.register
+def page(found: HomogeneityResult) -> Page:
+    """Return the page of the homogeneity of a magnet's field."""
     name, best = list(found.by_name.items())[-1]
-    write_text(folder / "homogeneity.json",
-               json.dumps(homogeneity_summary(found), indent=1, allow_nan=False) + "\n")
-    figures = {"homogeneity.png": (
-        slices_figure(found.model.slices(found.distributions[name].mean), best.mean_T),
+    every, region = {**found.by_name, **found.of_map}, found.model.region.text
+    rows, harmonics = homogeneity_rows(every), harmonic_rows(found)
+    figures: dict[str, tuple[Callable[[], Figure], str]] = {"homogeneity.png": (
+        partial(slices_figure, found.model.slices(found.distributions[name].mean), best.mean_T),
         "Deviation of |B| from its mean over the region (dashed), in planes through its "
         f"centre, {_known_as(name)}")}
-    every = {**found.by_name, **found.of_map}
-    if best.harmonics and not _cancels(best):
+    files = {}
+    if harmonics:
         figures["harmonics.png"] = (
-            harmonics_figure(best), f"The largest spherical harmonics {_known_as(name)}, by "
-            "degree; bars are two standard deviations")
-        with atomic(folder / "harmonics.csv") as temporary:
-            write_csv({
-                "magnet": [own for own, known in every.items() for _ in known.harmonics],
-                **{key: [getattr(each, key) for known in every.values()
-                         for each in known.harmonics]
-                   for key in ("degree", "order", "letter", "ppm", "sd_ppm")}}, {
-                "study": found.magnet.name, "convention": CONVENTION}, temporary)
-    figures |= stray_pictures(found.stray_field)
-    write_page(folder / "homogeneity.html", "homogeneity.html.j2", save(figures, folder),
-               study=found.magnet.study, provenance=provenance, answer=answer(found),
-               region=found.model.region.text,
-               rows=homogeneity_rows({**found.by_name, **found.of_map}),
-               sizes=SIZES, of_map=MAP_ROWS if found.of_map else "", misfit=_misfit(found),
-               stray=stray_section(found.stray_field),
-               harmonics=harmonic_rows(found), convention=CONVENTION,
-               solver_error=f"{found.model.solver_error_ppm:.2g}")
+            partial(harmonics_figure, best), f"The largest spherical harmonics {_known_as(name)}, "
+            "by degree; bars are two standard deviations")
+        files["harmonics.csv"] = csv_file({
+            "magnet": [own for own, known in every.items() for _ in known.harmonics],
+            **{key: [getattr(each, key) for known in every.values() for each in known.harmonics]
+               for key in ("degree", "order", "letter", "ppm", "sd_ppm")}},
+            {"study": found.magnet.name, "convention": CONVENTION})
+    remarks = " ".join(filter(None, (
+        SIZES, "Ranges hold 95 % of the magnets drawn from the prior or posterior.",
+        MAP_ROWS if found.of_map else "", _misfit(found),
+        "" if (own := f"{found.model.solver_error_ppm:.2g}") == "0" else
+        f"The solver's own error is {own} ppm rms for a component.")))
+    return Page(
+        "homogeneity", "homogeneity", found.magnet.study, answer(found),
+        homogeneity_summary(found), [
+            Section([remarks, Table(rows, "turned")], f"The field in {region}"),
+            *([Section([
+                "The largest ones, on the sphere's surface, in ppm of the mean field. "
+                f"{CONVENTION}.", Table(harmonics, "numbers"), Drawn("harmonics.png")],
+                "Spherical harmonics")] if harmonics else []),
+            *sections_of_stray(found.stray_field, drawn=True)],
+        {f"The field in {region}": rows, "Spherical harmonics in ppm of the mean field": harmonics,
+         "Outside of the magnet": stray_rows(found.stray_field)},
+        figures={**figures, **stray_pictures(found.stray_field)}, files=files)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.api import MultipoleTables
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.files import atomic
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
@@ -18,11 +20,14 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SECOND,
+    Drawn,
+    Page,
+    Section,
+    Table,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    linearized,
+    page_of,
 )
 from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
@@ -152,7 +157,7 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     return f"{where} the {name} is {size}\u00a0{unit}{by}."
 
 
-def middle_table(tables: Sequence[MultipoleTable], study: Study) -> dict[str, object]:
+def middle_table(tables: Sequence[MultipoleTable], study: Study) -> dict[str, Any]:
     """Return the template variables of the table of `middle_circle`; empty without circles."""
     if not tables:
         return {}
@@ -162,7 +167,7 @@ def middle_table(tables: Sequence[MultipoleTable], study: Study) -> dict[str, ob
             "rows": text_table(**magnets), "circles": len(tables)}
 
 
-def multipoles_summary(
+def _summary(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None
 ) -> dict[str, object]:
     """Return the content of multipoles.json."""
@@ -297,28 +302,29 @@ def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
     return f"{with_error(1e3 * known.main, 1e3 * known.main_sd)}\u00a0m{model.unit}"
 
 
-@own_style
-def write_multipoles(
-    study: Study, tables: Sequence[MultipoleTable], limit: float | None, folder: Path,
-    provenance: Mapping[str, str], disagreement: str | None = None, left_out: Sequence[str] = (),
-) -> Answer:
-    """Write multipoles.csv, multipoles.json, multipoles.html and its figures; return the answer.
-
-    ``left_out`` are the sentences of `multipole_models`.
-    """
-    write_multipole_csv(study, tables, folder / "multipoles.csv")
-    summary = multipoles_summary(study, tables, limit)
-    write_text(folder / "multipoles.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    pictures = save({
-        f"multipoles_{_location(model)}.png": (
-            multipole_figure(magnets, limit), "Unwanted multipoles, normal (left) and "
-            "skew (right); bars are two standard deviations")
-        for model, magnets in tables}, folder)
-    parts = [{"title": _location(model), "reference": reference_text(model, study),
-              "rows": multipole_rows(magnets), "picture": picture}
-             for (model, magnets), picture in zip(tables, pictures, strict=True)]
-    said = answer(tables, limit, disagreement, faults_in_words(study))
-    write_page(folder / "multipoles.html", "multipoles.html.j2", pictures, study=study,
-               provenance=provenance, answer=said, parts=parts, rows=multipole_rows(tables[0][1]),
-               left_out=left_out)
-    return said
+@page_of.register
+def page(found: MultipoleTables) -> Page:
+    """Return the page of the multipoles of a magnet."""
+    study, tables = found.magnet.study, found.tables
+    files = [f"multipoles_{_location(model)}.png" for model, _ in tables]
+    rows = [multipole_rows(magnets) for _, magnets in tables]
+    sections = [Section([
+        f"{reference_text(model, study)} ± is the standard deviation, including the error of the "
+        "solver; |c_n| is the size of b_n and a_n together.", Table(table, "numbers"),
+        Drawn(file)], _location(model).capitalize())
+        for (model, _), table, file in zip(tables, rows, files, strict=True)]
+    return Page(
+        "multipoles", "multipoles", study,
+        answer(tables, found.limit, found.disagreement, faults_in_words(study)),
+        _summary(study, tables, found.limit),
+        [*sections, Section([*found.left_out, *linearized(study)])],
+        {"Multipoles in units of 1e-4, " + (
+            "integrated along z" if model.integrated else
+            "of the cross-section" if model.z is None else f"on {place_of(model)}"): table
+         for (model, _), table in zip(tables, rows, strict=True)},
+        figures={file: (
+            partial(multipole_figure, magnets, found.limit), "Unwanted multipoles, normal (left) "
+            "and skew (right); bars are two standard deviations")
+            for file, (_, magnets) in zip(files, tables, strict=True)},
+        shown=tuple(files),
+        files={"multipoles.csv": partial(write_multipole_csv, study, tables)})

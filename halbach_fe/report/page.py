@@ -5,16 +5,19 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import platform
 import re
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, singledispatch
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
 import tomlkit
+from markupsafe import Markup
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -25,12 +28,15 @@ from matplotlib.ticker import FuncFormatter, LogFormatter
 from tomlkit.items import Array, Trivia, Whitespace
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import must_be
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, inputs_of_command
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
 from halbach_fe.report.words import faults_in_words
+from halbach_fe.study.edit_file import study_text, write_edited
 from halbach_fe.study.model import Study, is_nonlinear
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
@@ -52,17 +58,171 @@ own_style = style.context("default")
 need LaTeX, or a font that is not there."""
 
 
-def save(figures: Mapping[str, tuple[Figure, str]], folder: Path) -> list[Picture]:
+Figures = Mapping[str, tuple[Callable[[], Figure], str]]
+"""How figures are drawn, and their captions, by file name."""
+
+
+class Text(NamedTuple):
+    """A paragraph; words between backticks are code."""
+
+    text: str
+    kind: str = ""
+    """"small", or "warning"."""
+
+
+class Table(NamedTuple):
+    """Rows of text."""
+
+    rows: Sequence[Mapping[str, str]]
+    kind: str = ""
+    """"numbers" if the second column has numbers, or "turned" for a column per row."""
+
+
+class Drawn(NamedTuple):
+    """A figure of the page, in its place among the texts."""
+
+    file: str
+
+
+class View(NamedTuple):
+    """A magnet in three dimensions."""
+
+    view: Callable[[], Markup]
+    points: str
+    """What its colours are."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Texts, tables and figures of a page in their order."""
+
+    parts: Sequence[str | Text | Table | Drawn | View | Callable[[], Markup]]
+    """A plain string is a paragraph; a function returns HTML that only the page has."""
+    title: str = ""
+    """What stands above them; empty if nothing does."""
+    folded: bool | None = None
+    """Whether the section is folded until it is clicked on; None if it cannot be folded."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """All that a command says of its result: on its page and terminal, in files and notebooks."""
+
+    command: str
+    """The verb of halbach-fe."""
+    title: str
+    """Title of the page, after the study's name."""
+    study: Study
+    answer: Answer
+    summary: Mapping[str, object]
+    """What the option --json prints, and the file .json holds."""
+    sections: Sequence[Section]
+    tables: Mapping[str, Sequence[Mapping[str, str]]] = field(default_factory=dict)
+    """What terminal and notebooks show, by title. The first table is in page.json too."""
+    rows: Sequence[Mapping[str, str]] = ()
+    """The table of page.json, if it is another one."""
+    figures: Figures = field(default_factory=dict)
+    """How each figure is drawn, and its caption, by file name. Of those that no section has, the
+    first of all stands below the answer, and the others after all sections."""
+    shown: tuple[str, ...] = ()
+    """Figures that a notebook shows in place of tables."""
+    files: Mapping[str, Callable[[Path], object] | None] = field(default_factory=dict)
+    """How each further file is written, by name; None if the one before it is written with it."""
+    new_study: tuple[str, Study, str] | None = None
+    """File of a changed study, the study, and the note that says in it what was changed."""
+    stored: bool = True
+    """Whether the summary is a file, too."""
+    stem: str = ""
+    """Name of .html and .json; that of the command if it is empty."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Entries of the table of provenance by name, beside the files that were read."""
+
+    @property
+    def name(self) -> str:
+        """Name of .html and .json."""
+        return self.stem or self.command.replace("-", "_")
+
+    @property
+    def beside(self) -> list[str]:
+        """Names of the files beside the page and its figures."""
+        study = [] if self.new_study is None else [self.new_study[0]]
+        return [*study, *self.files, *([f"{self.name}.json"] if self.stored else [])]
+
+    @property
+    def unplaced(self) -> list[str]:
+        """Figures that no section has."""
+        placed = {part.file for section in self.sections for part in section.parts
+                  if isinstance(part, Drawn)}
+        return [name for name in self.figures if name not in placed]
+
+
+@singledispatch
+def page_of(result: object) -> Page:
+    """Return the page of a result; each module of this room registers that of its own.
+
+    Raises
+    ------
+    TypeError
+        If there is no page for such an object.
+    """
+    raise TypeError(must_be(
+        "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
+        f"a {type(result).__name__}"))
+
+
+def csv_file(
+    columns: Mapping[str, Iterable[object]], attributes: Mapping[str, str]
+) -> Callable[[Path], None]:
+    """Return how a table is written, for `Page.files`; ``attributes`` are comments at its top."""
+    def write(path: Path) -> None:
+        with atomic(path) as temporary:
+            write_csv(columns, attributes, temporary)
+
+    return write
+
+
+@own_style
+def write_files(page: Page, folder: Path, text: str | None = None) -> Path:
+    """Write all files of a page into a folder, and return the path of the page itself.
+
+    ``text`` is that of the study's file, if there is one: a changed study keeps its comments.
+    """
+    for name, write in page.files.items():
+        if write is not None:
+            write(folder / name)
+    if page.new_study is not None:
+        name, study, note = page.new_study
+        write_edited(folder / name, study_text(page.study) if text is None else text,
+                     [(study, note)])
+    if page.stored:
+        write_text(folder / f"{page.name}.json",
+                   json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
+    pictures = save(page.figures, folder)
+    path = folder / f"{page.name}.html"
+    write_page(path, "page.html.j2", pictures, page.study, page.provenance, answer=page.answer,
+               rows=page.rows or next(iter(page.tables.values()), ()), page=page,
+               drawn={picture.file: picture for picture in pictures})
+    return path
+
+
+def linearized(study: Study) -> list[str]:
+    """Return the sentence about a nonlinear iron, if there is one."""
+    return (["The iron is linearized about the nominal magnet."] if is_nonlinear(study) else [])
+
+
+def save(
+    figures: Mapping[str, tuple[Figure | Callable[[], Figure], str]], folder: Path
+) -> list[Picture]:
     """Write figures as PNG files into a folder, and return them for a page.
 
     Parameters
     ----------
     figures : mapping
-        Figure and caption by file name.
+        Figure, or how it is drawn, and caption, by file name.
     """
     pictures = []
     for name, (figure, caption) in figures.items():
-        png = png_of(figure)
+        png = png_of(figure() if callable(figure) else figure)
         with atomic(folder / name) as temporary:
             temporary.write_bytes(png)
         pictures.append(Picture(base64.b64encode(png).decode(), caption, name))
@@ -160,9 +320,16 @@ def _templates() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.globals |= {"is_nonlinear": is_nonlinear, "faults_of": faults_in_words}
-    environment.filters["units_kept"] = units_kept
+    environment.globals |= {"faults_of": faults_in_words}
+    environment.filters |= {"units_kept": units_kept, "with_code": _with_code}
+    environment.tests |= {kind.__name__.lower(): lambda part, kind=kind: isinstance(part, kind)
+                          for kind in (Text, Table, Drawn, View)}
     return environment
+
+
+def _with_code(text: str) -> str:
+    """Return a text as HTML in which words between backticks are code."""
+    return re.sub("`(.*?)`", r"<code>\1</code>", html.escape(text))
 
 
 def units_kept(text: str) -> str:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +12,6 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import write_text
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.instrument_terms import prior_sd
@@ -24,13 +20,16 @@ from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
+    Page,
+    Section,
+    Table,
+    Text,
+    csv_file,
     draw_cross_section,
     figure_of,
     label_logarithmic,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    page_of,
 )
 from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import Study, is_nonlinear
@@ -151,38 +150,54 @@ def _of_the_instrument(study: Study) -> str:
         "all readings share, is not in them, and leaves more of the blocks' common strength.")
 
 
-@own_style
-def write_plan(magnet: Magnet, plan: MeasurementPlan, folder: Path) -> None:
-    """Write plan.csv, plan.json, plan.html and its figures."""
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["order", "x_m", "y_m", "z_m", "information_nats"])
-    writer.writerows([number, *point, gain] for number, (point, gain) in enumerate(
-        zip(plan.points.tolist(), plan.gain.tolist(), strict=True), start=1))
-    write_text(folder / "plan.csv", table.getvalue())
-    summary = plan_summary(plan)
-    write_text(folder / "plan.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    pictures = save({
-        "plan_positions.png": (
-            _positions_figure(magnet, plan), "Candidate positions, chosen positions coloured by "
-            "the order of choice, and the study's own positions as rings"),
-        "plan_information.png": (
-            _pattern_figure(plan), "Standard deviation of a pattern of blocks in per cent of the "
-            "prior's, in the geometric mean over all patterns, against the number of positions, "
-            "for the plan and for evenly spread positions of the study")
-        if plan.deviation is None else (
-            _deviation_figure(plan), "Standard deviation of the deviation of |B| in the study's "
-            "region against the number of positions, for the plan and for evenly spread positions "
-            "of the study"),
-        "plan_blocks.png": (
-            _block_sd_figure(magnet, plan), "Standard deviation of a block's magnetization in per "
-            "cent of the prior's, by slot" + (
-                "" if _only_orders(plan) else ", for the plan and for equally many positions of "
-                "the study")),
-    }, folder)
-    write_page(folder / "plan.html", "plan.html.j2", pictures, study=magnet.study, plan=plan,
-               summary=summary, answer=answer(plan), rows=plan_table(plan),
-               chosen=chosen_table(plan))
+@page_of.register
+def page(plan: MeasurementPlan) -> Page:
+    """Return the page of the positions to measure."""
+    magnet, summary, rows = plan.magnet, plan_summary(plan), plan_table(plan)
+    chosen, beside, count = chosen_table(plan), "plan" in rows[0], len(plan.parameters)
+    what = ("the largest expected information about the "
+            f"{count} components of the magnetizations" if plan.deviation is None else
+            f"the largest fall of the sd of the deviation of |B| in {plan.deviation.region.text}")
+    by_patterns = ("" if plan.deviation is not None else " The positions are chosen by the sd of "
+                   "the patterns; that of a block is what you will know of each.")
+    title = ("The plan beside the positions of the study (* with equally many positions)"
+             if beside else "What the readings leave unknown")
+    return Page("plan", "where to measure", magnet.study, answer(plan), summary, [
+        Section([
+            Table(rows, "numbers"),
+            Text(f"{'* with equally many positions. ' * beside}Sd is the standard deviation after "
+                 "the readings. A pattern is a combination of blocks that deviate together; of "
+                 f"{count} components there are as many independent patterns, and readings tell "
+                 f"much of some and little of others.{by_patterns}", "small"),
+            Text(f"Chosen one after another from {len(plan.candidates)} candidates, for {what}. "
+                 f"The prior sd of a component is {1e-3 * _rms(plan.prior_sd):.3g} kA/m, that with "
+                 f"the plan {1e-3 * _rms(plan.planned_sd):.3g} kA/m (rms).", "small")]),
+        Section([
+            "In this order: if you stop early, what is measured tells most. plan.csv has them in "
+            "m, in the axes of the study.", Table(chosen, "numbers")],
+            "The positions to measure", folded=len(chosen) > 30)],
+        {title: rows},
+        figures={
+            "plan_positions.png": (
+                partial(_positions_figure, magnet, plan), "Candidate positions, chosen positions "
+                "coloured by the order of choice, and the study's own positions as rings"),
+            "plan_information.png": (
+                partial(_pattern_figure, plan), "Standard deviation of a pattern of blocks in per "
+                "cent of the prior's, in the geometric mean over all patterns, against the number "
+                "of positions, for the plan and for evenly spread positions of the study")
+            if plan.deviation is None else (
+                partial(_deviation_figure, plan), "Standard deviation of the deviation of |B| in "
+                "the study's region against the number of positions, for the plan and for evenly "
+                "spread positions of the study"),
+            "plan_blocks.png": (
+                partial(_block_sd_figure, magnet, plan), "Standard deviation of a block's "
+                "magnetization in per cent of the prior's, by slot" + (
+                    "" if _only_orders(plan) else ", for the plan and for equally many positions "
+                    "of the study"))},
+        files={"plan.csv": csv_file({
+            "order": range(1, len(plan.points) + 1),
+            **{f"{axis}_m": plan.points[:, number] for number, axis in enumerate("xyz")},
+            "information_nats": plan.gain}, {})})
 
 
 def chosen_table(plan: MeasurementPlan) -> list[dict[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 from scipy import special
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, PUBLISHED, figure_of, own_style, save, write_page
+from halbach_fe.report.page import MEASURED, PUBLISHED, Page, Section, Table, Text, figure_of
 from halbach_fe.report.words import counted, fraction, p_value, with_error
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
@@ -56,7 +55,7 @@ def _tested(prior: MeasuredPrior) -> bool:
     return any(not np.isnan(samples.p).all() for samples in prior.types)
 
 
-def prior_summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
+def _summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     """Return the content of prior.json.
 
     Deviations are in percent along the nominal magnetization and in degrees across it.
@@ -173,9 +172,56 @@ def answer(prior: MeasuredPrior) -> Answer:
         (prior.placed or not odd) and not prior.doubts)
 
 
-@own_style
-def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
-    """Write prior.h5, prior.json, prior.html and its figure."""
+def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
+    """Return the page of what measured blocks say about a magnet."""
+    summary, parts, rows = _summary(magnet, prior), parts_table(magnet, prior), type_table(prior)
+    common, mounting = magnet.study.prior.common_mode_sd, magnet.study.prior.mounting_sd_deg
+    calibration = (
+        f"All blocks share a calibration error of {100 * common:.3g} % (sd)." if common > 0 else
+        "The study has no `prior.common_mode_sd`: the calibration of the coil is assumed to be "
+        "exact.")
+    turned = (
+        f"Each block may be turned by {mounting:.3g}° (sd) about each axis when mounted."
+        if mounting > 0 else "The study has no `prior.mounting_sd_deg`: blocks are assumed to be "
+        "mounted without angular errors.")
+    types = ("A type is what the table of free blocks of the study calls so; a block that it gives "
+             "none is a type by itself." if _of_table(magnet) else
+             "A type is a kind of block that fits the slots of [prior.types] of the study; without "
+             "it, every slot number is a type.")
+    tested = ("" if not _tested(prior) else " p is the p-value of the Anderson-Darling test for "
+              "normality, after Holm's correction; – means that there are too few blocks for the "
+              "test.")
+    figure = {"prior_qq.png": (
+        partial(_standardized_deviations_figure, prior), "Quantiles of the standardized deviations "
+        "of all blocks from the mean of their type against normal quantiles. The dashed lines are "
+        "the 95 % band of each quantile for normally distributed samples of the same sizes")
+    } if any(len(samples.deviations) > 2 for samples in prior.types) else {"prior_blocks.png": (
+        partial(_deviations_figure, prior), "Deviation of each block from the study's "
+        "magnetization: along it, and across it")}
+    sizes = [1e-3 * float(np.sqrt(np.mean(values**2)))
+             for values in (prior.gaussian.mean - prior.nominal, prior.gaussian.sd)]
+    return Page("prior", "prior from measured blocks", magnet.study, answer(prior), summary, [
+        Section([f"{calibration} {turned}"]),
+        Section([
+            "A block differs from the study in the length of its magnetization and in its "
+            "direction, by an angle in the plane of its ring"
+            f"{' and one towards z' * (magnet.dimension == 3)}. An angle of 1° moves the tip of "
+            "the vector by 1.75 % of its length. Together is the length of the difference of the "
+            "two vectors: the root of the sum of the squares.",
+            Table(parts, "numbers"),
+            Text("In each component of the magnetization, deviation and standard deviation are "
+                 "{:.3g}\u00a0kA/m and {:.3g}\u00a0kA/m (rms over all components).".format(*sizes),
+                 "small")], "How the per cent add up"),
+        Section([
+            f"{types} Mean ± standard deviation relative to the study's nominal magnetization: "
+            f"along it, across it in the plane of the ring, and along z.{tested}",
+            Table(rows, "numbers")], "By type")],
+        {"Measured blocks relative to the nominal, by type": rows}, figures=figure,
+        files={"prior.h5": partial(_write_prior, magnet, prior)})
+
+
+def _write_prior(magnet: Magnet, prior: MeasuredPrior, path: Path) -> None:
+    """Write prior.h5."""
     data = xr.Dataset(
         {name: ("parameter", values, {"units": "A/m"}) for name, values in (
             ("nominal", prior.nominal), ("prior_mean", prior.gaussian.mean),
@@ -184,21 +230,7 @@ def write_prior(magnet: Magnet, prior: MeasuredPrior, folder: Path) -> None:
         attrs={"study": magnet.study.model_dump_json()})
     data["prior_covariance"] = (("parameter", "parameter_2"), prior.gaussian.covariance,
                                 {"units": "A2/m2"})
-    write_hdf5(data, folder / "prior.h5")
-    summary = prior_summary(magnet, prior)
-    write_text(folder / "prior.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    testable = any(len(samples.deviations) > 2 for samples in prior.types)
-    pictures = save({"prior_qq.png": (
-        _standardized_deviations_figure(prior), "Quantiles of the standardized deviations of all "
-        "blocks from the mean of their type against normal quantiles. The dashed lines are the "
-        "95 % band of each quantile for normally distributed samples of the same "
-        "sizes")} if testable else {
-        "prior_blocks.png": (
-            _deviations_figure(prior), "Deviation of each block from the study's magnetization: "
-            "along it, and across it")}, folder)
-    write_page(folder / "prior.html", "prior.html.j2", pictures, study=magnet.study, prior=prior,
-               summary=summary, rows=type_table(prior), tested=_tested(prior), answer=answer(prior),
-               parts=parts_table(magnet, prior), types_of_table=_of_table(magnet))
+    write_hdf5(data, path)
 
 
 def _of_table(magnet: Magnet) -> bool:

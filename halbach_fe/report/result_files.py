@@ -1,72 +1,55 @@
-"""The files of a result: its tables, and its HTML page with all figures."""
+"""What is made of a result: its files and its page, and what a notebook shows."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import html
+import io
+from collections.abc import Mapping, Sequence
 from functools import singledispatch
-from operator import attrgetter
 from pathlib import Path
 
-from halbach_fe.api import HomogeneityResult, MultipoleTables
+from matplotlib.figure import Figure
+
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.errors import must_be
 from halbach_fe.core.result_folder import result_folder
-from halbach_fe.core.versions import version
-from halbach_fe.design.assembly import Assembly
-from halbach_fe.design.demagnetization import DemagnetizationMap
-from halbach_fe.design.forces import Forces
-from halbach_fe.design.measurement_plan import MeasurementPlan
-from halbach_fe.design.ring_design import Designed
-from halbach_fe.design.shim_tray import FilledTray
-from halbach_fe.design.shimming import Shim
-from halbach_fe.design.sorting import SortedBlocks
-from halbach_fe.design.tolerance import HomogeneityTolerance, Tolerance
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import write_study, write_summary
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import write_inference
-from halbach_fe.report.assembly import write_assembly
-from halbach_fe.report.campaign import write_campaign_page
-from halbach_fe.report.demagnetization import write_demagnetization
-from halbach_fe.report.diagnosis import write_diagnosis_report
-from halbach_fe.report.forces import write_forces
-from halbach_fe.report.homogeneity import write_homogeneity
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.report import (
+    assembly,
+    campaign,
+    demagnetization,
+    forces,
+    homogeneity,
+    multipoles,
+    plan,
+    ring_design,
+    shim_tray,
+    shimming,
+    solution,
+    sorting,
+    tolerance,
+    verification,
+)
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.diagnosis import change_table, found_table, write_diagnosis_report
+from halbach_fe.report.diagnosis_answer import answer as answer_of_diagnosis
 from halbach_fe.report.inference import write_inference_report
-from halbach_fe.report.multipoles import write_multipoles
-from halbach_fe.report.plan import write_plan
-from halbach_fe.report.ring_design import write_design
-from halbach_fe.report.shim_tray import write_shim_tray
-from halbach_fe.report.shimming import write_shim
-from halbach_fe.report.solution import write_solution_report
-from halbach_fe.report.sorting import write_sorted
-from halbach_fe.report.tolerance import write_tolerance
-from halbach_fe.report.verification import write_verification
-from halbach_fe.response.discretization_error import Verification
-from halbach_fe.response.solution import Solution, write_solution
+from halbach_fe.report.page import geometry_figure, own_style, page_of, write_files
+from halbach_fe.report.prediction import prediction_profile_figure
 from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.model import Study
-from halbach_fe.synthetic.simulate import SimulatedCampaign, write_campaign
 
-OWNERS: dict[type, tuple[str, str]] = {
-    Solution: ("solve", "magnet.study"), InferenceResult: ("infer", "study"),
-    Diagnosis: ("diagnose", "corrected_study"), Verification: ("verify", "magnet.study"),
-    MultipoleTables: ("multipoles", "magnet.study"),
-    HomogeneityResult: ("homogeneity", "magnet.study"), Forces: ("forces", "magnet.study"),
-    FilledTray: ("shim-tray", "magnet.study"), Designed: ("design", "study"),
-    Assembly: ("cad", "magnet.study"),
-    MeasurementPlan: ("plan", "magnet.study"), Shim: ("shim", "result.study"),
-    SortedBlocks: ("sort", "study"), Tolerance: ("tolerance", "study"),
-    HomogeneityTolerance: ("tolerance", "study"),
-    DemagnetizationMap: ("demagnetization", "magnet.study"),
-    SimulatedCampaign: ("simulate-measurement", "study")}
-"""The command that writes each result too, and where the result has its study."""
+QUESTIONS = (assembly, campaign, demagnetization, forces, homogeneity, multipoles, plan,
+             ring_design, shim_tray, shimming, solution, sorting, tolerance, verification)
+"""Modules that register the page of their result, see `page_of`."""
 
-
-def provenance(getdp: str | None = None) -> dict[str, str]:
-    """Return the versions of the programs, which are shown at the end of a page."""
-    versions = {"halbach-fe": version("halbach-fe")}
-    return versions if getdp is None else versions | {"GetDP": getdp}
+DOTS_PER_INCH = 100
 
 
 @typed
@@ -104,124 +87,19 @@ Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
     >>> hf.write_report(solution, "field").name
     'report.html'
     """
-    owner = next((OWNERS[kind] for kind in type(result).__mro__ if kind in OWNERS), None)
-    if owner is None:
-        raise TypeError(must_be(
-            "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
-            f"a {type(result).__name__}"))
-    command, study = owner
-    with result_folder(Path(folder), f"halbach-fe {command}", attrgetter(study)(result).name):
-        return _write(result, folder)
-
-
-@singledispatch
-def _write(result: object, folder: str | Path) -> Path:
-    """Write the files of a result of any type; return the path of the page."""
-    raise TypeError(f"there is no report for a {type(result).__name__}")
-
-
-@_write.register
-def _(result: Solution, folder: str | Path) -> Path:
-    write_solution(result, Path(folder))
-    write_solution_report(result, Path(folder), provenance(result.getdp))
-    return Path(folder) / "report.html"
-
-
-@_write.register
-def _(result: InferenceResult, folder: str | Path) -> Path:
-    write_inference(result, Path(folder))
-    write_inference_report(result, Path(folder), provenance=provenance())
-    return Path(folder) / "report.html"
-
-
-@_write.register
-def _(result: Diagnosis, folder: str | Path) -> Path:
-    study = result.corrected_study
-    text = study_text(study)
-    return write_diagnosis(result, (), study, text, Path(folder))
-
-
-@_write.register
-def _(result: Verification, folder: str | Path) -> Path:
-    write_verification(result.magnet, result, Path(folder), provenance())
-    return Path(folder) / "verification.html"
-
-
-@_write.register
-def _(result: MultipoleTables, folder: str | Path) -> Path:
-    write_multipoles(result.magnet.study, result.tables, None, Path(folder), provenance(),
-                     result.disagreement, result.left_out)
-    return Path(folder) / "multipoles.html"
-
-
-@_write.register
-def _(result: HomogeneityResult, folder: str | Path) -> Path:
-    write_homogeneity(result, Path(folder), provenance())
-    return Path(folder) / "homogeneity.html"
-
-
-@_write.register
-def _(result: Forces, folder: str | Path) -> Path:
-    write_forces(result, Path(folder), provenance())
-    return Path(folder) / "forces.html"
-
-
-@_write.register
-def _(result: FilledTray, folder: str | Path) -> Path:
-    write_shim_tray(result, Path(folder), provenance())
-    return Path(folder) / "shim_tray.html"
-
-
-@_write.register
-def _(result: Assembly, folder: str | Path) -> Path:
-    write_assembly(result, Path(folder), provenance())
-    return Path(folder) / "assembly.html"
-
-
-@_write.register
-def _(result: Designed, folder: str | Path) -> Path:
-    text = study_text(result.study)
-    write_design(result, text, Path(folder), provenance())
-    return Path(folder) / "design.html"
-
-
-@_write.register
-def _(result: MeasurementPlan, folder: str | Path) -> Path:
-    write_plan(result.magnet, result, Path(folder))
-    return Path(folder) / "plan.html"
-
-
-@_write.register
-def _(result: Shim, folder: str | Path) -> Path:
-    text = study_text(result.study)
-    write_shim(result, result.result, text, Path(folder))
-    return Path(folder) / "shim.html"
-
-
-@_write.register
-def _(result: SortedBlocks, folder: str | Path) -> Path:
-    write_sorted(result, None, Path(folder))
-    return Path(folder) / "sort.html"
-
-
-@_write.register
-def _(result: Tolerance | HomogeneityTolerance, folder: str | Path) -> Path:
-    write_tolerance(result, Path(folder))
-    return Path(folder) / "tolerance.html"
-
-
-@_write.register
-def _(result: DemagnetizationMap, folder: str | Path) -> Path:
-    write_demagnetization(result, Path(folder))
-    return Path(folder) / "demagnetization.html"
-
-
-@_write.register
-def _(result: SimulatedCampaign, folder: str | Path) -> Path:
-    written = write_campaign(result, Path(folder))
-    write_campaign_page(result.study, result.readings, result.held_out, result.blocks,
-                        Path(folder), [path.name for path in written])
-    return Path(folder) / "campaign.html"
+    folder = Path(folder)
+    if isinstance(result, InferenceResult):
+        with result_folder(folder, "halbach-fe infer", result.study.name):
+            write_inference(result, folder)
+            write_inference_report(result, folder)
+        return folder / "report.html"
+    if isinstance(result, Diagnosis):
+        study = result.corrected_study
+        with result_folder(folder, "halbach-fe diagnose", study.name):
+            return write_diagnosis(result, (), study, study_text(study), folder)
+    page = page_of(result)
+    with result_folder(folder, f"halbach-fe {page.command}", page.study.name):
+        return write_files(page, folder)
 
 
 def write_diagnosis(
@@ -254,3 +132,66 @@ def write_diagnosis(
     write_diagnosis_report(diagnosis, separations, folder, assumptions)
     write_study(text, study, diagnosis, folder, origin)
     return folder / "diagnosis.html"
+
+
+@own_style
+def html_of(result: object) -> str:
+    """Return what a notebook shows of a result, as HTML that needs no other file: the answer, and
+    the main figure or tables.
+
+    Raises
+    ------
+    TypeError
+        If the result is of a type without a page.
+    """
+    return _html_of(result)
+
+
+@singledispatch
+def _html_of(result: object) -> str:
+    page = page_of(result)
+    return words(page.answer) + "".join(
+        [picture(page.figures[name][0](), page.figures[name][1]) for name in page.shown]
+        or map(table, page.tables.values()))
+
+
+@_html_of.register
+def _(magnet: Magnet) -> str:
+    points = points_from(magnet.study.observation.positions)
+    return picture(geometry_figure(magnet, points), f"The magnet {magnet.name}, with the "
+                   "magnetization of its blocks and the positions of its study")
+
+
+@_html_of.register
+def _(result: InferenceResult) -> str:
+    return picture(prediction_profile_figure(result), "Readings, and what the model predicts "
+                   "before and after the update")
+
+
+@_html_of.register
+def _(diagnosis: Diagnosis) -> str:
+    return (words(answer_of_diagnosis(diagnosis)) + table(found_table(diagnosis))
+            + table(change_table(diagnosis)))
+
+
+def words(answer: Answer) -> str:
+    """Return an answer as a paragraph."""
+    return f"<p>{html.escape(' '.join(answer.sentences))}</p>"
+
+
+def picture(figure: Figure, text: str) -> str:
+    """Return a figure as an HTML image element with an alternative text."""
+    raw = io.BytesIO()
+    figure.savefig(raw, format="png", dpi=DOTS_PER_INCH)
+    data = base64.b64encode(raw.getvalue()).decode("ascii")
+    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
+
+
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return rows of text as an HTML table; an empty text if there are no rows."""
+    if not rows:
+        return ""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(value)}</td>" for value in row.values())
+                   + "</tr>" for row in rows)
+    return f"<table><tr>{head}</tr>{body}</table>"

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.ring_design import Designed, RingDesign
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, slices_figure
 from halbach_fe.report.page import (
@@ -22,14 +19,17 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SMALL,
+    Drawn,
+    Page,
+    Section,
+    Table,
+    Text,
+    csv_file,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    page_of,
 )
 from halbach_fe.report.words import PERCENT_FROM, counted, in_a_row, ppm, relative
-from halbach_fe.study.edit_file import write_edited
 
 STUDY_FILE = "study.designed.toml"
 
@@ -93,7 +93,7 @@ def _count(design: RingDesign) -> str:
     return f"{rings} rings"
 
 
-def design_rows(found: Designed) -> list[dict[str, str]]:
+def _design_rows(found: Designed) -> list[dict[str, str]]:
     """Return a row of text for every design, by its field."""
     return [{
         "design": f"best: {smallest(found)}" if one is found.best else "",
@@ -102,7 +102,7 @@ def design_rows(found: Designed) -> list[dict[str, str]]:
         "blocks": str(one.blocks), "mass": f"{one.mass_kg:.4g} kg"} for one in found.front]
 
 
-def ring_rows(found: Designed) -> list[dict[str, str]]:
+def _ring_rows(found: Designed) -> list[dict[str, str]]:
     """Return a row of text for every place of the best design, from the middle upwards."""
     best = found.best
     rows = []
@@ -117,7 +117,7 @@ def ring_rows(found: Designed) -> list[dict[str, str]]:
     return rows
 
 
-def design_summary(found: Designed) -> dict[str, object]:
+def _summary(found: Designed) -> dict[str, object]:
     """Return the content of design.json."""
     def plain(one: RingDesign) -> dict[str, object]:
         values = {"mean_T": one.mean_T, "rms_ppm": one.rms_ppm,
@@ -131,7 +131,7 @@ def design_summary(found: Designed) -> dict[str, object]:
             "best": plain(found.best), "designs": [plain(one) for one in found.front]}
 
 
-def columns(found: Designed) -> dict[str, Iterable[object]]:
+def _columns(found: Designed) -> dict[str, Iterable[object]]:
     """Return the columns of rings.csv, with a row for every ring."""
     rings = found.study.array.ring
     return {"ring": range(1, len(rings) + 1),
@@ -192,28 +192,36 @@ def side_figure(found: Designed) -> Figure:
     return figure
 
 
-@own_style
-def write_design(
-    found: Designed, text: str, folder: Path, provenance: Mapping[str, str]
-) -> None:
-    """Write study.designed.toml, rings.csv, design.json, design.html and its figures.
-
-    ``text`` is that of the study file.
-    """
-    write_edited(folder / STUDY_FILE, text, [(found.study, "found by halbach-fe design")])
-    write_text(folder / "design.json",
-               json.dumps(design_summary(found), indent=1, allow_nan=False) + "\n")
-    with atomic(folder / "rings.csv") as temporary:
-        write_csv(columns(found), {"study": found.study.name}, temporary)
-    pictures = save({
-        "rings.png": (side_figure(found), f"The rings of the best design ({smallest(found)}) from "
-                      "the side, with their numbers of blocks, and the region whose field is to be "
-                      "homogeneous"),
-        "slices.png": (slices_figure(found.slices, found.best.mean_T),
-                       "Deviation of |B| from its mean, in planes through the region's centre"),
-        "front.png": (front_figure(found), "What more field costs: designs of larger fields")},
-        folder)
-    write_page(folder / "design.html", "design.html.j2", pictures, study=found.study,
-               provenance=provenance, answer=answer(found), rows=design_rows(found),
-               rings=ring_rows(found), sizes=SIZES, smallest=smallest(found),
-               settings=found.study.design)
+@page_of.register
+def page(found: Designed) -> Page:
+    """Return the page of a search for rings, with the study of the best design."""
+    settings, best, rows, rings = (
+        found.study.design, smallest(found), _design_rows(found), _ring_rows(found))
+    between = ("" if settings is None or not settings.between_radii else
+               " Only the best design has radii between those that the study lists.")
+    return Page("design", "design", found.study, answer(found), _summary(found), [
+        Section([Text("The designed rings take the place of the array of the study.", "small"),
+                 Drawn("slices.png")]),
+        Section([
+            Drawn("front.png"), Table(rows),
+            f"{SIZES} The search itself works for the component along the main field, which "
+            "differs from |B| by the components across it, to second order. Each row has the "
+            f"{best} that the search found for its field, and the best design has it of all; a "
+            f"local search does not prove that there is no better one.{between}"],
+            "All designs, by their field"),
+        Section([Table(rings), "Radii are those of the blocks' middles. Places at z and \u2212z "
+                 "hold equal rings."], f"The rings of the best design ({best})")],
+        {f"Designs, by their field in {found.region.text}": rows,
+         "The rings of the best design": rings},
+        figures={
+            "rings.png": (
+                partial(side_figure, found), f"The rings of the best design ({best}) from the "
+                "side, with their numbers of blocks, and the region whose field is to be "
+                "homogeneous"),
+            "slices.png": (
+                partial(slices_figure, found.slices, found.best.mean_T),
+                "Deviation of |B| from its mean, in planes through the region's centre"),
+            "front.png": (
+                partial(front_figure, found), "What more field costs: designs of larger fields")},
+        files={"rings.csv": csv_file(_columns(found), {"study": found.study.name})},
+        new_study=(STUDY_FILE, found.study, "found by halbach-fe design"))

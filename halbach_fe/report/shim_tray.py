@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.shim_tray import FilledTray
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
-from halbach_fe.report.page import PUBLISHED, figure_of, own_style, save, write_page
+from halbach_fe.report.page import (
+    PUBLISHED,
+    Drawn,
+    Page,
+    Section,
+    Table,
+    csv_file,
+    figure_of,
+    page_of,
+)
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.study.shim_tray import ShimTray
@@ -83,7 +89,7 @@ def _ranges(tray: ShimTray | None) -> str:
     return f"Yes, as far as the update is right: ranges contain what it leaves open, and {shims}."
 
 
-def rows(found: FilledTray) -> list[dict[str, str]]:
+def _rows(found: FilledTray) -> list[dict[str, str]]:
     """Return a row of text for every magnet."""
     return [{
         "place": str(one.place),
@@ -93,7 +99,7 @@ def rows(found: FilledTray) -> list[dict[str, str]]:
         "from the x axis": f"{one.direction_deg:.1f}°"} for one in found.filled]
 
 
-def homogeneity_rows(found: FilledTray) -> list[dict[str, str]]:
+def _field_rows(found: FilledTray) -> list[dict[str, str]]:
     """Return a row of text for the field before and after."""
     def row(name: str, known: Homogeneity) -> dict[str, str]:
         low, middle, high = map(ppm, known.rms_range_ppm)
@@ -105,7 +111,7 @@ def homogeneity_rows(found: FilledTray) -> list[dict[str, str]]:
     return [row("empty", found.before), row("filled", found.after)]
 
 
-def shim_tray_summary(found: FilledTray) -> dict[str, object]:
+def _summary(found: FilledTray) -> dict[str, object]:
     """Return the content of shim_tray.json."""
     return {"study": found.magnet.name, "region": asdict(found.model.region),
             "places": len(found.places_m), "magnets": len(found.filled), "left": found.left,
@@ -115,7 +121,7 @@ def shim_tray_summary(found: FilledTray) -> dict[str, object]:
                         "direction_deg": one.direction_deg} for one in found.filled]}
 
 
-def columns(found: FilledTray) -> dict[str, Iterable[object]]:
+def _columns(found: FilledTray) -> dict[str, Iterable[object]]:
     """Return the columns of shim_tray.csv, with a row for every place, also of empty ones."""
     there = {one.place: one for one in found.filled}
     every = [there.get(number) for number in range(1, len(found.places_m) + 1)]
@@ -126,7 +132,7 @@ def columns(found: FilledTray) -> dict[str, Iterable[object]]:
                for key in ("from_radius_deg", "direction_deg")}}
 
 
-def tray_figure(found: FilledTray) -> Figure:
+def _tray_figure(found: FilledTray) -> Figure:
     """Draw the tray unrolled, seen from outside.
 
     Arrows are polarizations: upwards ones point away from the axis, those to the right towards
@@ -159,26 +165,36 @@ def tray_figure(found: FilledTray) -> Figure:
     return figure
 
 
-@own_style
-def write_shim_tray(found: FilledTray, folder: Path, provenance: Mapping[str, str]) -> None:
-    """Write shim_tray.csv, shim_tray.json, shim_tray.html and its figures."""
-    write_text(folder / "shim_tray.json",
-               json.dumps(shim_tray_summary(found), indent=1, allow_nan=False) + "\n")
-    with atomic(folder / "shim_tray.csv") as temporary:
-        write_csv(columns(found), {"study": found.magnet.name}, temporary)
+@page_of.register
+def page(found: FilledTray) -> Page:
+    """Return the page of a tray, with the table to fill it from."""
+    tray = found.magnet.study.shim_tray
+    assert tray is not None
     before, after = (model.slices(known.mean) for model, known in (
         (found.model, found.before_known), (found.shimmed, found.after_known)))
     text = ("Deviation of |B| from its mean over the region (dashed), in planes through its "
             "centre, with {}")
     largest = largest_shown(before, found.before.mean_T)  # the same colours in both
-    pictures = save({
-        "shim_tray.png": (tray_figure(found), "The tray unrolled, seen from outside. Arrows are "
-                          "polarizations: up is away from the axis, right is counter-clockwise"),
-        "before.png": (slices_figure(before, found.before.mean_T, largest),
+    rows, fields = _rows(found), _field_rows(found)
+    listed = ("The tray" if len(rows) <= LISTED else
+              f"The first {LISTED} of {len(rows)} magnets of shim_tray.csv")
+    figures = {
+        "shim_tray.png": (
+            partial(_tray_figure, found), "The tray unrolled, seen from outside. Arrows are "
+            "polarizations: up is away from the axis, right is counter-clockwise"),
+        "before.png": (partial(slices_figure, before, found.before.mean_T, largest),
                        text.format("an empty tray")),
-        "after.png": (slices_figure(after, found.after.mean_T, largest),
-                      text.format("the filled tray"))},
-        folder)
-    write_page(folder / "shim_tray.html", "shim_tray.html.j2", pictures, study=found.magnet.study,
-               provenance=provenance, answer=answer(found), rows=rows(found),
-               fields=homogeneity_rows(found), tray=found.magnet.study.shim_tray)
+        "after.png": (partial(slices_figure, after, found.after.mean_T, largest),
+                      text.format("the filled tray"))}
+    return Page("shim-tray", "shim tray", found.magnet.study, answer(found), _summary(found), [
+        Section([Table(fields, "turned"), Drawn("before.png"), Drawn("after.png")]),
+        Section([
+            "Angles of a magnet's polarization are counter-clockwise as seen from +z: from the "
+            "radius of its place outwards, and from the x axis. Empty places are left out.",
+            Table(rows),
+            f"Ranges contain what the measurement leaves open, {100 * tray.strength_sd:g} % of "
+            f"each shim's strength, and {100 * tray.common_sd:g} % that all shims share, among it "
+            "what permeable blocks answer. The rms is the median of the magnets that are possible; "
+            "that of the mean field is smaller."], "What to put where")],
+        {f"The field in {found.model.region.text}": fields, listed: rows[:LISTED]}, rows, figures,
+        files={"shim_tray.csv": csv_file(_columns(found), {"study": found.magnet.name})})

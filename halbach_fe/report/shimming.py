@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -13,9 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import write_text
 from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
-from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
@@ -31,17 +28,19 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     SMALL,
+    Page,
+    Section,
+    Table,
+    Text,
     draw_cross_section,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    linearized,
+    page_of,
 )
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
 from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import plain, text_table
-from halbach_fe.study.edit_file import write_edited
 
 T = TypeVar("T")
 
@@ -54,12 +53,14 @@ MOST = 0.9
 LIKELY = 0.5
 """Probability below which the answer says that moves do not reach the limit."""
 
+STUDY_FILE = "study.shimmed.toml"
+
 DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change places in a cycle",
             "turn": "block that is turned in place", "replace": "block that is replaced"}
 """Names of the kinds of moves in the picture of all moves."""
 
 
-def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
+def _summary(shim: Shim) -> dict[str, object]:
     """Return the content of shim.json."""
     return {
         "study": shim.study.name, **_content(shim),
@@ -68,7 +69,9 @@ def shim_summary(shim: Shim, result: InferenceResult) -> dict[str, object]:
         "probability_within_limit": None if shim.within is None else {
             "before": shim.within[0], "after": shim.within[1]},
         "mounting_sd_deg": shim.study.prior.mounting_sd_deg,
-        "prior_conflict": result.prior_conflict, "prior_conflict_limit": result.conflict_limit,
+        "prior_conflict": shim.result.prior_conflict,
+        "prior_conflict_limit": shim.result.conflict_limit,
+        "study_file": STUDY_FILE if shim.shimmed_study else None,
     }
 
 
@@ -83,14 +86,9 @@ def _content(shim: Shim) -> dict[str, object]:
             "before": plain(shim.before, unit), "after": plain(shim.after, unit)}
 
 
-def move_title(shim: Shim, result: InferenceResult) -> str:
-    """Return the title of `move_table`, which does not ask for moves that the answer is against."""
-    return "Moves that would be made" if reason_against(shim, result) else "Moves"
-
-
-def reason_against(shim: Shim, result: InferenceResult) -> str:
+def _reason_against(shim: Shim) -> str:
     """Say why the moves should not be made as they are listed; empty if they should."""
-    if result.disagreement:
+    if shim.result.disagreement:
         return ("Do not make these moves yet: they follow from an update that disagrees with its "
                 "map. They are listed as what would be done if it were right.")
     if _gained(shim) < LITTLE:
@@ -131,7 +129,7 @@ def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
             "turn_deg": list(shim.mounts.turn_deg(placement.turn))}
 
 
-def move_table(shim: Shim) -> list[dict[str, str]]:
+def _move_table(shim: Shim) -> list[dict[str, str]]:
     """Return the rows of the table of moves, as text."""
     return [{"move": f"{number}: {step.move.kind}",
              "blocks": "; ".join(_placement_text(shim, placement)
@@ -141,13 +139,7 @@ def move_table(shim: Shim) -> list[dict[str, str]]:
             for number, step in enumerate(shim.steps, start=1)]
 
 
-def table_title(shim: Shim) -> str:
-    """Return the title of `value_table`."""
-    return ("Multipoles in units of 1e-4" if shim.fields is None else
-            f"Deviations of |B| in {shim.model.homogeneity.region.text}")
-
-
-def value_table(shim: Shim) -> list[dict[str, str]]:
+def _value_table(shim: Shim) -> list[dict[str, str]]:
     """Return the rows of the table of multipoles or fields before and after, as text."""
     if shim.fields is None:
         return text_table(**_compared(shim, shim.before, shim.after))
@@ -191,7 +183,7 @@ def _place_text(shim: Shim, number: int) -> str:
     return place_of(block)
 
 
-def answer(shim: Shim, result: InferenceResult) -> Answer:
+def answer(shim: Shim) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
     question = "Which blocks should be exchanged, turned or replaced?"
     before, after = (_size(shim, known.rms) for known in (shim.before, shim.after))
@@ -208,7 +200,7 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         moves = counted(len(shim.steps), "move")
         said = (f"{what} expected to fall from {before} to {after} {unit}, including the "
                 "uncertainty.")
-        if result.disagreement:
+        if shim.result.disagreement:
             said = ("No block yet: model and map disagree. If the model were right, with "
                     f"{moves} {said}")
         elif _gained(shim) < LITTLE:
@@ -229,29 +221,31 @@ def answer(shim: Shim, result: InferenceResult) -> Answer:
         if shim.steps and shim.within[1] < LIKELY:
             said += " These moves do not reach that limit."
     ended = f"The search ended because {STOPS[shim.stop]}."
-    if result.disagreement:
-        return Answer(question, said, f"No. Model and measurement disagree. {result.disagreement}",
+    if shim.result.disagreement:
+        return Answer(question, said,
+                      f"No. Model and measurement disagree. {shim.result.disagreement}",
                       "Find out what the study lacks before any block is moved.",
                       "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
     if shim.fields is None and lacks_main(shim.before):
         return of_no_main(question, said, "Not in these units", "shim STUDY --measurements MAP")
     make = ("Make the moves in their order, measure again, and update study.shimmed.toml."
             if shim.shimmed_study else "Make the moves in their order, and measure again.")
-    if result.reservation and shim.steps:
+    if shim.result.reservation and shim.steps:
         make = "Find out what it is, and update again, before any block is moved."
-    elif reason_against(shim, result):
+    elif _reason_against(shim):
         make = f"Leave the magnet as it is. If the gain is worth the work after all: {make}"
     mounted = "" if not shim.steps or shim.study.prior.mounting_sd_deg > 0 else (
         " That blocks are turned a little when they are mounted again is left out, as the study "
         "has no prior.mounting_sd_deg.")
     return Answer(
         question, said,
-        f"{result.reservation or 'Yes. Model and map agree.'} {ended}{mounted}", *(
+        f"{shim.result.reservation or 'Yes. Model and map agree.'} {ended}{mounted}", *(
             (make,
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {see} of the magnet as it is.",
-             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")), sound=not result.reservation)
+             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")),
+        sound=not shim.result.reservation)
 
 
 def _of_possible(shim: Shim) -> str:
@@ -311,36 +305,56 @@ def _unknown_part(shim: Shim) -> str:
             "blocks (--blocks) or a map at more places would tell more")
 
 
-@own_style
-def write_shim(shim: Shim, result: InferenceResult, text: str, folder: Path) -> None:
-    """Write shim.json, shim.html and its figures, and study.shimmed.toml.
+@page_of.register
+def page(shim: Shim) -> Page:
+    """Return the page of moves of blocks.
 
-    The latter is the text of the study file with the moves entered as exceptions. It is written
-    only if blocks are moved and a study can describe these moves.
+    It has the study with the moves entered as exceptions, if blocks are moved and a study can
+    describe these moves.
     """
-    summary = shim_summary(shim, result)
-    shimmed = shim.shimmed_study
-    note = f"shimmed: {len(shim.steps)} moves"
-    summary["study_file"] = "study.shimmed.toml" if shimmed else None
-    if shimmed:
-        write_edited(folder / "study.shimmed.toml", text, [(shimmed, note)])
-    write_text(folder / "shim.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    figures = {} if shim.fields is not None else {"shim_multipoles.png": (
-        multipole_figure(_compared(shim, shim.before, shim.after), shim.limit),
+    against = _reason_against(shim)
+    move_title = "Moves that would be made" if against else "Moves"
+    moves, rows = _move_table(shim), _value_table(shim)
+    multipoles = shim.fields is None
+    title = ("Multipoles in units of 1e-4" if multipoles else
+             f"Deviations of |B| in {shim.model.homogeneity.region.text}")
+    sections = [Section([_convention(shim), Table(rows, "numbers" if multipoles else "turned"),
+                         *linearized(shim.study)], title)]
+    figures = {} if not multipoles else {"shim_multipoles.png": (
+        partial(multipole_figure, _compared(shim, shim.before, shim.after), shim.limit),
         f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
         "and skew (right); bars are two standard deviations")}
     if shim.steps:
+        sections.insert(0, Section([*([Text(against, "warning")] if against else []),
+                                    _of_the_moves(shim), Table(moves)], move_title))
         figures |= {
             "shim_moves.png": (
-                _moves_figure(shim),
-                f"{move_title(shim, result)}, with their numbers in the table"),
+                partial(_moves_figure, shim), f"{move_title}, with their numbers in the table"),
             "shim_gain.png": (
-                _gain_figure(shim), f"Root mean square of {_values_text(shim)} after each move, "
-                "including the uncertainty")}
-    write_page(folder / "shim.html", "shim.html.j2", save(figures, folder), study=shim.study,
-               shim=shim, summary=summary, moves=move_table(shim), answer=answer(shim, result),
-               move_title=move_title(shim, result), against=reason_against(shim, result),
-               title=table_title(shim), text=_convention(shim), rows=value_table(shim))
+                partial(_gain_figure, shim), f"Root mean square of {_values_text(shim)} after each "
+                "move, including the uncertainty")}
+    return Page("shim", "how to shim it", shim.study, answer(shim), _summary(shim), sections,
+                {move_title: moves, title: rows}, rows, figures, new_study=(
+        None if shim.shimmed_study is None else
+        (STUDY_FILE, shim.shimmed_study, f"shimmed: {len(shim.steps)} moves")))
+
+
+def _of_the_moves(shim: Shim) -> str:
+    """Say in which order the moves are listed, and what their gain is."""
+    mounting = shim.study.prior.mounting_sd_deg
+    squares = ("the sum of all |c_n|²" if shim.fields is None else
+               "the mean square deviation of |B|")
+    return (
+        "The moves are listed in the order in which they were chosen; the gain is the expected "
+        f"decrease of {squares}, in units "
+        "of its own standard deviation (sd). The list ends before moves of less than 1; of those "
+        "with 1, one in six turns out to gain nothing, of those with 2, one in forty. A block is "
+        "first moved to its new slot in the orientation of that slot, then turned about its own "
+        "axes. " + (
+            f"Mounting a block again turns it by a random angle with an sd of {mounting:.3g}° "
+            "about each axis, which all uncertainties include." if mounting > 0 else
+            "The study has no `prior.mounting_sd_deg`: blocks are assumed to be mounted again "
+            "without angular errors."))
 
 
 def _values_text(shim: Shim) -> str:

@@ -23,11 +23,17 @@ def holder_name(plate: Plate) -> str:
     return f"holder_{plate.number:02d}"
 
 
-def write_solids(assembly: Assembly, folder: Path, progress: Progress) -> list[str]:
-    """Write blocks, plates and the whole magnet as STEP and STL files; return their names."""
+def solid_names(assembly: Assembly) -> list[str]:
+    """Return the names of the files of `write_solids`."""
+    stems = ["blocks", *map(holder_name, assembly.plates)]
+    whole = ["magnet.step"] if assembly.plates or assembly.magnet.iron else []
+    return [*(f"{stem}.{ending}" for stem in stems for ending in ("step", "stl")), *whole]
+
+
+def write_solids(assembly: Assembly, folder: Path, progress: Progress) -> None:
+    """Write blocks, plates and the whole magnet as STEP and STL files."""
     name, iron = assembly.magnet.name, assembly.magnet.iron
     total, done = len(assembly.kinds) + len(assembly.plates) + len(iron), 0
-    written: list[str] = []
 
     def made(part: str, body: Prism, openings: tuple[Prism, ...] = ()) -> tuple[Solid, Floats]:
         nonlocal done
@@ -39,7 +45,6 @@ def write_solids(assembly: Assembly, folder: Path, progress: Progress) -> list[s
     def write(stem: str, top: Solid | Group, triangles: Floats) -> None:
         write_text(folder / f"{stem}.step", step_text(top, UNIT))
         write_stl(triangles, f"{top.name}, unit mm", folder / f"{stem}.stl")
-        written.extend([f"{stem}.step", f"{stem}.stl"])
 
     parts = [made(f"{kind.shape}, magnetized {kind.magnetized}", kind.solid)
              for kind in assembly.kinds]
@@ -61,9 +66,7 @@ def write_solids(assembly: Assembly, folder: Path, progress: Progress) -> list[s
     if others:
         write_text(folder / "magnet.step",
                    step_text(Group(name, [*rings, *others]), UNIT))
-        written.append("magnet.step")
     progress(total, total)
-    return written
 
 
 def _by_ring(assembly: Assembly, parts: dict[int, Solid]) -> list[Occurrence]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +24,23 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SECOND,
+    Drawn,
+    Figures,
+    Page,
+    Section,
+    Table,
+    View,
     geometry_figure,
     label_logarithmic,
     legend_above,
-    own_style,
-    save,
+    page_of,
     stacked_axes,
-    write_page,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
-from halbach_fe.report.stray_field import stray_pictures, stray_section
+from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, is_fourier, relative
 from halbach_fe.response.multipoles import solved_circles
-from halbach_fe.response.solution import Solution
+from halbach_fe.response.solution import Solution, write_solution
 from halbach_fe.solver.formulation_choice import finer_in_words
 from halbach_fe.study.types import COMPONENTS
 
@@ -110,41 +115,63 @@ def _smallest_noise(solution: Solution) -> float:
     return min((region.sigma_T for region in noise.regions), default=0.0) if noise else 0.0
 
 
-@own_style
-def write_solution_report(
-    solution: Solution, folder: Path, provenance: Mapping[str, str]
-) -> Answer:
-    """Write report.html, self-contained, and its figures as PNG into ``folder``; and
-    multipoles.csv, if the positions are full circles. Return the page's answer.
-
-    ``provenance`` are words by key for the end of the page: versions, hashes of files, run time.
-    """
-    figures = {
-        "geometry.png": (geometry_figure(solution.magnet, solution.points), "The blocks of a ring "
-                         "with their magnetization and slots, the iron if there is any, and the "
-                         "study's positions"),
-        "field.png": (field_figure(solution),
-                      "The field at the study's positions"
-                      + (", and the solver's error bar of each reading"
-                         if solution.errors.any() and curve(solution.points) else "")),
+@page_of.register
+def page(solution: Solution) -> Page:
+    """Return the page of a solved nominal magnet, with the multipoles of full circles."""
+    magnet, study, rows = solution.magnet, solution.magnet.study, field_table(solution)
+    figures: Figures = {
+        "geometry.png": (
+            partial(geometry_figure, magnet, solution.points), "The blocks of a ring with their "
+            "magnetization and slots, the iron if there is any, and the study's positions"),
+        "field.png": (
+            partial(field_figure, solution), "The field at the study's positions"
+            + (", and the solver's error bar of each reading"
+               if solution.errors.any() and curve(solution.points) else "")),
         **stray_pictures(solution.stray_field)}
     multipoles: list[MultipoleTable] = [
         (model, {"nominal": known}) for model, known in solved_circles(
-            solution.magnet, solution.points, solution.flux_density, solution.errors)]
+            magnet, solution.points, solution.flux_density, solution.errors)]
+    files: dict[str, Callable[[Path], object] | None] = {
+        "field_map.h5": lambda path: write_solution(solution, path.parent),
+        **dict.fromkeys(("field_map.csv", "field_map.vtu", "readings.csv"))}
     if multipoles:
-        write_multipole_csv(solution.magnet.study, multipoles, folder / "multipoles.csv")
-    said = answer(solution, multipoles)
-    write_page(
-        folder / "report.html", "solution.html.j2", save(figures, folder),
-        study=solution.magnet.study,
-        magnet_rows=magnet_rows(solution.magnet),
-        multipoles=middle_table(multipoles, solution.magnet.study),
-        exact=not solution.errors.any(), provenance=provenance,
-        answer=said, rows=field_table(solution),
-        stray=stray_section(solution.stray_field),
-        view=view_of_nominal_magnet(
-            solution.magnet, field_points(solution.points, solution.flux_density)))
-    return said
+        files["multipoles.csv"] = partial(write_multipole_csv, study, multipoles)
+    view = View(lambda: view_of_nominal_magnet(magnet, field_points(
+        solution.points, solution.flux_density)), "the study's positions by the magnitude of the "
+        "field")
+    return Page(
+        "solve", "the nominal magnet", study, answer(solution, multipoles), solution.summary(), [
+            Section([view]), Section([Table(rows)], "The field at the study's positions"),
+            *sections_of_stray(solution.stray_field), *_sections_of_circles(solution, multipoles),
+            Section([*map(Drawn, [*figures][1:])], "Pictures"),
+            Section([Table([{"quantity": name, "value": value}
+                            for name, value in magnet_rows(magnet)])], "Model")],
+        {"The field at the study's positions": rows,
+         "Outside of the magnet": stray_rows(solution.stray_field)},
+        figures=figures, shown=("field.png",), files=files, stored=False, stem="report",
+        provenance={"GetDP": solution.getdp, "method": study.solver.method,
+                    "points, readings": f"{len(solution.points)}, {len(solution.readings)}"})
+
+
+def _sections_of_circles(
+    solution: Solution, tables: Sequence[MultipoleTable]
+) -> list[Section]:
+    """Return what the page says of the multipoles of full circles; nothing without any."""
+    if not tables:
+        return []
+    study = solution.magnet.study
+    said = middle_table(tables, study)
+    error = "" if not solution.errors.any() else (
+        " ± is the standard deviation that the solver's error allows.")
+    nearest = " and the z nearest to 0" if study.dimension == 3 else ""
+    others = "" if len(tables) == 1 else (
+        f" multipoles.csv has all {len(tables)} circles, each in units of the main multipole at "
+        f"its radius{nearest}.")
+    return [Section([
+        f"{said['reference']}{error} Main multipole: {said['mains']}. They are those of the "
+        "circle's own points. With m points, order n would contain order m − n too; that part is "
+        f"subtracted, as the blocks make it in vacuum.{others}",
+        Table(said["rows"], "numbers")], "Multipoles")]
 
 
 def field_table(solution: Solution) -> list[dict[str, str]]:

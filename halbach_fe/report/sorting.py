@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
-from pathlib import Path
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.sorting import SortedBlocks, types_in_words
 from halbach_fe.measurement.block_table import write_blocks
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
@@ -29,12 +26,14 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    Page,
+    Section,
+    Table,
     begin_at_zero,
+    csv_file,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    page_of,
 )
 from halbach_fe.report.words import counted, in_a_row, ppm
 from halbach_fe.response.deviations import DeviationModel
@@ -53,13 +52,16 @@ QUANTILES = (0.025, 0.5, 0.975)
 all ranges of the page do."""
 
 
-def sort_summary(found: SortedBlocks, limit: float | None) -> dict[str, object]:
+def _summary(found: SortedBlocks) -> dict[str, object]:
     """Return the content of sort.json; rms values are those of the mean."""
     unit = "units" if found.fields is None else "ppm"
     return {
-        "study": found.study.name, **_content(found, limit),
+        "study": found.study.name, **_content(found),
         "blocks": len(found.table), "left_over": found.left_over,
-        "table_order": found.own_order, "turned": turn_rows(found),
+        "table_order": found.own_order, "turned": [
+            {"serial": found.table.serial[row], "ring": int(found.table.ring[row]),
+             "slot": int(found.table.slot[row]), "turn_deg": found.turn_deg[row].tolist()}
+            for row in _turned_rows(found)],
         f"rms_sorted_{unit}": found.best.rms_of_mean,
         f"rms_unsorted_{unit}": found.numbered.rms_of_mean,
         "random_orders": len(found.random),
@@ -69,29 +71,27 @@ def sort_summary(found: SortedBlocks, limit: float | None) -> dict[str, object]:
     }
 
 
-def _content(found: SortedBlocks, limit: float | None) -> dict[str, object]:
+def _content(found: SortedBlocks) -> dict[str, object]:
     """Return multipoles or homogeneity, and what they refer to, as entries of sort.json."""
     if isinstance(found.model, DeviationModel) and found.fields is not None:
         best, own = found.fields
-        return {"region": asdict(found.model.homogeneity.region), "limit_ppm": limit,
+        return {"region": asdict(found.model.homogeneity.region), "limit_ppm": found.limit,
                 "sorted": plain_homogeneity(best), "unsorted": plain_homogeneity(own)}
     assert isinstance(found.model, MultipoleModel)
     unit = found.model.unit
-    return {"reference": reference_summary(found.model, limit),
+    return {"reference": reference_summary(found.model, found.limit),
             "sorted": plain(found.best, unit), "unsorted": plain(found.numbered, unit)}
 
 
-def turn_rows(found: SortedBlocks) -> list[dict[str, object]]:
-    """Return serial number, place and turn of the blocks that are turned, as plain data."""
-    return [{"serial": found.table.serial[row], "ring": int(found.table.ring[row]),
-             "slot": int(found.table.slot[row]), "turn_deg": found.turn_deg[row].tolist()}
-            for row in np.flatnonzero(found.turn_deg.any(axis=1)).tolist()]
+def _turned_rows(found: SortedBlocks) -> list[int]:
+    """Return the rows of the blocks that are turned."""
+    return [int(row) for row in np.flatnonzero(found.turn_deg.any(axis=1))]
 
 
-def turn_table(found: SortedBlocks) -> list[dict[str, str]]:
+def _turn_table(found: SortedBlocks) -> list[dict[str, str]]:
     """Return the rows of the table of turned blocks, as text."""
     rows = []
-    for row in np.flatnonzero(found.turn_deg.any(axis=1)).tolist():
+    for row in _turned_rows(found):
         vector = found.turn_deg[row]
         angle = float(np.linalg.norm(vector))
         axis = ", ".join(f"{part:.3g}" for part in vector / angle)
@@ -113,12 +113,6 @@ def place_table(found: SortedBlocks) -> list[dict[str, str]]:
                          f"{table.slot[some[-1]]}" if len(some) > 1 else str(table.slot[some[0]]),
                          "blocks, slot by slot": ", ".join(table.serial[row] for row in some)})
     return rows
-
-
-def table_title(found: SortedBlocks) -> str:
-    """Return the title of `order_table`."""
-    return ("Multipoles in units of 1e-4" if not isinstance(found.model, DeviationModel) else
-            f"Deviations of |B| in {found.model.homogeneity.region.text}")
 
 
 def order_table(found: SortedBlocks) -> list[dict[str, str]]:
@@ -234,35 +228,44 @@ def _uncertainty(found: SortedBlocks) -> float:
     return float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
 
 
-@own_style
-def write_sorted(found: SortedBlocks, limit: float | None, folder: Path) -> None:
-    """Write blocks.sorted.csv, sort.json, sort.html and its figures."""
-    write_blocks(found.table, folder / "blocks.sorted.csv")
-    summary = sort_summary(found, limit)
-    write_text(folder / "sort.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    if found.turned:
-        with atomic(folder / "sort.csv") as temporary:
-            rows = np.flatnonzero(found.turn_deg.any(axis=1)).tolist()
-            write_csv({"serial": [found.table.serial[row] for row in rows],
-                       "ring": found.table.ring[rows], "slot": found.table.slot[rows],
-                       **dict(zip(("turn_x_deg", "turn_y_deg", "turn_z_deg"),
-                                  found.turn_deg[rows].T, strict=True))}, {
-                "content": "blocks that are turned in their slots: rotation vectors along own axes"
-            }, temporary)
-    figures = {} if not found.matters else {"sort_orders.png": (
-        _random_orders_figure(found), f"Histogram of the root mean square of {_axis_text(found)} "
-        f"for {len(found.random)} random orders of the blocks; the lines are the order of the "
-        "table and the sorted blocks")}
-    if not isinstance(found.model, DeviationModel):
-        figures = {"sort_multipoles.png": (
-            multipole_figure(_compared(found, found.best, found.numbered), limit),
-            "Unwanted multipoles of the blocks" + (
-                " in the order of the table and of the sorted blocks" if _chose(found) else "")
-            + ", normal (left) and skew (right); bars are two standard deviations")} | figures
-    write_page(folder / "sort.html", "sort.html.j2", save(figures, folder), found=found,
-               study=found.study, answer=answer(found), rows=order_table(found),
-               in_a_region=bool(found.fields), turned=turn_table(found), places=place_table(found),
-               title=table_title(found), text=_convention(found))
+@page_of.register
+def page(found: SortedBlocks) -> Page:
+    """Return the page of blocks that were assigned to slots."""
+    in_a_region = isinstance(found.model, DeviationModel)
+    title = (f"Deviations of |B| in {found.model.homogeneity.region.text}"
+             if isinstance(found.model, DeviationModel) else "Multipoles in units of 1e-4")
+    rows, places = order_table(found), place_table(found)
+    figures = {} if in_a_region else {"sort_multipoles.png": (
+        partial(multipole_figure, _compared(found, found.best, found.numbered), found.limit),
+        "Unwanted multipoles of the blocks" + (
+            " in the order of the table and of the sorted blocks" if _chose(found) else "")
+        + ", normal (left) and skew (right); bars are two standard deviations")}
+    if found.matters:
+        figures["sort_orders.png"] = (
+            partial(_random_orders_figure, found), "Histogram of the root mean square of "
+            f"{_axis_text(found)} for {len(found.random)} random orders of the blocks; the lines "
+            "are the order of the table and the sorted blocks")
+    turned = _turned_rows(found)
+    files = {"blocks.sorted.csv": partial(write_blocks, found.table)} | ({} if not turned else {
+        "sort.csv": csv_file({
+            "serial": [found.table.serial[row] for row in turned],
+            "ring": found.table.ring[turned], "slot": found.table.slot[turned],
+            **dict(zip(("turn_x_deg", "turn_y_deg", "turn_z_deg"), found.turn_deg[turned].T,
+                       strict=True))},
+            {"content": "blocks that are turned in their slots: rotation vectors along own axes"})})
+    by_serial = ("By serial number, as in blocks.sorted.csv"
+                 f"{'; the turns of blocks are in a table below' if turned else ''}.")
+    return Page("sort", "which block goes into which slot", found.study, answer(found),
+                _summary(found), [
+        Section(["Blocks go only into slots of their own type."]),
+        Section([by_serial, Table(places)], "Which block goes where",
+                folded=len(places) > 12),
+        Section([_convention(found), Table(rows, "turned" if in_a_region else "numbers")], title),
+        *([Section([
+            "Each is put into its slot as it was measured, and then turned about its own axes. "
+            "The moments in blocks.sorted.csv are those of the turned blocks.",
+            Table(_turn_table(found))], "Blocks that are turned in their slots")]
+          if turned else [])], {title: rows}, figures=figures, files=files)
 
 
 def _convention(found: SortedBlocks) -> str:

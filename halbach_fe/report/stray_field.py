@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from typing import TypedDict
 
 import numpy as np
@@ -11,7 +11,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle
 
-from halbach_fe.report.page import POSTERIOR, SECOND, SMALL, figure_of
+from halbach_fe.report.page import (
+    POSTERIOR,
+    SECOND,
+    SMALL,
+    Drawn,
+    Figures,
+    Section,
+    Table,
+    figure_of,
+)
 from halbach_fe.report.words import decimals, with_error
 from halbach_fe.response.stray_field import NEAREST, StrayField
 
@@ -52,6 +61,18 @@ def stray_section(stray: StrayField | None) -> StraySection | None:
             "rows": stray_rows(stray)}
 
 
+def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Section]:
+    """Return the section of a page about the field outside; none if there is nothing to say.
+
+    ``drawn`` tells whether the figure of `stray_pictures` is in it.
+    """
+    if (said := stray_section(stray)) is None:
+        return []
+    rows = said["rows"]
+    return [Section([said["text"], *([Table(rows)] if rows else []),
+                     *([Drawn(STRAY_FIGURE)] if drawn and rows else [])], said["title"])]
+
+
 def _is_uncertain(stray: StrayField) -> bool:
     """Tell whether the distances are those of an updated magnet, with standard deviations."""
     return any(reach is not None and reach.sd_m for reach in (stray.radial, stray.axial))
@@ -86,11 +107,11 @@ def distance_text(distance_m: float, sd_m: float) -> str:
     return f"{text}\u00a0mm"
 
 
-def stray_pictures(stray: StrayField | None) -> Mapping[str, tuple[Figure, str]]:
+def stray_pictures(stray: StrayField | None) -> Figures:
     """Return figure and caption of the field outside by file name; none if it is unknown."""
     if stray is None or stray.unknown:
         return {}
-    return {STRAY_FIGURE: (stray_figure(stray), (
+    return {STRAY_FIGURE: (partial(stray_figure, stray), (
         f"|B| outside of the magnet in planes through its middle, in mT. Thick: the "
         f"{line_name(stray)}; dashed: the largest distances"))}
 

@@ -1,25 +1,19 @@
-"""Figures, table and page of the multipoles that result from the tolerances of the blocks."""
+"""The multipoles, or the homogeneity, that result from the tolerances of the blocks."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import write_text
+from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance, Tolerance
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.homogeneity_tolerance import (
-    ENOUGH,
-    homogeneity_quantiles,
-    homogeneity_tolerance_answer,
-    homogeneity_tolerance_summary,
-    tolerances_in_words,
-    write_homogeneity_tolerance,
-)
+from halbach_fe.report.homogeneity import SIZES, solver_error_text
 from halbach_fe.report.multipoles import (
     lacks_main,
     main_in_words,
@@ -31,29 +25,35 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     PUBLISHED,
+    Page,
+    Section,
+    Table,
     begin_at_zero,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
+    linearized,
+    page_of,
 )
-from halbach_fe.report.words import share_in_words, whole
+from halbach_fe.report.words import ppm, share_in_words, whole
 from halbach_fe.response.multipoles import plain
+from halbach_fe.study.inference import Prior
+from halbach_fe.study.model import Study
+
+ENOUGH = 0.9
+"""Share of the magnets within the limit from which the tolerances suffice."""
 
 LEAST_OF_SD = 5e-3
 """Part of its standard deviation below which a mean is 0 in the table."""
 
 
 OF_THE_DESIGN = 0.9
-"""Largest multipole of the magnet as ordered, relative to what half of the magnets have at most,
-from which on the answer says that it is the design's."""
+"""Largest multipole, or rms deviation, of the magnet as ordered, relative to what half of the
+magnets have at most, from which on the answer says that it is the design's. (Tolerances add by
+squares: a tenth of a deviation is half of it.)"""
 
 
-def tolerance_summary(found: Tolerance | HomogeneityTolerance) -> dict[str, object]:
+def _multipole_summary(found: Tolerance) -> dict[str, object]:
     """Return the content of tolerance.json."""
-    if isinstance(found, HomogeneityTolerance):
-        return homogeneity_tolerance_summary(found)
     shares = found.shares
     return {
         "study": found.study.name, "reference": reference_summary(found.model, found.limit),
@@ -72,17 +72,8 @@ def _by_quantile(values: Floats) -> dict[str, float]:
     return dict(zip(map(str, QUANTILES), values.tolist(), strict=True))
 
 
-def table_title(found: Tolerance | HomogeneityTolerance) -> str:
-    """Return the title of `quantile_table`."""
-    return (f"Deviations of |B| in {found.model.region.text}"
-            if isinstance(found, HomogeneityTolerance) else
-            "Multipoles |c_n| in units of 1e-4")
-
-
-def quantile_table(found: Tolerance | HomogeneityTolerance) -> list[dict[str, str]]:
-    """Return the rows of the table as text: of multipoles one for each order n."""
-    if isinstance(found, HomogeneityTolerance):
-        return homogeneity_quantiles(found)
+def _multipole_quantiles(found: Tolerance) -> list[dict[str, str]]:
+    """Return a row of text for each order n."""
     size, sd = len(found.model.orders), found.known.sd
     rows = []
     for i, order in enumerate(found.model.orders):
@@ -108,7 +99,7 @@ def _size(found: Tolerance, number: int) -> str:
 def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     """Say how large the multipoles of the magnets are, how many meet the limit, and what next."""
     if isinstance(found, HomogeneityTolerance):
-        return homogeneity_tolerance_answer(found)
+        return _homogeneity_answer(found)
     largest = found.sizes.max(axis=1)
     half, most = np.quantile(largest, (0.5, 0.95))
     worst = found.model.orders[int(np.argmax(found.quantiles[1]))]
@@ -150,27 +141,55 @@ def _made_by_tolerances(found: Tolerance) -> str:
             f"magnets, below {most[number]:.3g} in 95 %. With what the design makes: ")
 
 
-@own_style
-def write_tolerance(found: Tolerance | HomogeneityTolerance, folder: Path) -> None:
-    """Write tolerance.json, tolerance.html and its figures."""
+@page_of.register
+def page(found: Tolerance | HomogeneityTolerance) -> Page:
+    """Return the page of magnets that were drawn at random."""
     if isinstance(found, HomogeneityTolerance):
-        write_homogeneity_tolerance(found, folder)
-        return
-    summary = tolerance_summary(found)
-    write_text(folder / "tolerance.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    pictures = save({
-        "tolerance_sizes.png": (
-            _size_quantiles_figure(found), "Unwanted multipoles |c_n| of the simulated magnets: "
-            "median, with bars from the 5 % to the 95 % quantile"),
-        "tolerance_largest.png": (
-            _largest_multipole_figure(found), "Share of the simulated magnets whose largest "
-            "unwanted multipole is below a limit"),
-    }, folder)
-    write_page(folder / "tolerance.html", "tolerance.html.j2", pictures, found=found,
-               study=found.study, answer=answer(found),
-               reference=reference_text(found.model, found.study),
-               rows=quantile_table(found), draws=whole(len(found.sizes)),
-               main=main_in_words(found.model, found.known))
+        return _homogeneity_page(found)
+    rows = _multipole_quantiles(found)
+    return Page(
+        "tolerance", "multipoles to expect from the tolerances", found.study, answer(found),
+        _multipole_summary(found), [Section([
+            _drawn(found.study, whole(len(found.sizes))),
+            f"{reference_text(found.model, found.study)} Means and standard deviations are "
+            "computed in closed form, quantiles from the random magnets; standard deviations "
+            "include the error of the solver, quantiles do not. “95 % below” is the size that "
+            "|c_n| stays below in 95 % of them. Main multipole: "
+            f"{main_in_words(found.model, found.known)}.",
+            Table(rows, "numbers"), *linearized(found.study)])],
+        {"Multipoles |c_n| in units of 1e-4": rows},
+        figures={
+            "tolerance_sizes.png": (
+                partial(_size_quantiles_figure, found), "Unwanted multipoles |c_n| of the "
+                "simulated magnets: median, with bars from the 5 % to the 95 % quantile"),
+            "tolerance_largest.png": (
+                partial(_largest_multipole_figure, found), "Share of the simulated magnets whose "
+                "largest unwanted multipole is below a limit")})
+
+
+def _homogeneity_page(found: HomogeneityTolerance) -> Page:
+    """Return the page of the homogeneity of magnets that were drawn at random."""
+    region, rows = found.model.region.text, _homogeneity_quantiles(found)
+    return Page(
+        "tolerance", "homogeneity to expect from the tolerances", found.study, answer(found),
+        _homogeneity_summary(found), [
+            Section([_drawn(found.study, str(len(found.rms_ppm)))]),
+            Section([SIZES, Table(rows, "turned"), *linearized(found.study)],
+                    f"The field in {region}")],
+        {f"Deviations of |B| in {region}": rows},
+        figures={"tolerance_ppm.png": (
+            partial(_deviation_figure, found), "Share of the simulated magnets whose field "
+            "deviates from its mean by less than a limit, rms (left) and peak to peak (right)")})
+
+
+def _drawn(study: Study, draws: str) -> str:
+    """Say what was drawn."""
+    mounting = study.prior.mounting_sd_deg
+    return (f"{draws} magnets were drawn at random. The magnetizations of their blocks are "
+            "distributed as in the prior" + (
+                f", and mounting turns each block by a random angle with an sd of {mounting:.3g}° "
+                "about each axis" if mounting > 0 else "")
+            + ". Shapes and positions of the blocks are nominal.")
 
 
 def _size_quantiles_figure(found: Tolerance) -> Figure:
@@ -203,4 +222,99 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     begin_at_zero(axis)
     axis.ticklabel_format(axis="x", useOffset=False)
     axis.grid(alpha=0.3)
+    return figure
+
+
+def _homogeneity_summary(found: HomogeneityTolerance) -> dict[str, object]:
+    """Return the content of tolerance.json."""
+    return {
+        "study": found.study.name, "region": asdict(found.model.region),
+        "draws": len(found.rms_ppm), "limit_ppm": found.limit,
+        "as_ordered": {"mean_T": found.ordered.mean_T, "rms_ppm": found.ordered.rms_ppm,
+                       "peak_to_peak_ppm": found.ordered.peak_to_peak_ppm},
+        **{f"{name}_quantiles": _by_quantile(np.quantile(getattr(found, name), QUANTILES))
+           for name in ("mean_T", "rms_ppm", "peak_to_peak_ppm")},
+        "solver_error_ppm": found.model.solver_error_ppm,
+        "share_within_limit": found.share, "share_sd": found.share_sd,
+    }
+
+
+def _homogeneity_quantiles(found: HomogeneityTolerance) -> list[dict[str, str]]:
+    """Return a row of text for the rms deviation, the one peak to peak, and the mean field."""
+    def row(name: str, ordered: str, texts: list[str]) -> dict[str, str]:
+        return {"": name, "as ordered": ordered} | {
+            f"{100 * q:g} % below": text for q, text in zip(QUANTILES, texts, strict=True)}
+
+    def quantiles(values: Floats) -> list[float]:
+        return np.quantile(values, QUANTILES).tolist()
+
+    return [
+        row("rms in ppm", ppm(found.ordered.rms_ppm), list(map(ppm, quantiles(found.rms_ppm)))),
+        row("peak to peak in ppm", ppm(found.ordered.peak_to_peak_ppm),
+            list(map(ppm, quantiles(found.peak_to_peak_ppm)))),
+        row("mean field in mT", f"{1e3 * found.ordered.mean_T:.5g}",
+            [f"{1e3 * value:.5g}" for value in quantiles(found.mean_T)])]
+
+
+def _homogeneity_answer(found: HomogeneityTolerance) -> Answer:
+    """Say how homogeneous the magnets are, how many meet the limit, and what next."""
+    (half, most), (wide, widest) = (np.quantile(values, (0.5, 0.95)) for values in (
+        found.rms_ppm, found.peak_to_peak_ppm))
+    said = (f"Half of the magnets deviate by less than {ppm(half)} ppm rms ({ppm(wide)} peak to "
+            f"peak) from their mean field in {found.model.region.text}, 95 % by less than "
+            f"{ppm(most)} ({ppm(widest)}). With all blocks as ordered it is "
+            f"{ppm(found.ordered.rms_ppm)} ppm rms.")
+    share, prior = found.share, found.study.prior
+    if share is not None and found.limit is not None:
+        said = (f"{share_in_words(share, found.share_sd)} of the magnets "
+                f"are within {ppm(found.limit)} ppm rms. {said}")
+    enough = share is not None and share >= ENOUGH
+    step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
+             "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
+            ("Look for a better design first: perfect blocks would leave "
+             f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured "
+             "blocks can use their errors against it, but takes only a part of it away.",
+             "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
+             "halbach-fe sort STUDY BLOCKS -o DIR")
+            if found.ordered.rms_ppm > OF_THE_DESIGN * half else
+            ("Measure the blocks before assembly, and see what sorting them into the slots that "
+             "they fit gains.",
+             "halbach-fe sort STUDY BLOCKS -o DIR"))
+    text, small = solver_error_text(found.model, half)
+    return Answer(
+        "How homogeneous is the field that the tolerances of the blocks leave?", said,
+        f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
+        f"{whole(len(found.rms_ppm))} magnets were drawn. {text}", *step,
+        sound=small)
+
+
+def tolerances_in_words(prior: Prior) -> str:
+    """Say which tolerances of the blocks were drawn, and which were not, in sentences."""
+    together = (f", all of them together by {100 * prior.common_mode_sd:g} %"
+                if prior.common_mode_sd > 0 else "")
+    mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
+               if prior.mounting_sd_deg > 0 else "")
+    return (f"each block varies by {100 * prior.magnitude_sd:g} % and "
+            f"{prior.direction_sd_deg:g}°{together}{mounted}. Shapes and places count as nominal: "
+            "what their tolerances make comes on top of these numbers.")
+
+
+def _deviation_figure(found: HomogeneityTolerance) -> Figure:
+    """Draw the distribution functions of the rms and of the peak-to-peak deviation."""
+    figure = figure_of(3.6)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axis, values, ordered, name in (
+            (left, found.rms_ppm, found.ordered.rms_ppm, "rms"),
+            (right, found.peak_to_peak_ppm, found.ordered.peak_to_peak_ppm, "peak to peak")):
+        axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
+        axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
+        axis.set(xlabel=f"{name} deviation in ppm", ylim=(0, 1.02))
+        axis.grid(alpha=0.3)
+        axis.xaxis.set_major_locator(MaxNLocator(4))  # numbers of five digits side by side
+    left.set_ylabel("share of magnets")
+    if found.limit is not None:
+        left.axvline(found.limit, color=PRIOR, ls="--", label="limit")
+    for axis in (left, right):
+        begin_at_zero(axis)
+    legend_above(figure, left)
     return figure

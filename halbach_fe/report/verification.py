@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from halbach_fe.core.files import atomic, write_text
-from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import ViewPoints, field_points, view_of_nominal_magnet
@@ -23,15 +18,20 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     THIRD,
+    Drawn,
+    Page,
+    Section,
+    Table,
+    Text,
+    View,
     axis_of_points,
+    csv_file,
     figure_of,
     geometry_figure,
     label_logarithmic,
     legend_above,
-    own_style,
-    save,
+    page_of,
     stacked_axes,
-    write_page,
 )
 from halbach_fe.report.words import (
     ROUNDING,
@@ -187,39 +187,51 @@ def _reading(found: Verification) -> str:
     return "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
 
 
-@own_style
-def write_verification(
-    magnet: Magnet, found: Verification, folder: Path, provenance: Mapping[str, str]
-) -> None:
-    """Write verification.json, verification.csv, verification.html and its figures."""
-    write_text(folder / "verification.json",
-               json.dumps(found.plain(), indent=1, allow_nan=False) + "\n")
-    columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
-    with atomic(folder / "verification.csv") as temporary:
-        write_csv(columns | {f"{difference.what} in T": change for difference, change in zip(
-            found.differences, found.changes, strict=True)}, {"study": magnet.name}, temporary)
+@page_of.register
+def page(found: Verification) -> Page:
+    """Return the page of how far the computed field is off."""
+    magnet, rows, change = found.magnet, difference_table(found), found.changes[STEPS - 1]
+    main_field = flux_density(found.main_field_T, 4)
     figures = {}
     if found.changes[:STEPS].any():
-        figures["verification_convergence.png"] = _convergence_figure(found), (
+        figures["verification_convergence.png"] = partial(_convergence_figure, found), (
             "Change of the field against element size, both logarithmic: change by the "
             "next finer mesh with the slope of the order, and estimated error of the study's own "
             f"mesh{_compared(found)}")
-        figures["verification_along.png"] = _change_figure(found), (
+        figures["verification_along.png"] = partial(_change_figure, found), (
             "Change of B at every position of the study, for each change of the model")
-    figures["verification_geometry.png"] = geometry_figure(magnet, found.points), (
+    figures["verification_geometry.png"] = partial(geometry_figure, magnet, found.points), (
         "The blocks of the first ring with their easy axes, "
         f"{'the iron, ' if magnet.iron else ''}and the study's positions")
-    change = found.changes[STEPS - 1]
-    write_page(
-        folder / "verification.html", "verification.html.j2", save(figures, folder),
-        study=magnet.study, magnet_rows=magnet_rows(magnet),
-        provenance=provenance, found=found, rows=difference_table(found), basis=error_basis(found),
-        main_field=flux_density(found.main_field_T, 4), answer=answer(found),
-        refinement=REFINEMENT, view=view_of_nominal_magnet(
-            magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
-                found.points, 1e6 * change, "positions", "change by a<br>finer mesh in µT",
-                "a finer mesh changes B by %{customdata:.3g} µT",
-                (1e6 * float(change.min()), 1e6 * float(change.max())))))
+    fourier = (" Fourier: the same for the Fourier coefficients of B_r on the study's circles."
+               if rows and "Fourier in ppm" in rows[0] else "")
+    changes = [Section([Table(rows, "numbers"), Text(
+        f"Of the nominal magnet at the study's {len(found.points)} positions. Pointwise: the "
+        f"largest change of B, in ppm of the largest field at these positions, {main_field}."
+        f"{fourier} {error_basis(found)}", "small")],
+        "Changes of the model, and how much they change the field")] if rows else []
+    model = {"route": found.route.replace("_", " "), "method": magnet.study.solver.method,
+             "elements at the magnet": f"{1e3 * found.element_size_m:.3g} mm; finer by a factor of "
+             f"{REFINEMENT}, coarser by it and by its square", **dict(magnet_rows(magnet))}
+    size = 1e6 * change
+    view = View(lambda: view_of_nominal_magnet(
+        magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
+            found.points, size, "positions", "change by a<br>finer mesh in µT",
+            "a finer mesh changes B by %{customdata:.3g} µT",
+            (float(size.min()), float(size.max())))),
+        "positions of the study by the change of B that a finer mesh makes" if rows else
+        "positions of the study by the magnitude of the field")
+    columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
+    return Page(
+        "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
+        [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
+         Section([Table([{"quantity": name, "value": value} for name, value in model.items()])],
+                 "Model")],
+        {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
+        files={"verification.csv": csv_file(
+            columns | {f"{difference.what} in T": column for difference, column in zip(
+                found.differences, found.changes, strict=True)}, {"study": magnet.name})},
+        stem="verification")
 
 
 def _convergence_figure(found: Verification) -> Figure:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -398,20 +399,27 @@ def truth_text(truth: dict[str, object]) -> str:
     return json.dumps(truth, indent=1, allow_nan=False) + "\n"
 
 
-def write_campaign(campaign: SimulatedCampaign, folder: Path) -> list[Path]:
-    """Write the files of a campaign to a folder, and return their paths.
+def campaign_files(campaign: SimulatedCampaign) -> dict[str, Callable[[Path], None]]:
+    """Return how each file of a campaign is written, by its name.
 
     These are blocks.csv, map and held-out (.csv, or .h5 if large), and truth/truth.json.
     """
-    write_blocks(campaign.blocks, folder / "blocks.csv")
-    written = [folder / "blocks.csv"]
-    for name, data in (("map", campaign.readings), ("held-out", campaign.held_out)):
-        if data is None:
-            continue
-        path = folder / f"{name}{'.csv' if 9 * data.sizes['point'] < LARGEST_CSV else '.h5'}"
-        write_map(data, path)
-        written.append(path)
-    written.append(folder / "truth" / "truth.json")
-    with atomic(written[-1]) as temporary:
-        temporary.write_text(truth_text(campaign.truth), encoding="utf-8")
-    return written
+    maps = {f"{name}{'.csv' if 9 * data.sizes['point'] < LARGEST_CSV else '.h5'}":
+            partial(write_map, data)
+            for name, data in (("map", campaign.readings), ("held-out", campaign.held_out))
+            if data is not None}
+
+    def write_truth(path: Path) -> None:
+        with atomic(path) as temporary:
+            temporary.write_text(truth_text(campaign.truth), encoding="utf-8")
+
+    return {"blocks.csv": partial(write_blocks, campaign.blocks), **maps,
+            "truth/truth.json": write_truth}
+
+
+def write_campaign(campaign: SimulatedCampaign, folder: Path) -> list[Path]:
+    """Write the files of a campaign to a folder, and return their paths."""
+    files = campaign_files(campaign)
+    for name, write in files.items():
+        write(folder / name)
+    return [folder / name for name in files]

@@ -21,7 +21,8 @@ from halbach_fe.design.measurement_plan import plan_measurement
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.plan import plan_summary, write_plan
+from halbach_fe.report.page import write_files
+from halbach_fe.report.plan import page, plan_summary
 from halbach_fe.report.sensitivity import Sensitivity, plan_rows, write_sensitivity
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.formulation_choice import gateaux_derivative
@@ -100,8 +101,8 @@ def run(options: argparse.Namespace) -> int:
     information = {"equally spaced circle": (one.baseline_counts, one.baseline_gain)} | {
         f"plan {name}": (np.arange(1, len(found.gain) + 1), found.gain)
         for name, found in plans.items()}
-    write_plan(build_magnet(on_circle), plans["on the circle"], options.output / "plan-circle")
-    write_plan(build_magnet(study), plans["wherever the probe can go"], options.output / "plan")
+    write_files(page(plans["on the circle"]), options.output / "plan-circle")
+    write_files(page(plans["wherever the probe can go"]), options.output / "plan")
     summaries = {name: plan_summary(found) for name, found in plans.items()}
     write_sensitivity(build_magnet(study), Sensitivity(
         BLOCK, axis, axis, size, np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), along,

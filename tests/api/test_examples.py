@@ -6,6 +6,7 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 
@@ -156,10 +157,14 @@ def test_a_report_replaces_no_other_result(dipole, tmp_path):
 
 def test_every_result_has_a_command():
     from halbach_fe.cli.verbs import VERBS
-    from halbach_fe.report.result_files import OWNERS, _write
+    from halbach_fe.report.campaign_folders import ORDER
+    from halbach_fe.report.page import page_of
+    from halbach_fe.report.result_files import QUESTIONS
 
-    assert set(OWNERS) == set(_write.registry) - {object}
-    assert {command for command, _ in OWNERS.values()} <= set(VERBS)
+    named = [re.findall(r' Page\(\s*"([a-z-]+)"', inspect.getsource(one)) for one in QUESTIONS]
+    assert all(named)
+    assert {verb for verbs in named for verb in verbs} <= set(ORDER) <= set(VERBS)
+    assert {kind.__name__ for kind in page_of.registry} >= {"Solution", "Shim", "Tolerance"}
 
 
 RESULT, TABLE = object.__new__(hf.InferenceResult), object.__new__(hf.BlockTable)

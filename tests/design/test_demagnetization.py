@@ -15,7 +15,8 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.demagnetization import answer, demagnetization_summary, write_demagnetization
+from halbach_fe.report.demagnetization import answer, demagnetization_summary, page
+from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
@@ -239,7 +240,7 @@ def test_missing_blocks_are_left_out(warm):
 
 def test_files_and_page_say_the_same(warm, tmp_path):
     found = warm(100.0)
-    write_demagnetization(found, tmp_path)
+    write_files(page(found), tmp_path)
     summary = json.loads((tmp_path / "demagnetization.json").read_text())
     mesh = meshio.read(tmp_path / "demagnetization.vtu")
     assert mesh.cell_data["margin_A_per_m"][0].min() == pytest.approx(
@@ -248,9 +249,9 @@ def test_files_and_page_say_the_same(warm, tmp_path):
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert min(float(row["margin_A_per_m"]) for row in rows) == pytest.approx(
         summary["least_margin_A_per_m"])
-    page = (tmp_path / "demagnetization.html").read_text().replace("\u00a0", " ")
-    assert f"{100 * summary['share_beyond_knee']:.2g} % of the magnet" in page
-    assert page.count("alt=") >= 3
+    text = (tmp_path / "demagnetization.html").read_text().replace("\u00a0", " ")
+    assert f"{100 * summary['share_beyond_knee']:.2g} % of the magnet" in text
+    assert text.count("alt=") >= 3
 
 
 def test_the_command_line(tmp_path, capsys):

@@ -23,9 +23,9 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.inference.infer import infer
 from halbach_fe.report import sorting
-from halbach_fe.report.homogeneity_tolerance import OF_THE_DESIGN, homogeneity_tolerance_answer
-from halbach_fe.report.notebook import html_of
-from halbach_fe.report.result_files import write_report
+from halbach_fe.report.result_files import html_of, write_report
+from halbach_fe.report.tolerance import OF_THE_DESIGN
+from halbach_fe.report.tolerance import answer as answer_of_tolerance
 from halbach_fe.response.deviations import deviation_model
 from halbach_fe.response.homogeneity import default_region, homogeneity_model
 from halbach_fe.response.multipoles import MultipoleReference
@@ -130,13 +130,13 @@ def test_drawn_magnets_are_as_homogeneous_as_magpylibs(study, session, unit_fiel
     text = page(write_report(found, tmp_path / "report"))
     assert "ppm" in text
     assert "units of 1e-4" not in text
-    next_step = homogeneity_tolerance_answer(found).command
+    next_step = answer_of_tolerance(found).command
     assert ("design" in next_step) == (direct > OF_THE_DESIGN * np.median(found.rms_ppm))
     # the control: were the design perfect, its blocks would have to be sorted
     perfect = replace(found, ordered=replace(found.ordered, rms_ppm=0.0))
-    assert "sort" in homogeneity_tolerance_answer(perfect).command
+    assert "sort" in answer_of_tolerance(perfect).command
     poor = replace(found, ordered=replace(found.ordered, rms_ppm=float(np.median(found.rms_ppm))))
-    assert "design" in homogeneity_tolerance_answer(replace(poor, limit=None)).command
+    assert "design" in answer_of_tolerance(replace(poor, limit=None)).command
     assert "rms in ppm" in html_of(found)
     summary = json.loads((tmp_path / "report" / "tolerance.json").read_text())
     assert summary["share_within_limit"] == found.share

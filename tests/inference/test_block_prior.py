@@ -23,7 +23,8 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, shared_doubts
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.prior import answer, write_prior
+from halbach_fe.report.page import write_files
+from halbach_fe.report.prior import answer, page
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.solver.ring_harmonics_2d import (
     SectorMagnetization,
@@ -220,7 +221,7 @@ def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, 
     assert prior(truth, temperature=np.full(count, 25.0)).doubts == ()
     with pytest.warns(HalbachWarning, match="measured at 80 °C, 60 K from 20 °C"):
         found = prior(truth, temperature=np.full(count, 80.0))
-    write_prior(magnet, found, tmp_path)
+    write_files(page(magnet, found), tmp_path)
     assert "7.2 % off" in json.loads((tmp_path / "prior.json").read_text())["doubts"][0]
     assert "Not yet. The blocks were measured" in answer(found).trust
     assert not answer(found).sound
@@ -598,8 +599,9 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     """In the warning, on the page and in the summary; healthy ones are not."""
     study = vacuum_dipole()
     slots, _, truth = blocks_and_truth(study, generator, copies=8)
-    healthy = prior_from_blocks(build_magnet(study), table_of(study, slots, truth))
-    write_prior(build_magnet(study), healthy, tmp_path)
+    magnet = build_magnet(study)
+    healthy = prior_from_blocks(magnet, table_of(study, slots, truth))
+    write_files(page(magnet, healthy), tmp_path)
     assert "Only as mean and spread" not in (tmp_path / "prior.html").read_text()
     with xr.open_dataset(tmp_path / "prior.h5", engine="h5netcdf") as stored:
         np.testing.assert_allclose(stored["prior_covariance"], healthy.gaussian.covariance)
@@ -607,7 +609,7 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
     truth[slots.index(4)] *= 0.85  # one block that was partly demagnetized
     table = table_of(study, slots, truth)
     with pytest.warns(HalbachWarning, match="type 4 do not look normally"):
-        write_prior(build_magnet(study), prior_from_blocks(build_magnet(study), table), tmp_path)
+        write_files(page(magnet, prior_from_blocks(magnet, table)), tmp_path)
     assert "Only as mean and spread" in (tmp_path / "prior.html").read_text()
     summary = json.loads((tmp_path / "prior.json").read_text())
     assert summary["not_normal"] == ["4"]

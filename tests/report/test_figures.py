@@ -13,8 +13,8 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.page import begin_at_zero
 from halbach_fe.report.prior import type_table
+from halbach_fe.report.result_files import write_report
 from halbach_fe.report.solution import field_figure
-from halbach_fe.report.sorting import write_sorted
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import DIPOLE, changed, parse_study
@@ -62,7 +62,7 @@ def test_axes_begin_at_zero_unless_that_hides_the_differences(values, zero):
 def test_random_orders_are_drawn_if_there_are_any(types, drawn, tmp_path):
     study = parse_study(changed(MAGNET, array__rings=1, array__ring_gap_m=0.0, prior__types=types))
     magnet, blocks = hf.build_magnet(study), simulate_campaign(study, 2).blocks
-    write_sorted(hf.sort(magnet, blocks, Session.open(tmp_path)), None, tmp_path)
-    assert (tmp_path / "sort_orders.png").exists() == drawn
+    write_report(hf.sort(magnet, blocks, Session.open(tmp_path)), tmp_path / "sorted")
+    assert (tmp_path / "sorted" / "sort_orders.png").exists() == drawn
     rows = type_table(prior_from_blocks(magnet, blocks))
     assert ("p along" in rows[0]) == drawn  # single blocks of a type have no distribution

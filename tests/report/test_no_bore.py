@@ -16,6 +16,7 @@ from halbach_fe.report import field_traces_3d, magnet_view_3d, page
 from halbach_fe.report import solution as solution_page
 from halbach_fe.report.field_traces_3d import cut_trace
 from halbach_fe.report.magnet_table import in_one_line, magnet_rows
+from halbach_fe.report.page import write_files
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.response.solution import solve
 from halbach_fe.solver.formulation_choice import finer_in_words
@@ -55,8 +56,9 @@ def test_pages(places, bore, dimension, session, tmp_path):
     if places is ONE:
         magnet = magnet_of([(0.0, 0.0, 0.0)], dimension)
         found = solve(magnet, session)
-        answer = solution_page.write_solution_report(found, tmp_path, {})
-        assert "halbach-fe plan" in answer.command
+        shown = solution_page.page(found)
+        write_files(shown, tmp_path)
+        assert "halbach-fe plan" in shown.answer.command
         assert (tmp_path / "report.html").exists()
     cut = cut_trace(magnet)
     shown = np.isfinite(np.array(cut.surfacecolor, float))

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import json
 import os
 import re
 import subprocess
 import sys
+from argparse import Namespace
 
 import matplotlib
 import matplotlib.image
 import pytest
+import tomlkit
 from matplotlib.figure import Figure
 
-from halbach_fe.cli import main
+import halbach_fe as hf
+from halbach_fe.cli import common, main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import SMALL, own_style, save, simulated_files, write_page
@@ -154,3 +159,33 @@ def test_what_was_simulated_is_said():
     assert simulated_files({"measurements": of_map, "blocks": of_blocks}).startswith(both)
     behind = f"{of_map}; blocks.csv, simulated, SHA-256 34"
     assert simulated_files({"read for the posterior": behind}).startswith(both)
+
+
+def test_a_question_is_one_module(dipole, tmp_path, capsys, monkeypatch):
+    """The example of CONTRIBUTING: files, page, record, notebook and terminal say the same."""
+    code = re.search("```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S)[1]
+    (tmp_path / "toy_question.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    toy = importlib.import_module("toy_question")
+    found = toy.count(build_magnet(dipole()))
+    said = f"There are {sum(found.blocks)}."
+    shown = hf.write_report(found, tmp_path / "api")
+    assert sorted(path.name for path in shown.parent.iterdir()) == [
+        "count.csv", "count.html", "count.json", "page.json", "run.json"]
+    record = json.loads((tmp_path / "api" / "page.json").read_text())
+    assert record["answer"]["said"] == said
+    assert record["rows"] == [{"ring": "1", "blocks": str(found.blocks[0])}]
+    assert said in shown.read_text()
+    assert "count.csv, count.json, page.json" in shown.read_text()
+    assert said in found._repr_html_()
+    study = tmp_path / "study.toml"
+    study.write_text(tomlkit.dumps(DIPOLE))
+    for as_json in (False, True):
+        arguments = Namespace(study=study, output=tmp_path / "cli", json=as_json)
+        assert common.finish(arguments, toy.page(found)) == 0
+        printed = capsys.readouterr()
+        assert (said in printed.err) != as_json
+        assert ("Blocks by ring" in printed.out) != as_json
+    assert json.loads(printed.out)["blocks"] == list(found.blocks)
+    with pytest.raises(TypeError, match="has returned; instead received a str"):
+        hf.write_report("text", tmp_path / "none")

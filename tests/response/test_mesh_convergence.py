@@ -11,7 +11,8 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.verification import answer, write_verification
+from halbach_fe.report.result_files import write_report
+from halbach_fe.report.verification import answer
 from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.discretization_error import observed_order, refined, verify
 from halbach_fe.solver.formulation_choice import solve_nominal
@@ -133,10 +134,10 @@ def test_a_field_without_finite_elements(dipole, session, tmp_path):
     study = dipole(array__recoil_permeability=1.0)
     found = verify(build_magnet(study), session)
     assert "exact one of the blocks" in answer(found).said
-    write_verification(build_magnet(study), found, tmp_path, {})
+    write_report(found, tmp_path)
     page(tmp_path / "verification.html")
     assert not (tmp_path / "verification_convergence.png").exists()
     # negative control: a mesh whose refinement does not help is warned of
     stuck = replace(found, order=0.5, error_pointwise=0.01)
-    write_verification(build_magnet(study), stuck, tmp_path, {})
+    write_report(stuck, tmp_path)
     assert "the mesh should be finer" in page(tmp_path / "verification.html")
