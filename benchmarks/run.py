@@ -46,12 +46,12 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "real": real.emphatic, "overlap": real.overlap, "real_mri": real.mri, "faser": real.faser,
          "design": design.run, "mri": mri.run, "speed": speed.run, "speed_small": speed.small,
          "speed_full": speed.full, "speed_permeability": speed.permeability,
-         "speed_solvers": speed.solvers}
+         "speed_solvers": speed.solvers, "speed_waiting": speed.waiting}
 ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "check", "joined", "overlap",
          "unknown", "suspicion",
          "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
          "design", "mri", "speed", "speed_small", "speed_full", "speed_permeability",
-         "speed_solvers")
+         "speed_solvers", "speed_waiting")
 """Parts that are measured only when they are named: they take long."""
 
 

@@ -23,19 +23,22 @@ ROOT = Path(__file__).parent.parent
 BEFORE = "5c3aed3"
 """The last commit before the compiled field."""
 
-REPEATS = {"exact": 3, "help": 7, "diagnose-map": 1, "solve": 1, "response": 1}
+BEFORE_WAITING = "c8473ba"
+"""The last commit before check, register and the update of lattices were made fast."""
+
+REPEATS = {"exact": 3, "help": 7, "diagnose-map": 1, "solve": 1, "response": 1, "command": 1}
 
 HIDDEN = "block_displaced=6,5,3e-3,0,0"
 """A block that is displaced in the simulated maps: ring, slot, displacement in m."""
 
 
-def old_code() -> Path:
+def old_code(commit: str = BEFORE) -> Path:
     """Return a folder with the packages of the old code, which is installed there if need be."""
-    site = ROOT / "build" / f"before-{BEFORE}"
+    site = ROOT / "build" / f"before-{commit}"
     if not site.exists():
-        source = ROOT / "build" / "before-source"
+        source = ROOT / "build" / f"source-{commit}"
         source.mkdir(parents=True, exist_ok=True)
-        archive = subprocess.run(["git", "archive", BEFORE], cwd=ROOT, check=True,
+        archive = subprocess.run(["git", "archive", commit], cwd=ROOT, check=True,
                                  capture_output=True).stdout
         subprocess.run(["tar", "-x"], cwd=source, input=archive, check=True)
         subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps",
@@ -83,11 +86,13 @@ def run_task(
     return seconds, json.loads(done.stdout.splitlines()[-1])
 
 
-def both(name: str, folder: Path | None = None) -> tuple[dict[str, float], dict[str, float]]:
+def both(
+    name: str, folder: Path | None = None, commit: str = BEFORE
+) -> tuple[dict[str, float], dict[str, float]]:
     """Return the smallest figures of a task by the old code and by the new, run in turn."""
     runs: tuple[list[dict[str, float]], list[dict[str, float]]] = [], []
     for _ in range(REPEATS[name]):
-        for site, found in zip((old_code(), None), runs, strict=True):
+        for site, found in zip((old_code(commit), None), runs, strict=True):
             seconds, figures = run_task(name, site, folder)
             found.append({"processor_s": seconds, **figures})
     old, new = ({key: min(one[key] for one in found) for key in found[0]} for found in runs)
@@ -146,6 +151,27 @@ def _note_diagnosis(
          f"other effects named: {old['others']:g}, {new['others']:g}")
     note(f"diagnosis.seconds_{name}", new["wall_s"], "s",
          f"wall time; before {old['wall_s']:.3g} s")
+
+
+def waiting(note: Note) -> None:
+    """Note how much faster those commands are that people wait for.
+
+    What is compiled once is compiled before, by both, on the smaller of the tasks.
+    """
+    folder = ROOT / "build" / "speed" / "waiting"
+    if not (folder / "check-8892" / "map.csv").exists():
+        run_task("make-waiting", None, folder)
+    for site in (old_code(BEFORE_WAITING), None):
+        for name in ("register", "check-2565"):
+            run_task("command", site, folder / name)
+    for name, figure in (("register", "register.speedup"), ("check-2565", "check.speedup_2565"),
+                         ("check-8892", "check.speedup_8892"), ("infer", "infer.lattice_speedup")):
+        old, new = both("command", folder / name, BEFORE_WAITING)
+        answers = "".join(f"; {key} {old[key]:.4g}, {new[key]:.4g}" for key in new
+                          if key.endswith("_mm"))
+        note(figure, old["processor_s"] / new["processor_s"], "ratio",
+             f"processor time of the code before, commit {BEFORE_WAITING}: "
+             f"{old['processor_s']:.3g} s; now {new['processor_s']:.3g} s{answers}")
 
 
 def solvers(note: Note) -> None:

@@ -177,6 +177,114 @@ def diagnose_map(folder: Path) -> dict[str, float]:
             "wall_s": time.perf_counter() - begin}
 
 
+def make_waiting(folder: Path) -> dict[str, float]:
+    """Write a study and a map for each command that people wait for, into a folder each.
+
+    ``register`` has 338 cubes and 735 readings of a map that is displaced and turned, ``infer`` 404
+    hexagonal prisms with permeability and 588 readings; ``check`` two maps of the cubes.
+    """
+    from scipy.spatial.transform import Rotation
+
+    generator = np.random.default_rng(4)
+    bore = _grid(9, 0.05, 15, 0.06)
+    cubes = [(0.14 * np.cos(a), 0.14 * np.sin(a), z, 2 * a)
+             for z in np.linspace(-0.12, 0.12, 13) for a in 2 * np.pi * np.arange(26) / 26]
+    factors = 1 + 0.01 * generator.standard_normal(len(cubes))
+    pose = Rotation.from_rotvec([0.01, -0.02, 0.03])
+    lattice = [(x, y, z, 2 * np.arctan2(y, x)) for z in (-0.03, -0.01, 0.01, 0.03)
+               for x, y in ((0.0084 * (i + 0.5 * (j % 2)), 0.00756 * j)
+                            for i in range(-12, 13) for j in range(-12, 13))
+               if 0.033 < np.hypot(x, y) < 0.0655][:404]
+    tables = {
+        "register": (cubes, factors, bore, pose, {
+            "shape": "cuboid", "size_x_m": 0.012, "size_y_m": 0.012, "size_z_m": 0.012}),
+        "infer": (lattice, np.ones(404), _grid(9, 0.02, 12, 0.04), None, {
+            "shape": "polygon", "sides": 6, "radius_m": 0.004, "size_z_m": 0.018,
+            "recoil_permeability": 1.05}),
+        "check-2565": (cubes, factors, _grid(9, 0.05, 45, 0.06), pose, {}),
+        "check-8892": (cubes, factors, _grid(15, 0.05, 52, 0.06), pose, {})}
+    for name, (places, strengths, points, turned, shape) in tables.items():
+        here = folder / name
+        here.mkdir(parents=True, exist_ok=True)
+        if shape:
+            _write_blocks(here / "blocks.csv", places, shape)
+        _write_map(here / "map.csv", points, _field_of(
+            places, strengths, points, turned, cubes=name != "infer"), generator)
+    return {}
+
+
+def _grid(across: int, radius: float, along: int, half: float) -> Any:
+    """Points (n, 3) in m of a lattice within a cylinder about z."""
+    side = np.linspace(-radius, radius, across)
+    return np.array([(x, y, z) for x in side for y in side for z in np.linspace(-half, half, along)
+                     if np.hypot(x, y) <= 1.01 * radius])
+
+
+def _field_of(
+    places: Any, strengths: Any, points: Any, pose: Any, cubes: bool
+) -> Any:
+    """Field (n, 3) in T by magpylib in a map that is displaced by (1, -0.5, 2) mm and turned."""
+    import magpylib
+    from scipy.spatial.transform import Rotation
+
+    seen = points if pose is None else pose.apply(points) + np.array([1e-3, -5e-4, 2e-3])
+    total = np.zeros_like(points)
+    for (x, y, z, angle), strength in zip(places, strengths, strict=True):
+        body = magpylib.magnet.Cuboid(
+            polarization=(1.3 * strength, 0, 0), dimension=(0.012,) * 3, position=(x, y, z),
+            orientation=Rotation.from_rotvec([0, 0, angle])) if cubes else (
+            magpylib.misc.Dipole(
+                moment=np.array([np.cos(angle), np.sin(angle), 0]) * 1.3 / (4e-7 * np.pi)
+                * 6 * np.sqrt(3) / 4 * 0.004**2 * 0.018, position=(x, y, z)))
+        total += body.getB(seen)
+    return total if pose is None else pose.inv().apply(total)
+
+
+def _write_blocks(path: Path, places: Any, shape: dict[str, Any]) -> None:
+    """Write a table of free blocks of 1.3 T."""
+    names = ["name", "x_m", "y_m", "z_m", "remanence_x_T", "remanence_y_T", "remanence_z_T"]
+    turned = shape["shape"] == "cuboid"
+    own = {"rotation_z_deg", "remanence_T"} if turned else set(names[4:])
+    columns = [*names[:4], *sorted(own), *shape]
+    lines = [",".join(columns)]
+    for number, (x, y, z, angle) in enumerate(places):
+        known = {"name": f"b{number}", "x_m": x, "y_m": y, "z_m": z, "remanence_T": 1.3,
+                 "rotation_z_deg": np.degrees(angle), "remanence_x_T": 1.3 * np.cos(angle),
+                 "remanence_y_T": 1.3 * np.sin(angle), "remanence_z_T": 0.0, **shape}
+        lines.append(",".join(str(known[column]) for column in columns))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _write_map(path: Path, points: Any, field: Any, generator: Any) -> None:
+    """Write a map in T with noise of 20 µT."""
+    readings = field + 2e-5 * generator.standard_normal(field.shape)
+    np.savetxt(path, np.column_stack([points, readings, np.full(len(points), 2e-5)]),
+               delimiter=",", comments="", header="x_m,y_m,z_m,Bx_T,By_T,Bz_T,sigma_T")
+
+
+def command(folder: Path) -> dict[str, float]:
+    """Run the command that a folder is named by on its map, and return how good its answer is."""
+    from halbach_fe.cli import main
+
+    verb = folder.name.split("-")[0]
+    study = folder / "study.toml"
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(io.StringIO()):
+        if verb != "check" and not study.exists():
+            main(["new", str(study), "--free-blocks", str(folder / "blocks.csv")])
+        words = [str(folder / "map.csv")] if verb == "check" else [
+            str(study), "--measurements", str(folder / "map.csv")]
+        code = main([verb, *words, "-o", str(Path(name) / "out")])
+        found: dict[str, float] = {}
+        if verb == "register":
+            pose = json.loads((Path(name) / "out" / "registration.json").read_text())["poses"][0]
+            found = {f"{axis}_mm": 1e3 * value for axis, value in zip(
+                "xyz", pose["instrument"]["translation_m"], strict=True)}
+    if code:
+        raise SystemExit(code)
+    return found | {"wall_s": time.perf_counter() - begin}
+
+
 def solve(study: Path) -> dict[str, float]:
     """Solve a study, error bars included, by the command."""
     from halbach_fe.cli import main
@@ -210,6 +318,7 @@ def response(study: Path) -> dict[str, float]:
 
 TASKS: dict[str, Callable[..., dict[str, float]]] = {
     "exact": exact, "help": start, "make-map": make_map,
+    "make-waiting": make_waiting, "command": command,
     "diagnose-map": diagnose_map, "solve": solve, "response": response}
 
 

@@ -17,7 +17,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import points_on
+from halbach_fe.geometry.outline import outline_contains, points_on
 from halbach_fe.study.array import Array
 
 
@@ -94,8 +94,8 @@ def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
         direction = matrix @ np.array(block.easy_axis)
         known = [np.array(block.easy_axis), *(each for _, each in found)]
         nearest = min(np.linalg.norm(direction - each) for each in known)
-        if nearest > same_direction and block.contains(
-                _shrink(corners) @ matrix.T + corners.mean(axis=0)).all():
+        if nearest > same_direction and _fits(
+                block, _shrink(corners) @ matrix.T + corners.mean(axis=0)):
             found.append((_matrix_rows(matrix), direction))
     return tuple(turn for turn, _ in found)
 
@@ -196,18 +196,33 @@ def _pairs(
         there = turn @ blocks[number].middle + shift
         slot = to[int(np.linalg.norm(places - there, axis=1).argmin())]
         moved = (_shrink(corners) + corners.mean(axis=0)) @ turn.T + shift
-        if not blocks[slot].contains(moved).all():
+        if not _fits(blocks[slot], moved):
             return None
         found.append((slot, number))
     return tuple(found) if len({slot for slot, _ in found}) == len(to) else None
 
 
+def _fits(block: MagnetBlock, shrunk: Floats) -> bool:
+    """Tell whether points (n, 3) in m of a body that was shrunk all lie in the slot of a block.
+
+    None of them is on its surface, so that the distance from it, see `MagnetBlock.contains`, need
+    not be known.
+    """
+    places = block.to_frame(shrunk)
+    if not ((places[:, 2] > block.z_min) & (places[:, 2] < block.z_max)).all():
+        return False
+    return bool(outline_contains(block.outline, places[:, :2]).all())
+
+
+@lru_cache(maxsize=4096)
 def _corners(block: MagnetBlock) -> Floats:
     """Return points (n, 3) in m on the edges of a block; of an infinite one, at |z| of 1 m."""
     ends = [-1.0, 1.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
     outline = points_on(block.outline)
-    return block.from_frame(np.vstack([
+    corners = block.from_frame(np.vstack([
         np.column_stack([outline, np.full(len(outline), z)]) for z in ends]))
+    corners.flags.writeable = False
+    return corners
 
 
 def _shrink(corners: Floats) -> Floats:

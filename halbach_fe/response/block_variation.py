@@ -101,7 +101,6 @@ class Variations:
         interaction, found, names = Interaction(cells), [], []
         # rms field on the cylinder below which a mode is left out, at one prior standard deviation
         noticeable_T = 2e-5
-        jitter = 1e-9  # added to the diagonal of correlations, which are singular to rounding
         for number, block in enumerate(blocks):
             mine = slice(starts[number], starts[number + 1])
             places = cells.nodes[mine]
@@ -110,14 +109,15 @@ class Variations:
             own = Interaction(_select_cells(cells, mine))
             effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)
-            correlation = np.exp(-distance / (2 * length_m**2))
-            correlation[np.diag_indices(len(flat))] += jitter
-            root = sd * np.linalg.cholesky(correlation)
-            _, sizes, modes = np.linalg.svd(effect @ root, full_matrices=False)
-            kept = sizes / np.sqrt(len(effect) / 3) > noticeable_T
-            shapes = (root @ modes[kept].T).reshape(*places.shape[:2], 1, -1)
+            spread = sd**2 * np.exp(-distance / (2 * length_m**2)) @ effect.T
+            # the singular vectors of the effect, weighted by the prior, by its Gram matrix, which
+            # is smaller: sizes of interest are above 1e-4 of the largest one
+            squares, vectors = np.linalg.eigh(effect @ spread)
+            kept = np.flatnonzero(squares > noticeable_T**2 * len(effect) / 3)[::-1]
+            shapes = (spread @ (vectors[:, kept] / np.sqrt(squares[kept]))).reshape(
+                *places.shape[:2], 1, -1)
             found.append(shapes * easy[:, None])
-            names += [f"{block.name}.v{1 + mode:02d}" for mode in range(int(kept.sum()))]
+            names += [f"{block.name}.v{1 + mode:02d}" for mode in range(len(kept))]
         return cls(interaction, starts, tuple(found), tuple(names))
 
     def readings(self, observation: Observation, rows: slice) -> Floats:

@@ -23,6 +23,10 @@ CHORD = np.pi / 6
 """Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
 1.7 % of its radius on either side, if its area is right."""
 
+MOST_CORNERS = 6
+"""Largest number of corners of a convex polygon that is cut at the middles of its sides. A rounder
+one is cut from its centroid to every other corner, which makes half as many cells."""
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -233,15 +237,19 @@ def _scale_to_outline(quads: Floats, block: MagnetBlock) -> Floats:
 def quadrilaterals(outline: Outline, size: float, least: int = 1) -> Floats:
     """Cut an outline into convex quadrilaterals (k, 4, 2) of sides of about ``size``, in m.
 
-    A four-sided outline has at least ``least`` of them along either direction; others are in
-    several pieces anyway.
+    A four-sided outline has at least ``least`` of them along either direction; a convex polygon
+    that may have a single one is in as few pieces as possible, any other in several.
     """
     grid = _four_sided(outline)
     if grid is not None:
         return _grid(grid, size, least)
     polygon = _polygon(outline, size)
-    pieces = _cut_from_centroid(polygon) if _is_convex(polygon) else _merge_triangles(
-        polygon, _triangles(polygon))
+    if not _is_convex(polygon):
+        pieces = _merge_triangles(polygon, _triangles(polygon))
+    elif least == 1 and len(polygon) <= MOST_CORNERS:
+        pieces = _cut_from_corner(polygon)
+    else:
+        pieces = _cut_from_centroid(polygon)
     return np.concatenate([_grid(_edges(piece), size) for piece in pieces])
 
 
@@ -316,10 +324,7 @@ def _cut_from_centroid(polygon: Floats) -> list[Floats]:
     """Cut a convex polygon (m, 2) into quadrilaterals about its centroid."""
     centre = area_and_centroid(polygon[None])[1][0]
     count = len(polygon)
-    # largest number of corners of a convex polygon that is cut at the middles of its sides. A
-    # rounder one is cut from its centroid to every other corner, which makes half as many cells.
-    most_corners = 6
-    if count <= most_corners:
+    if count <= MOST_CORNERS:
         middles = (polygon + np.roll(polygon, -1, axis=0)) / 2
         return [np.array([polygon[i], middles[i], centre, middles[i - 1]]) for i in range(count)]
     pieces = [np.array([centre, polygon[i], polygon[i + 1], polygon[(i + 2) % count]])
@@ -327,6 +332,12 @@ def _cut_from_centroid(polygon: Floats) -> list[Floats]:
     if count % 2:
         pieces.append(np.array([centre, polygon[-1], polygon[0], polygon[0]]))
     return pieces
+
+
+def _cut_from_corner(polygon: Floats) -> list[Floats]:
+    """Cut a convex polygon (m, 2) into as few quadrilaterals as possible, a triangle among them."""
+    count = len(polygon)
+    return [polygon[[0, i, i + 1, min(i + 2, count - 1)]] for i in range(1, count - 1, 2)]
 
 
 def _triangles(polygon: Floats) -> list[tuple[int, int, int]]:

@@ -52,6 +52,15 @@ def test_cuboids_and_proportions():
     assert not cells_of([block("trapezoid")], 1).cuboid.any()
 
 
+def test_polygons_have_as_few_cells_as_possible():
+    """The time of columns grows with the square of the cells, and of a lattice of prisms."""
+    flat = {"triangle": (1, 3), "hexagon": (2, 6)}  # of the height of a cube of the same volume
+    for name, (least, finer) in flat.items():
+        body = block(name, height=float(np.cbrt(block(name, height=1.0).volume**1.5)))
+        assert len(cells_of([body], 1)) == least
+        assert len(cells_of([body], 2)) >= 2 * finer
+
+
 def test_blocks_of_an_array(short_dipole):
     """Sectors and cuboids of rings; chords of sectors without gaps do not overlap."""
     for shape in ({"shape": "sector"}, {"shape": "cuboid", "width_m": 0.03}):
