@@ -21,7 +21,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import RECORD, result_folder
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
-from halbach_fe.report.campaign_report import LONGEST_GIST, _gist, _parts, read_campaign
+from halbach_fe.report.campaign_report import _parts, read_campaign
 from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import PAGE_RECORD, Picture
 from halbach_fe.report.result_files import OWNERS
@@ -515,15 +515,6 @@ def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
     control = found_in(home, "field", "diagnosis", "better").answer
     assert control.trust.startswith(
         "Yes: they are of versions of the study that follow from each other,")
-
-
-def test_the_contents_say_what_each_result_says():
-    said = "The middle lies at 1.5 mm. Its odds are 1 : 1."
-    assert _gist(said) == "The middle lies at 1.5 mm."
-    assert _gist("Yes") == "Yes"
-    long = _gist("word, " * 100)
-    assert long.endswith("word …")
-    assert len(long) <= LONGEST_GIST + 2
 
 
 def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
