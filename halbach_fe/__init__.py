@@ -24,9 +24,13 @@ if TYPE_CHECKING:
     from halbach_fe.api import MultipoleTables as MultipoleTables
     from halbach_fe.api import demagnetization as demagnetization
     from halbach_fe.api import diagnose as diagnose
+    from halbach_fe.api import export as export
     from halbach_fe.api import homogeneity as homogeneity
+    from halbach_fe.api import import_map as import_map
     from halbach_fe.api import multipoles as multipoles
+    from halbach_fe.api import new as new
     from halbach_fe.api import plan as plan
+    from halbach_fe.api import prior as prior
     from halbach_fe.api import shim as shim
     from halbach_fe.api import simulate_measurement as simulate_measurement
     from halbach_fe.api import sort as sort
@@ -94,6 +98,7 @@ _HOME = {
                      "write_study"), "magnets"),
     "explain": "explanation", "Explanation": "explanation",
     "field_map": "measurement.field_map", "write_map": "measurement.field_map",
+    **dict.fromkeys(("new", "import_map", "export", "prior"), "api"),
     "register": "inference.registration", "Registration": "inference.pose_result",
     "prior_from_blocks": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
