@@ -581,7 +581,7 @@ def everywhere(home, text):
     said = json.loads((folder / PAGE_RECORD).read_text())
     said |= {"title": text, "rows": [{text or "x": text}], "provenance": {"programs": text},
              "answer": {key: text if isinstance(value, str) else False
-                        for key, value in said["answer"].items()}}
+                        for key, value in said["answer"].items()} | {"numbers": [[text, text]]}}
     said["figures"][0]["caption"] = text
     said["study"]["description"] = text.replace("\x1b", "").replace("\u202e", "")
     (folder / PAGE_RECORD).write_text(json.dumps(said))
