@@ -677,4 +677,4 @@ def test_page_records_are_of_what_is_on_the_page(tmp_path):
         "page": "one.html", "title": "Calibration", "rows": [{"a": "1"}],
         "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
         "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
-                   "sound": True, "concern": "", "changes_study": True}}
+                   "sound": True, "concern": "", "changes_study": True, "gist": "", "numbers": []}}
