@@ -187,5 +187,5 @@ def test_options_of_other_names_are_refused(tmp_path):
     for call in (partial(hf.new, tmp_path / "a.toml"), partial(hf.import_map, tmp_path / "a.csv")):
         with pytest.raises(hf.HalbachError, match="Input lenght"):
             call(lenght=1)
-    with pytest.raises(hf.HalbachError, match="format .*'stl'"):
+    with pytest.raises(hf.HalbachError, match=r"format .*'stl'"):
         hf.export(hf.field_map([[0, 0, 0]], [[1, 0, 0]], sigma_T=1e-5), tmp_path / "a", "stl")

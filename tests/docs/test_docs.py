@@ -148,7 +148,8 @@ def test_a_wrong_block_is_seen(tmp_path):
 def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("docs")
     subprocess.run([sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", DOCS,
-                    folder, "-D", "nb_execution_mode=off", "-d", folder / ".doctrees"], check=True, timeout=600)
+                    folder, "-D", "nb_execution_mode=off", "-d", folder / ".doctrees"],
+                   check=True, timeout=600)
     return folder
 
 
