@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core.arguments import typed
+from halbach_fe.core.arguments import refuse_unknown, typed
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
@@ -46,7 +46,6 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
-from halbach_fe.magnets import new_magnet
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.files import WRITERS, export_map
@@ -71,7 +70,6 @@ from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.free_blocks_file import write_free_blocks
 from halbach_fe.study.model import Study
-from halbach_fe.study.template import OUTER_RADIUS, MagnetTemplate, write_new_study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign
 
@@ -79,42 +77,8 @@ prior = prior_from_blocks
 
 
 @typed
-def new(path: str | Path, **values: object) -> Magnet:
-    """Write a commented study file to start from, and return its magnet.
-
-    Parameters
-    ----------
-    path : str or Path
-    **values
-        Those of the magnet that differ from the defaults: multipole_order, blocks_per_ring, rings,
-        inner_radius_m, outer_radius_m, ring_length_m, remanence_T or material, shape, iron_ring,
-        steel, dsv_m and so on, as the options of ``halbach-fe new`` are named.
-
-    Raises
-    ------
-    StudyError
-        If a value has another name, or makes no magnet.
-    OutputError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> import halbach_fe as hf
-    >>> hf.new("quadrupole.toml", multipole_order=2, inner_radius_m=0.02).name
-    'quadrupole'
-    """
-    _known(values, [one.name for one in fields(MagnetTemplate)], "hf.new")
-    if "inner_radius_m" in values and "outer_radius_m" not in values:
-        values["outer_radius_m"] = round(OUTER_RADIUS * float(str(values["inner_radius_m"])), 6)
-    path = as_path(path)
-    magnet, template = new_magnet(MagnetTemplate(**values), path.stem, path.parent)  # type: ignore[arg-type]
-    write_new_study(path, template)
-    return magnet
-
-
-@typed
 def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dataset:
-    """Read a map in another file format, in m and T.
+    r"""Read a map in another file format, in m and T.
 
     Parameters
     ----------
@@ -137,11 +101,11 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
     --------
     >>> import halbach_fe as hf
     >>> with open("mm.txt", "w") as file:
-    ...     _ = file.write("x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT]\\n1,2,3,4,5,6\\n")
+    ...     _ = file.write("x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT]\n1,2,3,4,5,6\n")
     >>> float(hf.import_map("mm.txt")["B_T"][0, 2])
     0.006
     """
-    _known(declared, [one.name for one in fields(DeclaredFormat)], "hf.import_map")
+    refuse_unknown(declared, [one.name for one in fields(DeclaredFormat)], "hf.import_map")
     if format not in ("", *FORMATS):
         raise MeasurementError(must_be("format", "hf.import_map", f"one of {', '.join(FORMATS)}",
                                        f"'{format}'"))
@@ -188,13 +152,6 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     else:
         export_map(content, format, path)
     return path
-
-
-def _known(given: Mapping[str, object], names: Sequence[str], where: str) -> None:
-    """Refuse options of other names by a StudyError."""
-    if unknown := sorted(given.keys() - {*names}):
-        raise StudyError(must_be(unknown[0], where, f"left out, or one of {', '.join(names)}",
-                                 repr(given[unknown[0]])))
 
 
 @dataclass(frozen=True)

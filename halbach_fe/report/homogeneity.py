@@ -102,7 +102,8 @@ def answer(found: HomogeneityResult) -> Answer:
             question, f"{text}.",
             f"{agreement(found.disagreement)} {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
-            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small, numbers=numbers)
+            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small,
+            numbers=numbers)
     measure = ("Measure it, and update its blocks with the map; then ask again with --posterior "
                "and the posterior.h5 that this command writes into its DIR:",
                "halbach-fe infer STUDY --measurements MAP -o DIR")

@@ -193,7 +193,8 @@ def write_inference_report(
         provenance=provenance, result=result, multipoles=middle_table(multipoles, result.study),
         rows=score_table(result, published), published=published, assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet),
-        answer=said, blocks=block_table(result), contraction=_contraction_in_words(result, contraction),
+        answer=said, blocks=block_table(result),
+        contraction=_contraction_in_words(result, contraction),
         terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
         noise=[flux_density(float(end), 2)
                for end in (result.noise.sd.min(), result.noise.sd.max())],
