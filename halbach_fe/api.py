@@ -90,6 +90,11 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
         component, at, origin_m, decimal_comma, encoding, as the options of ``halbach-fe
         import-map`` are named.
 
+    Returns
+    -------
+    Dataset
+        The map, as of `halbach_fe.read_map`.
+
     Raises
     ------
     StudyError

@@ -379,6 +379,10 @@ def new(path: str | Path, **values: object) -> Magnet:
         inner_radius_m, outer_radius_m, ring_length_m, remanence_T or material, shape, iron_ring,
         steel, dsv_m and so on, as the options of ``halbach-fe new`` are named.
 
+    Returns
+    -------
+    Magnet
+
     Raises
     ------
     StudyError
