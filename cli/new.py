@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CommandLineError, must_be
 from halbach_fe.magnets import new_magnet
-from halbach_fe.study.template import MagnetTemplate, write_new_study
+from halbach_fe.study.template import OUTER_RADIUS, MagnetTemplate, write_new_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         given["iron_ring"] = True
     inner = max([*given.get("inner_radii_m", ()), given.get("inner_radius_m", 0.0)])
     if inner:
-        given.setdefault("outer_radius_m", round(1.8 * inner, 6))
+        given.setdefault("outer_radius_m", round(OUTER_RADIUS * inner, 6))
     path, folder = arguments.study, arguments.study.parent
     if "free_blocks" in given:
         given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)

@@ -17,9 +17,12 @@ from latex2mathml.converter import convert
 
 project = "halbach-fe"
 release = metadata.version("halbach-fe")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120  # in s, of a cell
 autosummary_generate = True
 autodoc_typehints = "description"
 napoleon_google_docstring = False
@@ -33,7 +36,10 @@ suppress_warnings = ["ref.python"]  # words of shapes are no cross-references
 exclude_patterns = ["_build"]
 
 CONTENTS = {
-    "Start": ("tutorial", "from-python", "glossary"),
+    "Start": ("tutorial", "from-python", "coming-from", "questions", "glossary"),
+    "Examples": ("examples", *(f"examples/{example}" for example in (
+        "ring", "quadrupole", "mri", "magpylib", "iron", "undulator", "check", "register", "infer",
+        "diagnose", "forces", "corner", "tolerance", "shim"))),
     "Gallery": ("gallery", *(f"gallery/{study}" for study in (
         "faser", "linear-3d", "nonlinear-2d", "quadrupole", "cubes", "mri", "mandhala", "mri4all",
         "mri-large", "emphatic", "hybrid-quadrupole", "sensitivity", "calibration", "diagnosis"))),

@@ -24,9 +24,12 @@ if TYPE_CHECKING:
     from halbach_fe.api import MultipoleTables as MultipoleTables
     from halbach_fe.api import demagnetization as demagnetization
     from halbach_fe.api import diagnose as diagnose
+    from halbach_fe.api import export as export
     from halbach_fe.api import homogeneity as homogeneity
+    from halbach_fe.api import import_map as import_map
     from halbach_fe.api import multipoles as multipoles
     from halbach_fe.api import plan as plan
+    from halbach_fe.api import prior as prior
     from halbach_fe.api import shim as shim
     from halbach_fe.api import simulate_measurement as simulate_measurement
     from halbach_fe.api import sort as sort
@@ -60,6 +63,7 @@ if TYPE_CHECKING:
     from halbach_fe.magnets import from_magpylib as from_magpylib
     from halbach_fe.magnets import halbach_ring as halbach_ring
     from halbach_fe.magnets import magnet_of_blocks as magnet_of_blocks
+    from halbach_fe.magnets import new as new
     from halbach_fe.magnets import to_magpylib as to_magpylib
     from halbach_fe.magnets import write_study as write_study
     from halbach_fe.measurement.block_table import BlockTable as BlockTable
@@ -92,8 +96,9 @@ if TYPE_CHECKING:
 _HOME = {
     **dict.fromkeys(("halbach_ring", "magnet_of_blocks", "from_magpylib", "to_magpylib",
                      "write_study"), "magnets"),
-    "explain": "explanation", "Explanation": "explanation",
+    "new": "magnets", "explain": "explanation", "Explanation": "explanation",
     "field_map": "measurement.field_map", "write_map": "measurement.field_map",
+    **dict.fromkeys(("import_map", "export", "prior"), "api"),
     "register": "inference.registration", "Registration": "inference.pose_result",
     "prior_from_blocks": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",

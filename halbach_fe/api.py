@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core.arguments import typed
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.arguments import refuse_unknown, typed
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
 from halbach_fe.core.pace import Progress
@@ -38,12 +40,16 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import Say
+from halbach_fe.geometry.free_blocks import blocks_table
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
+from halbach_fe.measurement.formats.files import WRITERS, export_map
+from halbach_fe.measurement.formats.files import import_map as read_foreign_map
 from halbach_fe.measurement.instrument import check_total_field
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
@@ -62,9 +68,95 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.free_blocks_file import write_free_blocks
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign
+
+prior = prior_from_blocks
+
+
+@typed
+def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dataset:
+    r"""Read a map in another file format, in m and T.
+
+    Parameters
+    ----------
+    path : str or Path
+    format : str, optional
+        ``columns``, ``opera`` and so on; by default it is recognized from the content.
+    **declared
+        What the file does not state: columns (a list), length_unit, field_unit, angle_unit,
+        component, at, origin_m, decimal_comma, encoding, as the options of ``halbach-fe
+        import-map`` are named.
+
+    Returns
+    -------
+    Dataset
+        The map, as of `halbach_fe.read_map`.
+
+    Raises
+    ------
+    StudyError
+        If an option has another name.
+    MeasurementError
+        If the file cannot be read as a map; the message says what to add.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> with open("mm.txt", "w") as file:
+    ...     _ = file.write("x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT]\n1,2,3,4,5,6\n")
+    >>> float(hf.import_map("mm.txt")["B_T"][0, 2])
+    0.006
+    """
+    refuse_unknown(declared, [one.name for one in fields(DeclaredFormat)], "hf.import_map")
+    if format not in ("", *FORMATS):
+        raise MeasurementError(must_be("format", "hf.import_map", f"one of {', '.join(FORMATS)}",
+                                       f"'{format}'"))
+    if "columns" in declared:
+        declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
+    return read_foreign_map(as_path(path), DeclaredFormat(**declared), format).data  # type: ignore[arg-type]
+
+
+@typed
+def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") -> Path:
+    """Write a map, or the table of a magnet's blocks, for another program.
+
+    Parameters
+    ----------
+    content : Dataset or Magnet
+        A map is written in a ``format``: openpmd, bdsim, geant4, csv or vtu. Of a magnet the table
+        of its free blocks is written (CSV or HDF5).
+    path : str or Path
+    format : str, optional
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    MeasurementError
+        If the format is unknown, or needs a regular grid that the map is not.
+    OutputError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.export(hf.build_magnet(hf.read_study("dipole.toml")), "blocks.csv").name
+    'blocks.csv'
+    """
+    path = as_path(path)
+    if isinstance(content, Magnet):
+        write_free_blocks(blocks_table(content), path)
+    elif format not in WRITERS:
+        raise MeasurementError(must_be("format", "hf.export", f"one of {', '.join(WRITERS)}",
+                                       f"'{format}'"))
+    else:
+        export_map(content, format, path)
+    return path
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ any of it, and `write_study` writes it down.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.arguments import refuse_unknown, typed
 from halbach_fe.core.errors import OutputError, StudyError, must_be
-from halbach_fe.core.files import write_text
+from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -27,7 +28,13 @@ from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
 from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
 from halbach_fe.study.model import Study
-from halbach_fe.study.template import MagnetTemplate, new_study, parse_new_study
+from halbach_fe.study.template import (
+    OUTER_RADIUS,
+    MagnetTemplate,
+    new_study,
+    parse_new_study,
+    write_new_study,
+)
 from halbach_fe.synthetic.optional_packages import import_extra
 
 WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
@@ -374,3 +381,41 @@ def _source(magpylib: Any, table: FreeBlocks, number: int) -> Any:
     return magpylib.magnet.TriangularMesh.from_ConvexHull(points=np.vstack([
         np.column_stack([corners, np.full(len(corners), z)]) for z in (-length / 2, length / 2)]),
         **common)
+
+
+@typed
+def new(path: str | Path, **values: object) -> Magnet:
+    """Write a commented study file to start from, and return its magnet.
+
+    Parameters
+    ----------
+    path : str or Path
+    **values
+        Those of the magnet that differ from the defaults: multipole_order, blocks_per_ring, rings,
+        inner_radius_m, outer_radius_m, ring_length_m, remanence_T or material, shape, iron_ring,
+        steel, dsv_m and so on, as the options of ``halbach-fe new`` are named.
+
+    Returns
+    -------
+    Magnet
+
+    Raises
+    ------
+    StudyError
+        If a value has another name, or makes no magnet.
+    OutputError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> hf.new("quadrupole.toml", multipole_order=2, inner_radius_m=0.02).name
+    'quadrupole'
+    """
+    refuse_unknown(values, [one.name for one in fields(MagnetTemplate)], "hf.new")
+    if "inner_radius_m" in values and "outer_radius_m" not in values:
+        values["outer_radius_m"] = round(OUTER_RADIUS * float(str(values["inner_radius_m"])), 6)
+    path = as_path(path)
+    magnet, template = new_magnet(MagnetTemplate(**values), path.stem, path.parent)  # type: ignore[arg-type]
+    write_new_study(path, template)
+    return magnet

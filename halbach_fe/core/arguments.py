@@ -6,7 +6,7 @@ import functools
 import inspect
 import os
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, ParamSpec, TypeVar
@@ -68,3 +68,10 @@ def _own_classes(hint: Any) -> tuple[type, ...]:
                 and part.__module__.startswith("halbach_fe."))
     return (*own, NoneType) if own and {*parts} - {*own} == {NoneType} else (
         own if len(own) == len(parts) else ())
+
+
+def refuse_unknown(given: Mapping[str, object], names: Sequence[str], where: str) -> None:
+    """Refuse options of other names by a StudyError."""
+    if unknown := sorted(given.keys() - {*names}):
+        raise StudyError(must_be(unknown[0], where, f"left out, or one of {', '.join(names)}",
+                                 repr(given[unknown[0]])))

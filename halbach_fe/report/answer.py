@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +26,9 @@ MAP_OPTIONS = "options of MAP"
 
 LISTED_MAPS = "maps of STUDY"
 """Key of whether the study lists its maps, so that a command must not name one."""
+
+MOST_WORDS = 40
+"""Largest number of words of a box in large type, which are read at a glance."""
 
 TAKE_LISTED_MAPS = ("infer", "diagnose", "register")
 """Commands that take the maps that a study lists."""
@@ -89,6 +93,10 @@ class Answer:
     changes_study : bool
         Whether a study that the command wrote says something else than the one that it read, beyond
         the error bars. Otherwise results of the one are as good as those of the other.
+    gist : str
+        The answer in a sentence, where that is not the first one of ``said``.
+    numbers : tuple of (str, str)
+        What the answer is about, and its size with a unit: the largest type of the page.
     """
 
     question: str
@@ -99,6 +107,26 @@ class Answer:
     sound: bool = True
     concern: str = ""
     changes_study: bool = True
+    gist: str = ""
+    numbers: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """The gist, or the first sentence, as far as the words of large type suffice."""
+        first = self.gist or _first_sentence(self.said)
+        words = first.split(" ")
+        most = MOST_WORDS - sum(len(f"{name} {size}".split(" ")) for name, size in self.numbers)
+        return first if len(words) <= most else f"{' '.join(words[:most - 1]).rstrip(',;:(')} …"
+
+    @property
+    def short_trust(self) -> str:
+        """The verdict on whether it can be trusted, and the first reason."""
+        return _first_sentence(self.trust)
+
+    @property
+    def level(self) -> str:
+        """How far it can be trusted: "", "partial" or "doubtful"."""
+        return ("partial" if self.trust.startswith("Only") else "" if self.sound else "doubtful")
 
     @property
     def sentences(self) -> tuple[str, str, str]:
@@ -147,6 +175,12 @@ class Answer:
         """
         return self.with_paths({
             name: path for name, path in (_NAMES.get() or {}).items() if folder or name != "DIR"})
+
+
+def _first_sentence(text: str) -> str:
+    """Return the first sentence of a text, or two if the first is a mere verdict, as "Passed."."""
+    first, *others = re.split(r"(?<=[.!?]) (?=[A-Z])", text)
+    return first if " " in first else " ".join([first, *others[:1]])
 
 
 def agreement(disagreement: str | None) -> str:

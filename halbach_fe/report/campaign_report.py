@@ -40,9 +40,6 @@ POSTERIOR = "posterior.h5"
 MOST_ROWS = 40
 """Largest number of rows of a folded table. All of them are on its page."""
 
-LONGEST_GIST = 240
-"""Largest number of characters of an answer that the contents quote."""
-
 SHORT_DIGEST = 16
 """Digits of SHA-256 that the page shows."""
 
@@ -176,7 +173,44 @@ class Campaign:
         if self.doubts and not left:
             step = f"Mend what does not fit together, as the list below says. After that: {step}"
         return Answer("What is known of this magnet?", said, trust, step,
-                      last.command if last else "", sound=not (self.doubts or left))
+                      last.command if last else "", sound=not (self.doubts or left),
+                      gist=self._gist(), numbers=self._numbers())
+
+    def _used(self, *verbs: str) -> list[tuple[Page, Answer]]:
+        """Return the pages and answers of commands that no later result replaces, sound ones if
+        there are any, in the order of ``verbs`` and then of the page.
+        """
+        found = [(page, answer) for verb in verbs for chapter, page, answer in self.answered
+                 if chapter.verb == verb and self.replaced(chapter) is None]
+        return [each for each in found if each[1].sound] or found
+
+    def _numbers(self) -> tuple[tuple[str, str], ...]:
+        """Return the field in the region of an MRI magnet, and the largest force; or else how far
+        off the first update began and the last one ended; or else what the last result says.
+        """
+        region = [one.numbers for _, one in self._used("homogeneity")[-1:]]
+        if region and region[0]:
+            return region[0] + tuple(each for _, one in self._used("forces")[-1:]
+                                     for each in one.numbers)
+        updates = [answer.numbers for chapter, _, answer in self.answered
+                   if chapter.verb == "infer" and answer.numbers]
+        last = [answer.numbers for _, answer in self._used("infer") if answer.numbers]
+        if updates:
+            return updates[0][:1] + (last or updates)[-1][1:]
+        return next((answer.numbers for _, _, answer in reversed(self.answered)
+                     if answer.numbers), ())
+
+    def _gist(self) -> str:
+        """Say in a sentence each what is known of the magnet and of its map; empty without."""
+        changed = [answer for _, answer in self._used("diagnose") if answer.changes_study]
+        magnet = changed[-1:] or [answer for _, answer in self._used("infer")[-1:]]
+        of_map = [answer for _, answer in self._used("check", "register")[-1:]]
+        return " ".join(one.headline for one in magnet + of_map)
+
+    def lead(self) -> Picture | None:
+        """Return the picture that says most of all: of the region, or of the last update."""
+        return next((page.picture for verb in ("homogeneity", "infer", "diagnose")
+                     for page, _ in reversed(self._used(verb)) if page.picture is not None), None)
 
     def _verdict(self, left: Sequence[str]) -> str:
         """Say whether all answers can be trusted; ``left`` are the folders of those that cannot."""
@@ -364,17 +398,19 @@ def _html(campaign: Campaign, path: Path) -> str:
     picture = geometry_figure(magnet, points_from(campaign.study.observation.positions))
     return rendered(
         "campaign_report.html.j2", campaign.study, answer=campaign.answer, pictures=[],
-        magnet=in_one_line(magnet), picture=Picture(
+        magnet=in_one_line(magnet), lead=(lead := campaign.lead()), picture=Picture(
             base64.b64encode(png_of(picture)).decode(),
-            "The blocks with their magnetization and slots, and the positions of the study"),
+            "The blocks with their magnetization, and the positions of the study"),
         doubts=campaign.doubts, versions=campaign.versions,
-        parts=_parts(campaign, path),
+        parts=_parts(campaign, path, lead),
         folders=_folder_rows(campaign), inputs=_input_rows(campaign),
         provenance={"programs": programs()})
 
 
-def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
-    """Return what the template shows of every page."""
+def _parts(
+    campaign: Campaign, output: Path, lead: Picture | None = None
+) -> list[dict[str, object]]:
+    """Return what the template shows of every page; the picture ``lead`` stands at the top."""
     pages = [(chapter, page) for chapter in campaign.chapters for page in chapter.pages]
     first = {chapter.label: number for number, (chapter, _) in reversed(list(enumerate(pages, 1)))}
     found = []
@@ -392,20 +428,13 @@ def _parts(campaign: Campaign, output: Path) -> list[dict[str, object]]:
             "name": _shown(PurePath(chapter.label) / PurePath(page.path).parent),
             "of": _shown(next(of, "")),
             "command": chapter.record.command, "ended": _date(chapter.record.ended),
-            "answer": answer, "gist": _gist(answer.said) if answer else "",
+            "answer": answer, "gist": answer.headline if answer else "",
             "next": done and first[done.label],
             "where": "above" if earlier else "below",
-            "picture": page.picture,
+            "picture": None if page.picture is lead else page.picture,
             "rows": rows[:MOST_ROWS], "all_rows": len(rows), "page": files.get(page.path),
             "files": {_shown(name): address for name, address in files.items()}})
     return found
-
-
-def _gist(said: str) -> str:
-    """Return the first sentence of an answer, or its beginning if that is long."""
-    first = re.split(r"(?<=[.!?]) (?=[A-Z])", said, maxsplit=1)[0]
-    return first if len(first) <= LONGEST_GIST else (
-        first[:LONGEST_GIST].rpartition(" ")[0].rstrip(",;:") + " …")
 
 
 def _shown(text: object) -> str:

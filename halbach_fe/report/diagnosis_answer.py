@@ -27,6 +27,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import symmetry_images
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
+from halbach_fe.report.inference_answer import distances
 from halbach_fe.report.unknown_cause import (
     more_readings,
     suspicion_in_words,
@@ -86,7 +87,7 @@ def answer(diagnosis: Diagnosis) -> Answer:
         diagnosis, sound), *_next(diagnosis), sound, "" if not remedies else (
             f"The magnet was not assembled as designed: {in_a_row(remedies)}, or use "
             f"{STUDY_FILE}, which describes it with these errors."),
-        diagnosis.found_anything)
+        diagnosis.found_anything, numbers=distances(diagnosis.before, diagnosis.after))
 
 
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:

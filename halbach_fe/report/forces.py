@@ -85,7 +85,7 @@ def answer(found: Forces) -> Answer:
         "Yes, for the blocks of the study, at rest in their places: a block that is 1 % stronger "
         "feels 1 % more, and one that comes nearer to its neighbours than its place is may feel "
         f"more. The integration itself is right to {_newton(error)}.", *plan,
-        sound=error <= ROUGH * size)
+        sound=error <= ROUGH * size, numbers=(("largest force in place", _newton(size)),))
 
 
 def _on_rings(found: Forces) -> list[str]:
@@ -219,6 +219,17 @@ def _columns(found: Forces) -> dict[str, Iterable[object]]:
     return columns
 
 
+def _drawn_ring(found: Forces) -> list[int]:
+    """Return the indices of the blocks of the ring with the largest force."""
+    ring = found.blocks[int(np.argmax(found.in_place.magnitude))].ring
+    return [number for number, block in enumerate(found.blocks) if block.ring == ring]
+
+
+def _is_numbered(found: Forces) -> bool:
+    """Tell whether the blocks of the ring that is drawn have their numbers."""
+    return len(_drawn_ring(found)) <= NUMBERED_SLOTS
+
+
 def forces_figure(found: Forces) -> Figure:
     """Draw the ring with the largest force, and the forces by the order of insertion."""
     figure = figure_of(8.8)
@@ -245,8 +256,7 @@ def round_below(size: float) -> float:
 def _draw_ring(axis: Axes, found: Forces) -> None:
     """Draw the blocks of the ring with the largest force, coloured, with arrows of their forces."""
     size = found.in_place.magnitude
-    ring = found.blocks[int(np.argmax(size))].ring
-    chosen = [number for number, block in enumerate(found.blocks) if block.ring == ring]
+    chosen = _drawn_ring(found)
     t = np.linspace(0, 1, 9)
     corners = []
     for number in chosen:
@@ -256,7 +266,7 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
         corners.append(1e3 * block.from_frame(
             np.column_stack([outline, np.full(len(outline), height)]))[:, :2])
     colours = Normalize(0, float(size[chosen].max()) or 1.0)
-    if len(chosen) <= NUMBERED_SLOTS:
+    if _is_numbered(found):
         outside = 1.1 * max(float(np.hypot(*corner.T).max()) for corner in corners)
         for number in chosen:
             block, (x, y, _) = found.blocks[number], found.blocks[number].middle
@@ -280,7 +290,7 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
                          location="bottom", shrink=0.6)
     reach = 1.3 * float(np.abs(np.vstack(corners)).max())
     axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm", xlim=(-reach, reach),
-             ylim=(-reach, reach), title=f"ring {ring}")
+             ylim=(-reach, reach), title=f"ring {found.blocks[chosen[0]].ring}")
 
 
 @page_of.register
@@ -304,6 +314,7 @@ def page(found: Forces) -> Page:
         {"Largest forces in place": rows},
         figures={"forces.png": (
             partial(forces_figure, found), "Above: forces in place in the ring of the largest one; "
-            "arrows show their part in the plane, numbers are slots. Below: forces in the order of "
-            "the assembly")},
+            "arrows show their part in the plane"
+            f"{', numbers are slots' if _is_numbered(found) else ''}. Below: forces in the order "
+            "of the assembly")},
         files={"forces.csv": csv_file(_columns(found), {"study": found.magnet.name})})

@@ -33,7 +33,7 @@ from halbach_fe.report.page import (
     page_of,
 )
 from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.words import decimals, ppm, with_error
+from halbach_fe.report.words import decimals, flux_density, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 from halbach_fe.study.model import Study
 
@@ -87,6 +87,8 @@ def answer(found: HomogeneityResult) -> Answer:
             "region is 0 but for errors of the blocks, as in a multipole.", "See its multipoles.",
             "halbach-fe multipoles STUDY -o DIR", sound=False)
     trust, small = solver_error_text(found.model, best.rms_ppm)
+    numbers = (("mean field", flux_density(best.mean_T, 4)),
+               ("rms deviation", f"{ppm(best.rms_ppm)}\u00a0ppm"))
     if name != "prior" and found.disagreement:
         return of_a_conflict(question, f"{text}.", found.disagreement)
     better: tuple[str, str] | None = None
@@ -94,13 +96,14 @@ def answer(found: HomogeneityResult) -> Answer:
         better = _better_design(found.magnet.study, best.rms_ppm)
     if name != "prior" and better:
         return Answer(question, f"{text}.", f"{agreement(found.disagreement)} {trust}", *better,
-                      small)
+                      small, numbers=numbers)
     if name != "prior":
         return Answer(
             question, f"{text}.",
             f"{agreement(found.disagreement)} {trust}",
             "If that is too much, put [shim_tray] into the study and fill the tray with small "
-            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small)
+            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small,
+            numbers=numbers)
     measure = ("Measure it, and update its blocks with the map; then ask again with --posterior "
                "and the posterior.h5 that this command writes into its DIR:",
                "halbach-fe infer STUDY --measurements MAP -o DIR")
@@ -108,7 +111,7 @@ def answer(found: HomogeneityResult) -> Answer:
         question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
         f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
-        *(better or measure), small)
+        *(better or measure), small, numbers=numbers)
 
 
 def _better_design(study: Study, rms_ppm: float) -> tuple[str, str]:

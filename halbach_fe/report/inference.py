@@ -29,13 +29,16 @@ from halbach_fe.report.prediction import (
     whitened_quantiles_figure,
 )
 from halbach_fe.report.stray_field import stray_pictures, stray_section
-from halbach_fe.report.words import decimals, flux_density, ppm, relative
+from halbach_fe.report.words import decimals, flux_density, place_of, ppm, relative, with_error
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.multipoles import circle_models
 
 NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 """Largest numbers of slots and rings for which the contraction figure prints its values."""
+
+RANKED = 8
+"""Number of the blocks that a page lists: those that deviate most."""
 
 ALIKE = 0.03
 """Range of the contractions of all blocks up to which they are said instead of drawn."""
@@ -92,6 +95,35 @@ def score_table(result: InferenceResult,
 
 def _chi2(value: float | None) -> str:
     return NOTHING if value is None else decimals(value)
+
+
+def block_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: the blocks that deviate most, the one that is least likely first.
+
+    That is by the change of the magnetization along and across the easy axis, each in standard
+    deviations of its prior.
+    """
+    nominal = result.by_block(result.response.nominal)
+    size = np.linalg.norm(nominal, axis=1)
+    there = np.flatnonzero(size)  # without the places of missing blocks
+    axes = nominal[there] / size[there, None]
+    change = result.by_block(result.posterior.mean - result.response.nominal)[there]
+    along = np.einsum("ij,ij->i", change, axes)
+    across = np.linalg.norm(change - along[:, None] * axes, axis=1)
+    prior_sd = result.by_block(result.prior.sd)[there]
+    distance = np.linalg.norm(change / np.where(prior_sd > 0, prior_sd, np.inf), axis=1)
+    rows = []
+    for one in np.argsort(-distance, kind="stable")[:RANKED].tolist():
+        row = np.zeros((1, len(result.posterior.mean)))
+        result.by_block(row[0])[there[one]] = axes[one]
+        sd, of = result.posterior.sd_of(row)[0], 100 / size[there[one]]
+        turn = np.degrees(np.arctan2(across[one], size[there[one]] + along[one]))
+        rows.append({
+            "block": place_of(result.magnet.blocks[there[one]]),
+            "along the easy axis": f"{with_error(of * along[one], of * sd)}\u00a0%",
+            "turned by": f"{decimals(float(turn), 2)}°",
+            "standard deviations of its prior": decimals(float(distance[one]), 2)})
+    return rows
 
 
 @own_style
@@ -161,7 +193,8 @@ def write_inference_report(
         provenance=provenance, result=result, multipoles=middle_table(multipoles, result.study),
         rows=score_table(result, published), published=published, assumptions=assumptions,
         magnet_rows=magnet_rows(result.magnet),
-        answer=said, contraction=_contraction_in_words(result, contraction),
+        answer=said, blocks=block_table(result),
+        contraction=_contraction_in_words(result, contraction),
         terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
         noise=[flux_density(float(end), 2)
                for end in (result.noise.sd.min(), result.noise.sd.max())],

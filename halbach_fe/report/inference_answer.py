@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
@@ -40,6 +41,7 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     The field is the main one of ``tables``, the multipoles of the study's circles.
     """
     said = f"{_prediction(result)} {_blocks(result)}"
+    numbers = distances(result, result)
     question = "What is the measured magnet like?"
     solver = _of_the_solver(result)
     if result.disagreement:
@@ -48,7 +50,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         return Answer(question, f"{wrong}, so that these numbers and their "
                       f"error bars are not to be used as they stand. {said}",
                       f"No. {result.disagreement}{solver}",
-                      *_after_a_conflict(result), sound=False)
+                      *_after_a_conflict(result), sound=False, numbers=numbers,
+                      gist=f"{wrong}: these numbers are not to be used.")
     tested = "" if result.held_out.any() else (
         " No reading was held out, so that this is no test of the predictions: hold some out by "
         "[inference.held_out] or --held-out.")
@@ -64,7 +67,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
         *(LOOK if single or (shared and "update again" not in result.reservation) else
-          AGAIN if shared else _after_agreement(result)), sound=not (single or shared))
+          AGAIN if shared else _after_agreement(result)), sound=not (single or shared),
+        gist=_blocks(result, "The blocks deviate"), numbers=numbers)
 
 
 def _after_agreement(result: InferenceResult) -> tuple[str, str]:
@@ -177,15 +181,12 @@ def _numbers(values: Floats, form: str) -> str:
 
 def _prediction(result: InferenceResult) -> str:
     """Say how far the predictions are from readings, if possible from ones that it has not seen."""
-    parts = np.array(result.parts)
-    part = next((name for name in (HELD_OUT_MAP, HELD_OUT) if (parts == name).any()), None)
-    chosen = parts == part if part else np.ones(len(parts), bool)
+    part, chosen = _tested(result)
     before, after = (_rms((result.readings - each.mean)[chosen])
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
         return (f"The updated magnet differs from the readings by {_field(after)} rms, "
                 f"before the update {_before(result)} differed by {_field(before)}.")
-    expected = np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen]
     bands = [(score.readings, score.coverage95_posterior) for score in result.scores
              if score.part == part and score.coverage95_posterior is not None]
     held = sum(count * share for count, share in bands) / sum(count for count, _ in bands)
@@ -193,9 +194,32 @@ def _prediction(result: InferenceResult) -> str:
           else "readings that were held out")
     return (f"The updated magnet predicts {chosen.sum()} {of} to "
             f"{_field(after)} rms, where its error bars and the noise allow "
-            f"{_field(_rms(expected))}; before the update, {_before(result)} was "
+            f"{_field(_expected(result))}; before the update, {_before(result)} was "
             f"{_field(before)} off. "
             f"The 95 % band holds {fraction(held)} of them.")
+
+
+def _tested(result: InferenceResult) -> tuple[str | None, NDArray[np.bool_]]:
+    """Return the part of the readings that the update has not seen, and a mask (readings,) of it;
+    None and all readings if it has seen all.
+    """
+    parts = np.array(result.parts)
+    part = next((name for name in (HELD_OUT_MAP, HELD_OUT) if (parts == name).any()), None)
+    return part, parts == part if part else np.ones(len(parts), bool)
+
+
+def _expected(result: InferenceResult) -> float:
+    """Return the rms difference in T that error bars and noise allow."""
+    _, chosen = _tested(result)
+    return _rms(np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen])
+
+
+def distances(first: InferenceResult, last: InferenceResult) -> tuple[tuple[str, str], ...]:
+    """Return how far the model is off before the first of two updates, and after the last one."""
+    off = [_rms((result.readings - prediction.mean)[_tested(result)[1]]) for result, prediction in (
+        (first, first.prediction_prior), (last, last.prediction_posterior))]
+    return (("off before", _field(off[0])), ("after", _field(off[1])),
+            ("noise and error bars", _field(_expected(last))))
 
 
 def _before(result: InferenceResult) -> str:
@@ -204,7 +228,8 @@ def _before(result: InferenceResult) -> str:
             else "the magnet of the measured blocks")
 
 
-def _blocks(result: InferenceResult) -> str:
+def _blocks(result: InferenceResult, start: str = (
+        "Along their easy axes the blocks deviate from the study")) -> str:
     """Say how the magnetizations along the easy axes deviate from the nominal ones."""
     nominal = result.by_block(result.response.nominal)
     size = np.linalg.norm(nominal, axis=1)
@@ -216,8 +241,7 @@ def _blocks(result: InferenceResult) -> str:
     row = np.zeros((1, len(result.posterior.mean)))
     result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
-    start = (f"Along their easy axes the blocks deviate from the study by {fraction(_rms(mean))} "
-             f"rms, the most {place_of(block)}")
+    start = f"{start} by {fraction(_rms(mean))} rms, the most {place_of(block)}"
     if result.disagreement:  # error bars that are not to be used are not stated
         return (f"{start}, which seems to be missing or reversed." if mean[worst] < -1 else
                 f"{start} by {100 * mean[worst]:+.2g}\u00a0%.")

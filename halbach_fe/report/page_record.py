@@ -80,7 +80,8 @@ def _cleaned_answer(answer: Answer) -> Answer:
     """Return an answer whose texts have no control characters."""
     cleaned: dict[str, Any] = {key: _cleaned(value) for key, value in vars(answer).items()
                                if isinstance(value, str)}
-    return replace(answer, **cleaned)
+    return replace(answer, **cleaned, numbers=tuple(
+        (_cleaned(name), _cleaned(size)) for name, size in answer.numbers))
 
 
 Text = Annotated[str, AfterValidator(_cleaned)]

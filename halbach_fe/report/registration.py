@@ -165,7 +165,13 @@ def answer(
             if _is_near(best, assumed or Instrument()) else
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{own} -o DIR")), sound=sound,
-        changes_study=not _is_as_assumed(best, assumed or Instrument()))
+        changes_study=not _is_as_assumed(best, assumed or Instrument()), gist="" if not sound else
+        f"{f'Map {name}' if name else 'The map'} lies at ({_in_mm(best)}) mm in the magnet.")
+
+
+def _in_mm(best: Registration) -> str:
+    """Return where the middle of a map lies, in mm and without error bars."""
+    return ", ".join(f"{1e3 * value:.3f}" for value in best.middle_m.round(6) + 0.0)
 
 
 def is_sound(best: Registration) -> bool:

@@ -27,6 +27,9 @@ LATITUDES, ANGLES = 9, 16
 spherical harmonics up to degree 8."""
 
 
+OUTER_RADIUS = 1.8
+"""Outer radius of the blocks of a new study, relative to the inner one, if it is not given."""
+
 AROUND = 1.2
 """Radius of the points about a magnet without a bore, relative to that of the magnet."""
 

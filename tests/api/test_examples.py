@@ -90,7 +90,7 @@ def documented_parameters(docstring):
     section = text.partition("\n\n")[0].splitlines()
     return {name.strip() for line in section if line[:1].strip() and " : " in line
             for name in line.partition(" : ")[0].split(",")} | {
-        line for line in section if line.isidentifier()}
+        line.lstrip("*") for line in section if line.lstrip("*").isidentifier()}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

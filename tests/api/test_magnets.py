@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from functools import partial
 
 import magpylib
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
+from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.errors import StudyError
 from halbach_fe.core.versions import version
 from halbach_fe.study.reader import parse_study
@@ -203,3 +205,30 @@ def test_a_displaced_map_is_explained_in_python(generator):
     z = found.inference.magnet.study.instrument.translation_m[2]
     assert z == pytest.approx(-0.0435, abs=5 * found.poses[0].translation_sd_m[2])
     assert "\n" not in repr(found)
+
+
+OTHER_NAMES = {"check": "check_map", "design": "design_rings", "report": "campaign_report"}
+"""Functions whose names say more than those of their commands."""
+
+OF_THE_SHELL = {"cache", "doctor", "schema", "completion"}
+"""Commands about the installation and the command line, which Python has no use for."""
+
+
+def without_function(verbs, names):
+    return [verb for verb in verbs if verb not in OF_THE_SHELL
+            and OTHER_NAMES.get(verb, verb).replace("-", "_") not in names]
+
+
+def test_every_command_is_a_function():
+    assert without_function(VERBS, hf.__all__) == []
+    assert all(callable(getattr(hf, OTHER_NAMES.get(verb, verb).replace("-", "_")))
+               for verb in VERBS if verb not in OF_THE_SHELL)
+    assert without_function([*VERBS, "levitate"], hf.__all__) == ["levitate"]  # the control
+
+
+def test_options_of_other_names_are_refused(tmp_path):
+    for call in (partial(hf.new, tmp_path / "a.toml"), partial(hf.import_map, tmp_path / "a.csv")):
+        with pytest.raises(hf.HalbachError, match="Input lenght"):
+            call(lenght=1)
+    with pytest.raises(hf.HalbachError, match=r"format .*'stl'"):
+        hf.export(hf.field_map([[0, 0, 0]], [[1, 0, 0]], sigma_T=1e-5), tmp_path / "a", "stl")

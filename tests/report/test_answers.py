@@ -43,7 +43,7 @@ from halbach_fe.report import (
     tolerance,
     verification,
 )
-from halbach_fe.report.answer import LISTED_MAPS, Answer, known_paths
+from halbach_fe.report.answer import LISTED_MAPS, MOST_WORDS, Answer, known_paths
 from halbach_fe.report.page import write_files
 from halbach_fe.report.words import (
     bayes_factor,
@@ -442,6 +442,25 @@ def test_bayes_factors_in_words(nats, said):
     (2e-5, 2, "0.0000200"), (1e-9, 3, "0"), (-1234.0, 2, "-1\u202f200")])
 def test_decimals_have_no_exponent(value, digits, said):
     assert decimals(value, digits) == said
+
+
+@pytest.mark.parametrize(("said", "headline"), [
+    ("The middle lies at 1.5 mm. Its odds are 1 : 1.", "The middle lies at 1.5 mm."),
+    ("Passed. The map obeys. More.", "Passed. The map obeys."), ("Yes", "Yes"),
+    ("word, " * 100, ("word, " * 35).rstrip(", ") + " …")])
+def test_large_type_has_forty_words(said, headline):
+    """Those of the numbers are among them: `before` and `3 mT`, with a space of two words."""
+    answer = Answer("?", said, "Yes.", "", numbers=(("off before", "3 mT"),))
+    assert answer.headline == headline
+    shown = " ".join([answer.headline, *(" ".join(each) for each in answer.numbers)])
+    assert len(shown.split(" ")) <= MOST_WORDS
+
+
+def test_what_holds_only_in_part_is_no_yes():
+    """Its box has another colour than one that may be used as it stands."""
+    levels = [Answer("?", "1", trust, "", sound=sound).level for trust, sound in (
+        ("Yes.", True), ("Only in part.", True), ("Only in part.", False), ("No.", False))]
+    assert levels == ["", "partial", "partial", "doubtful"]
 
 
 def test_paths_in_a_command_are_quoted():

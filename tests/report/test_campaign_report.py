@@ -21,7 +21,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import RECORD, result_folder
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
-from halbach_fe.report.campaign_report import LONGEST_GIST, _gist, _parts, read_campaign
+from halbach_fe.report.campaign_report import _parts, read_campaign
 from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import PAGE_RECORD, Picture
 from tests.conftest import changed, parse_study
@@ -516,15 +516,6 @@ def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
         "Yes: they are of versions of the study that follow from each other,")
 
 
-def test_the_contents_say_what_each_result_says():
-    said = "The middle lies at 1.5 mm. Its odds are 1 : 1."
-    assert _gist(said) == "The middle lies at 1.5 mm."
-    assert _gist("Yes") == "Yes"
-    long = _gist("word, " * 100)
-    assert long.endswith("word …")
-    assert len(long) <= LONGEST_GIST + 2
-
-
 def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
     """A command is not told to diagnose what has been diagnosed; the control has no diagnosis."""
     results(home / "shimmed", "shim", reads=[home / "study.toml", home / "map.csv"],
@@ -589,7 +580,7 @@ def everywhere(home, text):
     said = json.loads((folder / PAGE_RECORD).read_text())
     said |= {"title": text, "rows": [{text or "x": text}], "provenance": {"programs": text},
              "answer": {key: text if isinstance(value, str) else False
-                        for key, value in said["answer"].items()}}
+                        for key, value in said["answer"].items()} | {"numbers": [[text, text]]}}
     said["figures"][0]["caption"] = text
     said["study"]["description"] = text.replace("\x1b", "").replace("\u202e", "")
     (folder / PAGE_RECORD).write_text(json.dumps(said))
@@ -685,4 +676,4 @@ def test_page_records_are_of_what_is_on_the_page(tmp_path):
         "page": "one.html", "title": "Calibration", "rows": [{"a": "1"}],
         "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
         "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
-                   "sound": True, "concern": "", "changes_study": True}}
+                   "sound": True, "concern": "", "changes_study": True, "gist": "", "numbers": []}}

@@ -53,7 +53,10 @@ def answer_of(path):
                       r".*?<dd>(?P<trust>.*?)</dd>.*?<dd>(?P<step>.*?)(<code>.*)?</dd>",
                       first[0], re.DOTALL)
     assert parts is not None
-    found = {name: html.unescape(part) for name, part in parts.groupdict().items()}
+    whole = re.search(r"In full</summary>\s*<p>(?P<said>.*?)</p>\s*<p>(?P<trust>.*?)</p>",
+                      first[0], re.DOTALL)
+    found = {name: html.unescape(part) for name, part in {
+        **parts.groupdict(), **(whole.groupdict() if whole else {})}.items()}
     assert all(len(part) > 10 for part in found.values())
     return found
 
