@@ -145,7 +145,7 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     Examples
     --------
     >>> import halbach_fe as hf
-    >>> hf.export(hf.build_magnet(hf.read_study("dipole.toml")), "blocks.csv").name
+    >>> hf.export(hf.build_magnet(hf.read_study("dipole.toml")), "nominal-blocks.csv").name
     'blocks.csv'
     """
     path = as_path(path)

@@ -185,7 +185,7 @@ SEEDS = "seed .* a whole number of at least 0; instead received -1"
     (lambda magnet, session: hf.simulate_measurement(magnet.study, seed=-1), SEEDS),
     (lambda magnet, session: hf.sort(magnet, TABLE, session, seed=-1), SEEDS),
     (lambda magnet, session: hf.Region.sphere(float("nan")), "half_axes_m .* received nan"),
-    (lambda magnet, session: hf.Region.sphere("0.1"), "half_axes_m .* received 0.1"),
+    (lambda magnet, session: hf.Region.sphere("0.1"), "half_axes_m .* received '0.1'"),
     (lambda magnet, session: hf.Region.sphere(-0.1), "half_axes_m .* above 0"),
     (lambda magnet, session: hf.Region.sphere(100), "below 10 m; .* in millimetres"),
     (lambda magnet, session: hf.Region("cube", (0.01,) * 3), "one of sphere"),
