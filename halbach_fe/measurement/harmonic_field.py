@@ -283,10 +283,9 @@ class FreeField:
 
     def part(self, rows: NDArray[np.bool_], rest: FreeField | None = None) -> FreeField:
         """Return the same for some of the readings (m,), of which ``rest`` has all others."""
+        gram = None if rest is None or self.dual else self.gram - rest.gram
         if self.dual:
             gram = self.gram[np.ix_(rows, rows)]
-        else:
-            gram = None if rest is None else self.gram - rest.gram
         return FreeField(self.by_amplitude[rows], self.penalty, gram, self.dual)
 
     @cached_property
