@@ -111,10 +111,11 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
 
 def test_the_penalty_of_largest_evidence_is_found_beside_another_maximum():
     """Near cubes; the control climbs from a penalty that is usual far from sources."""
-    data = hard_map(1)
-    points, readings = points_of(data), np.asarray(data["B_T"].values).ravel()
-    charges = Charges.around(points, 2 * 0.0057)
-    free = harmonic_field.FreeField(charges.fields(points).reshape(-1, len(charges)), 0.0)
+    scan, _, _ = map_check.scan_of(hard_map(1))
+    charges = Charges.around(scan.points, 1.5 * map_check.point_spacing(scan.points))
+    model, rows = scan.model(charges), np.ones(len(scan.points), bool)
+    at = model.start(harmonic_field.NO_FIT)
+    readings, free = model.target(at, rows), model.free(at, rows, 0.0)
     every = [one.log_evidence(readings)[0] for one in free.by_penalty]
     assert free.most_probable(readings).log_evidence == max(every)
     assert free.most_probable(readings, near=8).log_evidence < max(every)
