@@ -357,12 +357,12 @@ class FreeField:
         sigma = float(np.sqrt(max(rest, 1e-30) / len(readings)))
         size = 2 * float(np.log(np.diag(self.lower)).sum()) - len(self.lower) * np.log(
             self.penalty)
-        return -len(readings) * np.log(sigma) - size / 2, sigma
+        return float(-len(readings) * np.log(sigma) - size / 2), sigma
 
     @cached_property
     def by_penalty(self) -> list[FreeField]:
         """The same for each of `PENALTIES`, in units of `mean`."""
-        return [self.of_noise(penalty * self.mean) for penalty in PENALTIES]
+        return [self.of_noise(penalty * self.mean) for penalty in PENALTIES.tolist()]
 
     def most_probable(self, readings: Floats, near: int | None = None) -> HarmonicFit:
         """Return the fit of readings (m,) by the penalty of largest evidence.
