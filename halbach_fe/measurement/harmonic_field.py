@@ -283,10 +283,9 @@ class FreeField:
 
     def part(self, rows: NDArray[np.bool_], rest: FreeField | None = None) -> FreeField:
         """Return the same for some of the readings (m,), of which ``rest`` has all others."""
+        gram = None if rest is None or self.dual else self.gram - rest.gram
         if self.dual:
             gram = self.gram[np.ix_(rows, rows)]
-        else:
-            gram = None if rest is None else self.gram - rest.gram
         return FreeField(self.by_amplitude[rows], self.penalty, gram, self.dual)
 
     @cached_property
@@ -358,12 +357,12 @@ class FreeField:
         sigma = float(np.sqrt(max(rest, 1e-30) / len(readings)))
         size = 2 * float(np.log(np.diag(self.lower)).sum()) - len(self.lower) * np.log(
             self.penalty)
-        return -len(readings) * np.log(sigma) - size / 2, sigma
+        return float(-len(readings) * np.log(sigma) - size / 2), sigma
 
     @cached_property
     def by_penalty(self) -> list[FreeField]:
         """The same for each of `PENALTIES`, in units of `mean`."""
-        return [self.of_noise(penalty * self.mean) for penalty in PENALTIES]
+        return [self.of_noise(penalty * self.mean) for penalty in PENALTIES.tolist()]
 
     def most_probable(self, readings: Floats, near: int | None = None) -> HarmonicFit:
         """Return the fit of readings (m,) by the penalty of largest evidence.

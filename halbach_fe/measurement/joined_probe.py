@@ -30,9 +30,6 @@ from halbach_fe.measurement.suspect_rows import scatter_around
 TERMS = len(PRIOR_SD)
 """Number of the terms of a probe."""
 
-NEAR_PLACED = (*(3e-4,) * 3, *(3e-3,) * 3, 1e-2)
-"""Changes of these up to which a design is used again, see `NEAR`."""
-
 SHIFT, TURN, GAIN = slice(0, 3), slice(3, 6), 6
 """Places of a map's own numbers: shift of its middle, turn about it, and gain of |B|."""
 
@@ -141,8 +138,7 @@ class JoinedModel(ProbeModel):
         self.prior_sd = self.any_sd
         self.ends = np.cumsum([0, *(len(one.points) for one in maps)])
         self._last = []
-        self.near = np.concatenate([*(one.near for one in (maps[0], *maps)),
-                                    *(NEAR_PLACED,) * len(maps)])
+        self.near = np.zeros(len(self.any_sd))  # what maps share is known better than a design
 
     def rows_of(self, number: int) -> slice:
         """Return the rows of a map."""

@@ -32,9 +32,9 @@ NEAR = 0.1
 """Change of an instrument, in units of its prior, up to which a design is used again: readings per
 amplitude change by some per cent, and residuals are those of the exact ones."""
 
-NEARLY_AT_REST = 10.0
-"""Decrease of chi-squared, of thousands of readings, below which a step is taken as if they were
-linear in it."""
+AT_REST, NEARLY_AT_REST = 1.0, 10.0
+"""Decreases of chi-squared, of thousands of readings, below which the fit is at rest, and below
+which a small step is taken as if they were linear in it."""
 
 STEEPER = 100.0
 """Ratio of the squared gradients of nine tenths and one tenth of the readings from which the noise
@@ -340,11 +340,15 @@ def fit_probe(
     for number in range(iterations + 1):
         design, by_field, covariance = state.normal()
         step, used = state.step(design, covariance), state.used(design, by_field, covariance)
-        linear = number == iterations or state.decrease(design, step) < NEARLY_AT_REST
-        after = state.linear(step, design, by_field) if linear else state.stepped(step)
+        lower, small = state.decrease(design, step), bool(
+            (np.abs(step * model.prior_sd) <= model.near).all())
+        if last := number == iterations or lower < (NEARLY_AT_REST if small else AT_REST):
+            after = state.linear(step, design, by_field) if small else state
+        else:
+            after = state.stepped(step)
         sigma = float(np.sqrt(after.left @ after.left / max(len(after.left) - used, 1.0)))
         found = replace(after.at, sigma=sigma, covariance=sigma**2 * covariance, used=used)
-        if linear or after is state:
+        if last or after is state:
             return found
         state = after.with_noise(sigma, found)
     raise AssertionError  # the last step is a linear one
@@ -422,8 +426,10 @@ class State:
     @classmethod
     def of(cls, model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_], width2: float) -> State:
         """Fit the field for the instrument and the noise of ``at``."""
-        return cls._solved(model, rows, width2, at, model.target(at, rows),
-                           model.free(at, rows, at.sigma**2 / width2))
+        free = model.free(at, rows, at.sigma**2 / width2)
+        state = cls._solved(model, rows, width2, at, model.target(at, rows), free)
+        # a design that is used again is off by some per cent of what the amplitudes change
+        return cls._solved(model, rows, width2, at, model.target(state.at, rows), free)
 
     @classmethod
     def _solved(

@@ -110,6 +110,34 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
     assert np.abs(drawn / left.mean() - 1).max() > 0.12
 
 
+def test_the_penalty_of_largest_evidence_is_found_beside_another_maximum():
+    """Near cubes; the control climbs from a penalty that is usual far from sources."""
+    scan, _, _ = map_check.scan_of(hard_map(1))
+    charges = Charges.around(scan.points, 1.5 * map_check.point_spacing(scan.points))
+    model, rows = scan.model(charges), np.ones(len(scan.points), bool)
+    at = model.start(harmonic_field.NO_FIT)
+    readings, free = model.target(at, rows), model.free(at, rows, 0.0)
+    every = [one.log_evidence(readings)[0] for one in free.by_penalty]
+    assert free.most_probable(readings).log_evidence == max(every)
+    assert free.most_probable(readings, near=8).log_evidence < max(every)
+
+
+def test_few_combinations_of_charges_have_the_field_of_all(generator):
+    """Of what readings determine; the control leaves out what they do."""
+    field = read_by(generator)
+    charges = Charges.around(GRID, 2.5 * STEP_M)
+    free = harmonic_field.FreeField(charges.fields(GRID).reshape(-1, len(charges)), 0.0)
+    best = free.most_probable(field.ravel())
+    whole = charges.field(GRID, best.amplitudes)
+    for penalty, like in ((best.penalty, True), (1e6 * best.penalty, False)):
+        few = harmonic_field.FewCharges(charges.places, charges.scale, free.determined(penalty))
+        own = harmonic_field.FreeField(few.fields(GRID).reshape(-1, len(few)), best.penalty)
+        off = few.field(GRID, own.amplitudes(field.ravel())) - whole
+        assert len(few) < len(charges)
+        # what is left out was fitted to 1 % of the noise at most
+        assert (np.abs(off).max() < 0.5 * NOISE_T) == like
+
+
 def test_gradient_of_charges(generator):
     charges = Charges.around(GRID, 0.01)
     amplitudes, points = generator.standard_normal(len(charges)), GRID[::40]

@@ -85,7 +85,12 @@ def test_the_joined_map_is_that_of_one_stage(generator):
     """A gain that only one map has is found, and taken out of the joined map."""
     maps, poses, magnet = campaign(1, maps=2)
     maps["part1"] = read(magnet, poses[1], generator, gain=1.01)
+    maps["part1"]["sigma_T"] = 2 * NOISE_T + 0 * maps["part1"]["B_T"]
     joined = joined_of(maps)
+    # a turn of equal sigmas leaves them; the other map has the noise of its check
+    sigma = np.asarray(joined.data["sigma_T"].values) / NOISE_T
+    np.testing.assert_allclose(sigma[:len(points_of(maps["part0"]))], 1.0)
+    np.testing.assert_allclose(sigma[len(points_of(maps["part0"])):], 2.0)
     (term,) = joined.terms
     assert term.name == "gain of part1 relative to part0"
     assert abs(term.value - 1) < 4 * term.sd
