@@ -145,8 +145,8 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     Examples
     --------
     >>> import halbach_fe as hf
-    >>> hf.export(hf.build_magnet(hf.read_study("dipole.toml")), "nominal-blocks.csv").name
-    'blocks.csv'
+    >>> hf.export(hf.build_magnet(hf.read_study("dipole.toml")), "nominal.csv").name
+    'nominal.csv'
     """
     path = as_path(path)
     if isinstance(content, Magnet):

@@ -67,7 +67,7 @@ def text_of_table(raw: bytes, where: str) -> bytes:
     try:
         return untrusted.sheet_text(raw)
     except ValueError as error:
-        raise MeasurementError(must_be("content", where, "a whole workbook", f"'{error}'",
+        raise MeasurementError(must_be("content", where, "an Excel workbook that is whole", f"'{error}'",
                                        "Save the sheet as CSV.")) from None
 
 
