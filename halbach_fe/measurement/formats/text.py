@@ -67,8 +67,8 @@ def text_of_table(raw: bytes, where: str) -> bytes:
     try:
         return untrusted.sheet_text(raw)
     except ValueError as error:
-        raise MeasurementError(must_be("content", where, "an Excel workbook that is whole", f"'{error}'",
-                                       "Save the sheet as CSV.")) from None
+        raise MeasurementError(must_be(
+            "content", where, "an Excel workbook that is whole", f"'{error}'", "Save the sheet as CSV.")) from None
 
 
 def is_comment(line: str) -> bool:
