@@ -68,7 +68,8 @@ def text_of_table(raw: bytes, where: str) -> bytes:
         return untrusted.sheet_text(raw)
     except ValueError as error:
         raise MeasurementError(must_be(
-            "content", where, "an Excel workbook that is whole", f"'{error}'", "Save the sheet as CSV.")) from None
+            "content", where, "an Excel workbook that is whole", f"'{error}'",
+            "Save the sheet as CSV.")) from None
 
 
 def is_comment(line: str) -> bool:
