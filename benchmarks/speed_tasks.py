@@ -230,7 +230,7 @@ def _field_of(
     seen = points if pose is None else pose.apply(points) + np.array([1e-3, -5e-4, 2e-3])
     total = np.zeros_like(points)
     for (x, y, z, angle), strength in zip(places, strengths, strict=True):
-        body = magpylib.magnet.Cuboid(
+        body: Any = magpylib.magnet.Cuboid(
             polarization=(1.3 * strength, 0, 0), dimension=(0.012,) * 3, position=(x, y, z),
             orientation=Rotation.from_rotvec([0, 0, angle])) if cubes else (
             magpylib.misc.Dipole(

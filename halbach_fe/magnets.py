@@ -152,7 +152,7 @@ def magnet_of_blocks(
     """
     if not isinstance(table, FreeBlocks):
         if not hasattr(table, "keys") or any(
-                isinstance(table[one], str) or not np.ndim(table[one]) for one in table):
+                np.isscalar(table[one]) or getattr(table[one], "ndim", 1) == 0 for one in table):
             raise StudyError(must_be(
                 "table", "magnet_of_blocks", "columns by name, each a list with an element for "
                 "every block", f"a {type(table).__name__} that is none",

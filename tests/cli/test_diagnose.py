@@ -176,7 +176,7 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
     page = Page((out / "diagnosis.html").read_text())
     assert page.headings == [
         "small: what the model lacks", "What is missing", "What else it could be",
-        "What would tell it from other causes", "Pictures", "Where model and map disagree",
+        "What would tell it from other causes", "Where model and map disagree",
         "How sure that is", "What changed", "Structure in the magnetizations", "The magnet",
         "The study with what was missing", "Provenance"]
     assert len(page.pictures) == 5
@@ -226,7 +226,7 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert ("It would have shown the loss of" in page) == blocks_chosen
     loss = found["limits"]["loss"]  # noise of 3e-5 T, 1 % and 1 deg of the blocks
     assert 0.01 < loss["median"] <= loss["worst"] < 0.5
-    assert "before" not in page.split("<body>")[1].split("<h2>Pictures")[0]
+    assert "before" not in page.split("<body>")[1].split("<figure")[0]
 
 
 def test_the_floor_of_a_check_stands_beside(study, tmp_path, capsys):

@@ -209,6 +209,7 @@ VERBS_WITH_FOLDERS = {
     "shim": ("study", "--measurements", "map", *TARGET, "--swaps", "1"),
     "shim-tray": ("tray", "--posterior", "posterior"), "sort": ("study", "table", *TARGET),
     "tolerance": ("study", *TARGET, "--draws", "100"), "demagnetization": ("hot", "--across", "2"),
+    "field": ("study", "--from-m", "0", "0", "-0.1", "--to-m", "0", "0", "0.1"),
     "simulate-measurement": ("study",), "check": ("volume",),
     "register": ("study", "--measurements", "map"), "report": ("folder",)}
 """Options of every command that writes a folder."""
@@ -243,7 +244,7 @@ def paths(tmp_path_factory, getdp):
 
 
 def test_every_verb_is_in_the_table():
-    single_files = {"new", "import-map", "export"}
+    single_files = {"new", "import-map", "import-blocks", "export"}
     nothing = {"cache", "doctor", "schema", "completion"}  # which write no file of a user's choice
     by_others = {"explain"}  # runs other verbs, in folders of their own
     assert set(VERBS) == {*VERBS_WITH_FOLDERS, *single_files, *nothing, *by_others}

@@ -6,6 +6,8 @@ import html
 import re
 from html.parser import HTMLParser
 
+from halbach_fe.core.versions import version
+
 
 class _Parts(HTMLParser):
     """Texts of pictures, what is loaded from elsewhere, and headings."""
@@ -38,7 +40,7 @@ def page(path):
     assert all(len(one) > 20 for one in parts.texts)
     assert not parts.loaded
     assert "Provenance" in parts.headings
-    assert "halbach-fe 0" in text
+    assert f"halbach-fe {version('halbach-fe')}" in text
     answer_of(path)
     return text
 
