@@ -226,7 +226,7 @@ def test_nothing_is_missing(study, tmp_path, capsys):
     assert ("It would have shown the loss of" in page) == blocks_chosen
     loss = found["limits"]["loss"]  # noise of 3e-5 T, 1 % and 1 deg of the blocks
     assert 0.01 < loss["median"] <= loss["worst"] < 0.5
-    assert "before" not in page.split("<body>")[1].split("<figure")[0]
+    assert "before" not in page.split('<p class="said">')[1].split("<figure")[0]
 
 
 def test_the_floor_of_a_check_stands_beside(study, tmp_path, capsys):
@@ -360,7 +360,7 @@ def test_the_documentation_says_what_is_in_the_file():
         position_noise=(), solver_error=None, unknown=None, suspected=(), found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, answer=1, converged=True, positions=(),
-        limits=None, floor_T=None, uncompared=None)
+        limits=None, floor_T=None, uncompared=None, imitated=())
     assert keys == list(diagnosis_summary(nothing))
     assert all(f"`{name}`" in section for name in ERRORS_BY_PLAUSIBILITY)
     rows = [line.split("|") for line in section.splitlines()

@@ -196,7 +196,7 @@ def test_a_small_part_of_a_ring_is_no_ring(small):
     place = effect.places(small)[0]
     for strength, is_possible in ((0.02, False), (-0.5, False), (0.5, True)):
         found = IdentifiedEffect(Hypothesis(effect, place), np.array([strength]), np.ones(1), None)
-        campaign = SimpleNamespace(points_of=lambda study: np.zeros((1, 3)))
+        campaign = SimpleNamespace(points_of=lambda study: np.zeros((1, 3)), blocks=None)
         assert possible(small, [found], campaign) == is_possible
 
 

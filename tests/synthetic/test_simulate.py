@@ -137,9 +137,11 @@ def test_the_truth_is_sealed(campaigns):
     assert truth["model"].keys() == {"vacuum", "reaction"}
     for name in ("map.csv", "blocks.csv"):  # nothing of it is in the open
         assert "seed" not in (folder / name).read_text()
-    text = page(folder / "campaign.html")
+    assert hashlib.sha256(text).hexdigest() in page(folder / "campaign.html")
+    digests = json.loads((folder / "run.json").read_text())["files"]
     for name in ("map.csv", "held-out.csv", "blocks.csv", "truth/truth.json"):
-        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() in text
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digests[name]
+    text = page(folder / "campaign.html")
     largest = np.nanmax(np.abs(read_map(folder / "map.csv")["B_T"].values))
     assert f">{flux_density(largest, 5)}</td>" in text
     # blocks are shown as they were ordered, not as they were drawn
