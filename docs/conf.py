@@ -32,7 +32,7 @@ html_static_path = ["_static"]
 html_css_files = ["formulas.css"]
 html_theme = "furo"
 html_title = f"halbach-fe {release}"
-# words of shapes are no cross-references; without execution no kernel tells the language of examples
+# words of shapes are no cross-references; without execution no kernel tells a cell's language
 suppress_warnings = ["ref.python", "myst-nb.lexer"]
 exclude_patterns = ["_build"]
 
