@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compute the field, write the tables, print the integrals of the middle line."""
     from halbach_fe.design.tolerance import assembled_prior
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.inference.same_magnet import distributions_of
+    from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
     from halbach_fe.inference.storage import read_posterior
     from halbach_fe.response.field_on_lines import FEWEST, Lines, field_on_lines
     from halbach_fe.study.reader import read_study
@@ -59,8 +59,9 @@ def run(arguments: argparse.Namespace) -> int:
             "--count and --to-m", "the command line", f"at least {FEWEST} points, and another "
             "point than --from-m", f"{arguments.count} points"))
     magnet = build_magnet(read_study(arguments.study))
-    known = (distributions_of(magnet, read_posterior(magnet, arguments.posterior))["posterior"]
-             if arguments.posterior else assembled_prior(magnet, magnet.nominal_magnetization))
+    read = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
+    known = (assembled_prior(magnet, magnet.nominal_magnetization) if read is None
+             else distributions_of(magnet, read)["posterior"])
     offsets = tuple(np.linspace(-half, half, arguments.lines) if half else np.zeros(1)
                     for half in arguments.across_m)
     lines = Lines(start, end, (offsets[0], offsets[1]), arguments.count)
@@ -86,6 +87,8 @@ def run(arguments: argparse.Namespace) -> int:
             for order, name, unit, key in ((1, "first", "T m", "T_m"), (2, "second", "T m²",
                                                                          "T_m2"))}}
         for axis in COMPONENTS], "Integrals of B along the middle line")
+    if doubt := disagreement_of(read):
+        common.say(doubt)
     common.say(f"Wrote {lines.points.shape[0]} lines of {lines.count} points: {folder}")
     return 0
 

@@ -140,7 +140,7 @@ def test_near_a_face_nothing_changes(generator):
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_edges_are_refused(kind, generator):
-    """Edges of end faces and along the block, corners; smooth seams of cylinder and ring are none."""
+    """Edges of end faces and along the block, corners; smooth seams of cylinders and rings not."""
     magnet, place, rotation, _ = turned(kind, generator)
     outline = magnet.blocks[0].outline
     t = np.array([0.3])

@@ -317,7 +317,9 @@ def test_what_all_blocks_share_is_compared_with_the_prior_of_their_mean(
     (0.12, 1e-3, True),
     (0.015, 1e-3, False),  # 1.5 standard deviations of its prior
     (0.12, 2e-6, False)])  # the readings alone say where it is
-def test_a_block_that_its_prior_holds_back_is_named(generator, tmp_path, weak, sigma_T, held):
+def test_a_block_that_its_prior_holds_back_is_named(
+    generator, tmp_path, capsys, weak, sigma_T, held
+):
     """One block is weaker than a prior of 1 % allows, and the readings know it to 0.5 % only."""
     magnet = build_magnet(parse_study(tomllib.loads(QUADRUPOLE)))
     source = to_magpylib(magnet)
@@ -344,6 +346,11 @@ def test_a_block_that_its_prior_holds_back_is_named(generator, tmp_path, weak, s
         later = multipoles_answer(found.tables, None, found.disagreement)
         assert later.sound == (not held)
         assert later.trust.startswith("Only in part. Block" if held else "Yes: the update agrees")
+    (tmp_path / "study.toml").write_text(QUADRUPOLE)
+    assert main(["field", str(tmp_path / "study.toml"), "--from-m", "0", "0", "-0.05", "--to-m",
+                 "0", "0", "0.05", "--posterior", str(tmp_path / "posterior.h5"),
+                 "-o", str(tmp_path / "field")]) == 0
+    assert ("Only in part. Block" in capsys.readouterr().err) == held
 
 
 def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path):
