@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
     from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.report.words import with_error
     from halbach_fe.response.field_on_lines import FEWEST, Lines, field_on_lines
     from halbach_fe.study.reader import read_study
 
@@ -82,8 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
     middle = len(columns["u_m"]) // 2
     common.print_table([{
         "component": axis, **{
-            f"{name} integral, {unit}": f"{columns[f'I{order}{axis}_{key}'][middle]:.6g} ± "
-            f"{columns[f'sd_I{order}{axis}_{key}'][middle]:.2g}"
+            f"{name} integral, {unit}": with_error(columns[f"I{order}{axis}_{key}"][middle],
+                                                   columns[f"sd_I{order}{axis}_{key}"][middle])
             for order, name, unit, key in ((1, "first", "T m", "T_m"), (2, "second", "T m²",
                                                                          "T_m2"))}}
         for axis in COMPONENTS], "Integrals of B along the middle line")
