@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compute the forces, write the results, print the answer and the largest forces."""
     from halbach_fe.design.forces import forces
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.measurement.assembly_order import read_order
+    from halbach_fe.measurement.block_table import read_order
     from halbach_fe.report.forces import page
     from halbach_fe.solver.separate_blocks import present_blocks
     from halbach_fe.study.reader import read_study

@@ -22,8 +22,8 @@ from halbach_fe.geometry.prism import Prism, upright
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.array import block_name
+from halbach_fe.study.design import Holder
 from halbach_fe.study.free_blocks import SIZES
-from halbach_fe.study.holder import Holder
 
 TURNED_ALIKE = ("cuboid", "sector", "trapezoid", "cylinder")
 """Shapes that are the same after half a turn about their x axis."""

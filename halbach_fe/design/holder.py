@@ -17,7 +17,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import Outline, distance_from_origin, thinnest_wall
 from halbach_fe.geometry.prism import Prism, circle, rectangle, widened, with_notch
-from halbach_fe.study.holder import Holder, Rods
+from halbach_fe.study.design import Holder, Rods
 
 SEGMENTS = {"0": "abcdef", "1": "bc", "2": "abged", "3": "abgcd", "4": "fgbc", "5": "afgcd",
             "6": "afgedc", "7": "abc", "8": "abcdefg", "9": "abcdfg"}

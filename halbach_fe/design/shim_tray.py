@@ -42,8 +42,8 @@ from halbach_fe.solver.exact_block_field import unit_field
 from halbach_fe.solver.separate_blocks import present_blocks
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.design import ShimMagnet, ShimTray
 from halbach_fe.study.grades import grade
-from halbach_fe.study.shim_tray import ShimMagnet, ShimTray
 
 EMPTY = -1
 

@@ -11,9 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.effects.base import Effect, each_block
+from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, each_block
 from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect, BlockDisplacedEffect
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,

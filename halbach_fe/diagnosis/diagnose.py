@@ -41,13 +41,16 @@ from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Effect
-from halbach_fe.diagnosis.equal_positions import possible_positions
+from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import Family
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
-from halbach_fe.diagnosis.map_errors import beside_amplitudes, blocks_of, correct_map_errors
+from halbach_fe.diagnosis.map_errors import (
+    beside_amplitudes,
+    blocks_of,
+    correct_map_errors,
+    possible_positions,
+)
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
@@ -62,8 +65,10 @@ from halbach_fe.diagnosis.result import (
     Floor,
     IdentifiedEffect,
     Imitation,
+    SolverErrorExplanation,
     Suspicion,
     UnknownCause,
+    explain_by_solver_error,
 )
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
@@ -79,7 +84,6 @@ from halbach_fe.diagnosis.search import (
     with_rivals,
     with_short_steps,
 )
-from halbach_fe.diagnosis.solver_error import SolverErrorExplanation, explain_by_solver_error
 from halbach_fe.diagnosis.summary import place_in_words
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.diagnosis.unknown_cause import (

@@ -12,7 +12,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.instrument import to_magnet_axes
-from halbach_fe.study.halbach_order import check_order
+from halbach_fe.study.array import check_order
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes
 

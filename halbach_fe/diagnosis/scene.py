@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.diagnosis.effects.base import Effect, Place
-from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.inference.infer import with_instruments
 from halbach_fe.inference.instrument_fit import OpenTerms

@@ -14,9 +14,8 @@ from pydantic import ValidationError
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, HalbachWarning
 from halbach_fe.core.pace import Progress
-from halbach_fe.diagnosis.effects.base import Effect, Place
+from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     PINNED_SD,

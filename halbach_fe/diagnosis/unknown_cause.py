@@ -19,8 +19,8 @@ from scipy.special import logsumexp
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.competition import Competition, Explanation, Term
+from halbach_fe.diagnosis.effects.base import Hypothesis
 from halbach_fe.diagnosis.flexible_causes import Family, field_family, instrument_families
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     INDISTINGUISHABLE_LOG_EVIDENCE,

@@ -12,8 +12,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.response.block_variation import Variations
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.differences import differences
-from halbach_fe.study.model import Study, magnet_description
+from halbach_fe.study.model import Study, differences, magnet_description
 
 
 def check_same_magnet(

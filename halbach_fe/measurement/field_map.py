@@ -35,12 +35,12 @@ from halbach_fe.core.errors import MeasurementError, OutputError, must_be
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
-from halbach_fe.measurement.clock_times import look_like_clock
 from halbach_fe.measurement.tables import (
     _check_printable,
     check_columns,
     csv_table,
     finite,
+    look_like_clock,
     write_csv,
 )
 from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T

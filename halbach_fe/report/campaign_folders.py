@@ -22,8 +22,7 @@ from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
 from halbach_fe.core.result_folder import Record, Results, finished_results
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, Picture
-from halbach_fe.study.differences import differences
-from halbach_fe.study.model import Study, magnet_description
+from halbach_fe.study.model import Study, differences, magnet_description
 
 ORDER = ("design", "solve", "verify", "demagnetization", "forces", "tolerance", "plan", "sort",
          "cad", "simulate-measurement", "check", "register", "prior", "infer", "multipoles",

@@ -15,8 +15,7 @@ from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.report.campaign_folders import Chapter
 from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.array import BlockException
-from halbach_fe.study.differences import differences
-from halbach_fe.study.model import Study, magnet_description
+from halbach_fe.study.model import Study, differences, magnet_description
 
 FINDING = ("register", "diagnose")
 """Commands that write a study which later results should be of."""

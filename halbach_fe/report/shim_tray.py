@@ -25,7 +25,7 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
-from halbach_fe.study.shim_tray import ShimTray
+from halbach_fe.study.design import ShimTray
 
 LISTED = 12
 """Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""

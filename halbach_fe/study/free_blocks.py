@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.study.material_keys import Material, columns_with_grades
+from halbach_fe.study.grades import Material, columns_with_grades
 from halbach_fe.study.polygons import crossing
 from halbach_fe.study.types import (
     MAX_LENGTH_M,

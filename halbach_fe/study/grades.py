@@ -18,7 +18,9 @@ from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from types import MappingProxyType
-from typing import NoReturn
+from typing import Annotated, Any, NoReturn
+
+from pydantic import AfterValidator, Field
 
 from halbach_fe.core.numbers import parse_number
 from halbach_fe.study.materials import MU_0
@@ -280,3 +282,50 @@ def check_grade(one: Grade) -> None:
         refuse(f"(BH)_max must not be larger than B_r^2 / (4 mu_0 mu_rec) = {straight:.3g} J/m^3")
     if one.family != "ferrite" and (one.coercivity_coefficient_per_K or 0.0) > 0:
         refuse("coercivity_coefficient_per_K must be negative, except for ferrite")
+
+
+Material = Annotated[str, Field(max_length=40), AfterValidator(lambda name: grade(name).name)]
+"""Name of a grade of magnet, in any spelling; the study holds the table's."""
+
+STRENGTHS = ("remanence_T", "block_moment_A_m2", "remanence_x_T", "remanence_y_T", "remanence_z_T")
+"""Keys that give the strength of a block; any of them wins over the grade."""
+
+
+def grade_of(values: Any) -> Grade | None:
+    """Return the grade that a table names, or None if it names none, or an unknown one."""
+    name = (values.get("material") if isinstance(values, Mapping)
+            else getattr(values, "material", None))
+    try:
+        return grade(name) if isinstance(name, str) else None
+    except ValueError:  # reported by the validation of the key itself
+        return None
+
+
+def with_grade(values: dict[str, Any]) -> dict[str, Any]:
+    """Return a table with remanence and recoil permeability of its grade where it gives none."""
+    found = grade_of(values)
+    if found is None:
+        return values
+    filled = dict(values)
+    if all(filled.get(key) is None for key in STRENGTHS):
+        filled["remanence_T"] = found.nominal_remanence
+    if filled.get("recoil_permeability") is None:
+        filled["recoil_permeability"] = found.recoil_permeability
+    return filled
+
+
+def columns_with_grades(columns: dict[str, Any]) -> dict[str, Any]:
+    """Do for every row of a table, given by column, what `with_grade` does for one."""
+    materials = columns.get("material")
+    if not isinstance(materials, list | tuple) or not any(materials):
+        return columns
+    filled = dict(columns)
+    keys = ("material", "recoil_permeability", *STRENGTHS)
+    given = {key: values for key in keys if isinstance(values := columns.get(key), list | tuple)
+             and len(values) == len(materials)}
+    rows = [with_grade({key: values[number] for key, values in given.items()})
+            for number in range(len(materials))]
+    for key in ("remanence_T", "recoil_permeability"):
+        if key in given or not columns.get(key):
+            filled[key] = tuple(row.get(key) for row in rows)
+    return filled

@@ -20,17 +20,14 @@ from pydantic import Field, ValidationError, model_validator
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.array import Array
-from halbach_fe.study.design import Design
-from halbach_fe.study.holder import Holder
-from halbach_fe.study.homogeneity import HomogeneityRegion
+from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
+from halbach_fe.study.grades import STRENGTHS, grade_of
 from halbach_fe.study.inference import Inference, Plan, Prior
 from halbach_fe.study.iron import Iron, IronMaterial, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
 from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS, InstrumentSd, MapSettings
-from halbach_fe.study.material_keys import STRENGTHS, grade_of
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.measurement import Instrument, NoiseSettings, ObservationSettings
-from halbach_fe.study.shim_tray import ShimTray
 from halbach_fe.study.solver import MeshSettings, OpenBoundary, SolverSettings
 from halbach_fe.study.types import COMPONENTS, Lines, StudyModel
 from halbach_fe.study.uncertain import Uncertain, check_uncertain
@@ -243,3 +240,19 @@ def curve_of(study: Study) -> Curve | None:
                                  "read together with the study's own file", f"'{curve.file}'",
                                  "Use read_study, or give H_A_per_m and B_T."))
     return materials.table_curve(np.array(table[0]), np.array(table[1]))
+
+
+def differences(one: Any, other: Any, key: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return both values of every key in which two trees of plain data differ, by dotted key.
+
+    Examples
+    --------
+    >>> differences({"array": {"rings": 1, "ring": []}}, {"array": {"rings": 2, "ring": []}})
+    {'array.rings': (1, 2)}
+    """
+    if isinstance(one, dict) and isinstance(other, dict):
+        found: dict[str, tuple[Any, Any]] = {}
+        for name in one | other:
+            found |= differences(one.get(name), other.get(name), f"{key}.{name}".lstrip("."))
+        return found
+    return {} if one == other else {key: (one, other)}

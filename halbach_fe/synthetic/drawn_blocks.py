@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,8 +12,37 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.model import Study
-from halbach_fe.synthetic.helmholtz_coil import moments
+from halbach_fe.synthetic.reaction import lone_moment_matrix
+from halbach_fe.synthetic.shapes import Shape
 from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, vector
+
+
+def moments(bodies: tuple[Body, ...], length: float) -> Floats:
+    """Return the moments (n, 3) in A m^2 of single bodies, each in its own axes.
+
+    Bodies of infinite length are given the finite ``length`` in m. Bodies of the same shape and
+    permeability share their `lone_moment_matrix`, which is good to some 1e-4.
+    """
+    found = []
+    for body in bodies:
+        shape, seat = body.shape, body.seat_orientation.as_matrix()
+        if np.isinf(shape.length):
+            shape = replace(shape, length=length)
+        tensor = seat.T @ body.permeability @ seat
+        matrix = _known_matrix(shape, tuple((tensor.round(12) + 0.0).ravel().tolist()))
+        own = body.seat_orientation.inv().apply(body.remanence) * body.mean_factor
+        found.append(body.seat_orientation.apply(matrix @ own))
+    return np.array(found)
+
+
+@lru_cache(maxsize=4096)
+def _known_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
+    """Return `lone_moment_matrix`, cached; ``permeability`` is the tensor row by row.
+
+    The tensor does not depend on the sign of the easy axis, so opposite blocks share a matrix.
+    """
+    return lone_moment_matrix(shape, np.reshape(permeability, (3, 3)))
+
 
 ALONG_Z = 1e-6
 """Sine of the angle to the magnet's axis below which a magnetization has no direction across."""

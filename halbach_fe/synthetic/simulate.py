@@ -26,17 +26,22 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map
-from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.study.magnet import check_apart
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
-from halbach_fe.synthetic import stated_instrument
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet, magnetizations
-from halbach_fe.synthetic.faulty_instrument import IDEAL_AXES, FaultyInstrument
+from halbach_fe.synthetic.faulty_instrument import (
+    IDEAL_AXES,
+    FaultyInstrument,
+    columns,
+    stated_places,
+    stated_readings,
+)
 from halbach_fe.synthetic.hidden_effects import (
     RequestedEffect,
     choose_effects,
@@ -48,11 +53,8 @@ from halbach_fe.synthetic.knee_losses import lost_field
 from halbach_fe.synthetic.magpylib_field import no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
 from halbach_fe.synthetic.optional_packages import version_of
-from halbach_fe.synthetic.placed_blocks import in_places
-from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.reaction import by_elements, reaction_field
-from halbach_fe.synthetic.stated_instrument import columns
-from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, TrueMagnet
+from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, TrueMagnet, in_places
 
 COIL_SD = 0.001
 """Noise of a Helmholtz coil relative to the moment; usual coils reach 0.1 %."""
@@ -239,7 +241,7 @@ def measured(
     places = instrument.places(nominal, generator)
     if stated != IDEAL:
         places = places + np.concatenate(
-            [stated_instrument.places(stated, part) - part for part in maps], axis=1)
+            [stated_places(stated, part) - part for part in maps], axis=1)
     if offsets is not None:
         places = places + offsets  # the same for all sensors
     # the three sensors are usually in one place, whose field is then computed once
@@ -264,7 +266,7 @@ def _as_stated(stated: Instrument, fields: Floats, counts: Sequence[int]) -> Flo
 
     The readings of maps of so many points each follow each other.
     """
-    shown = np.vstack([stated_instrument.values(stated, part, np.linspace(0.0, 1.0, part.shape[1]))
+    shown = np.vstack([stated_readings(stated, part, np.linspace(0.0, 1.0, part.shape[1]))
                        for part in np.split(fields, np.cumsum(counts)[:-1], axis=1)])
     return np.broadcast_to(shown, fields.shape)
 

@@ -20,9 +20,8 @@ from halbach_fe.diagnosis.discriminating_measurements import (
     separations,
 )
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect

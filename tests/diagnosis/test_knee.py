@@ -9,9 +9,8 @@ import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Parameter
+from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter
 from halbach_fe.diagnosis.effects.knee import COERCIVITIES, STATED, KneeEffect
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import NominalSolver, with_short_steps

@@ -11,8 +11,7 @@ import pytest
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Parameter, Place
-from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
 from halbach_fe.diagnosis.result import (
     IdentifiedEffect,

@@ -15,7 +15,7 @@ from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, separations
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.effects.base import Hypothesis
 from halbach_fe.diagnosis.map_errors import correct_map_errors
 from halbach_fe.diagnosis.model_selection import Candidate
 from halbach_fe.diagnosis.scene import Campaign

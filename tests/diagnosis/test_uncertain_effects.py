@@ -14,8 +14,7 @@ from halbach_fe.api import shim
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Place
-from halbach_fe.diagnosis.hypothesis import Hypothesis
+from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.summary import STUDY_FILE, write_study
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects

@@ -11,9 +11,9 @@ from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.competition import Competition, Explanation
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Hypothesis
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
-from halbach_fe.diagnosis.hypothesis import Hypothesis
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import NominalSolver, possible
 from halbach_fe.diagnosis.unknown_cause import are_scattered

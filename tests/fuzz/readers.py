@@ -35,8 +35,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import mcmc, storage
 from halbach_fe.inference.mcmc import _Run
 from halbach_fe.inference.storage import _stored_root, read_posterior
-from halbach_fe.measurement.assembly_order import read_order
-from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
+from halbach_fe.measurement.block_table import BlockTable, read_blocks, read_order, write_blocks
 from halbach_fe.measurement.field_map import check_readings, field_map, read_map, write_map
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
 from halbach_fe.measurement.formats.declared import DeclaredFormat

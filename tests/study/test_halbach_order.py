@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors
-from halbach_fe.study.halbach_order import check_order
+from halbach_fe.study.array import check_order
 
 INNER, OUTER, RADIUS = 1.0, 1.5, 0.1
 ORDERS, NUMBERS = range(1, 13), range(4, 17)

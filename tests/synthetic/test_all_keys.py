@@ -19,7 +19,7 @@ from halbach_fe.study.iron import IronPrism, IronTube
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
-from halbach_fe.synthetic.separate_reaction import separate_reaction
+from halbach_fe.synthetic.reaction import separate_reaction
 from halbach_fe.synthetic.shapes import SectorBody
 from halbach_fe.synthetic.simulate import true_field
 from tests.conftest import DIPOLE, changed, circle

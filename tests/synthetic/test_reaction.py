@@ -10,10 +10,9 @@ import pytest
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.synthetic import ngsolve_reaction, reaction, separate_reaction
+from halbach_fe.synthetic import ngsolve_reaction, reaction
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_blocks import coil_table
-from halbach_fe.synthetic.helmholtz_coil import moments
+from halbach_fe.synthetic.drawn_blocks import coil_table, moments
 from halbach_fe.synthetic.ngsolve_reaction import Elements
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, PrismBody, SectorBody
 from tests.conftest import circle
@@ -38,16 +37,16 @@ def test_separate_blocks_against_finite_elements(array):
     """
     magnet = magnet_of(study_of(array))
     theirs = ngsolve_reaction.reaction_field(magnet, POINTS)
-    ours = separate_reaction.separate_reaction(magnet, POINTS)
+    ours = reaction.separate_reaction(magnet, POINTS)
     size = np.abs(theirs).max()
     np.testing.assert_allclose(ours, theirs, atol=(1e-2 if array is CUBES else 2e-2) * size)
     # negative controls: a block less, and no anisotropy
-    alone = separate_reaction.separate_reaction(
+    alone = reaction.separate_reaction(
         replace(magnet, bodies=magnet.bodies[:1]), POINTS)
     assert np.abs(alone - theirs).max() > 0.1 * size
     if array is CUBES:
         isotropic = magnet_of(study_of(array | {"recoil_permeability_across": 1.06}))
-        other = separate_reaction.separate_reaction(isotropic, POINTS)
+        other = reaction.separate_reaction(isotropic, POINTS)
         assert np.abs(other - theirs).max() > 0.05 * size
 
 
@@ -58,15 +57,15 @@ def test_far_blocks_count_as_dipoles(monkeypatch):
     array = CUBES | {"blocks_per_ring": 12, "block": {"shape": "cuboid", "width_m": 0.02},
                      "inner_radius_m": 0.1}
     magnet = magnet_of(study_of(array))
-    ours = separate_reaction.separate_reaction(magnet, POINTS)
+    ours = reaction.separate_reaction(magnet, POINTS)
     size = np.abs(ours).max()
     with monkeypatch.context() as patch:
-        patch.setattr(separate_reaction, "NEAR", 100.0)
-        exact = separate_reaction.separate_reaction(magnet, POINTS)
+        patch.setattr(reaction, "NEAR", 100.0)
+        exact = reaction.separate_reaction(magnet, POINTS)
     np.testing.assert_allclose(ours, exact, atol=2e-3 * size)
-    monkeypatch.setattr(separate_reaction, "moment_field",
+    monkeypatch.setattr(reaction, "moment_field",
                         lambda places, moments, points: np.zeros_like(points))
-    assert np.abs(separate_reaction.separate_reaction(magnet, POINTS) - exact).max() > 1e-2 * size
+    assert np.abs(reaction.separate_reaction(magnet, POINTS) - exact).max() > 1e-2 * size
 
 
 SHAPES = [PrismBody(0.02, 0.03, 0.03, 0.04), PrismBody(0.02, 0.02, 0.04, 0.03, 0.3),
@@ -83,7 +82,7 @@ def test_lone_moment_of_every_shape(shape):
     """
     mu = np.diag([1.05, 1.1, 1.1])
     theirs = moment_matrix(shape, mu, block_mesh(shape, shape.thickness / 1.7, 1), 2)
-    ours = separate_reaction.lone_moment_matrix(shape, mu)
+    ours = reaction.lone_moment_matrix(shape, mu)
     size = theirs[0, 0]
     np.testing.assert_allclose(ours, theirs, atol=1e-3 * size)
     assert np.abs(shape.volume / (4e-7 * np.pi) * np.eye(3) - theirs).max() > 1e-2 * size

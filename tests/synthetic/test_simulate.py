@@ -17,7 +17,7 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation import fourier_analysis, observe
-from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.words import flux_density
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors, gradient_of
@@ -25,8 +25,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.drawn_blocks import coil_table, draw_magnet
-from halbach_fe.synthetic.positions import between
-from halbach_fe.synthetic.separate_reaction import lone_moment_matrix
+from halbach_fe.synthetic.reaction import lone_moment_matrix
 from halbach_fe.synthetic.simulate import real_places, simulate_campaign, write_campaign
 from tests.conftest import DIPOLE, changed
 from tests.support.pages import page

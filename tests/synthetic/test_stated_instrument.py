@@ -20,7 +20,7 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic import stated_instrument
+from halbach_fe.synthetic.faulty_instrument import stated_places, stated_readings
 from halbach_fe.synthetic.simulate import simulate_campaign
 
 STATED = {
@@ -48,21 +48,21 @@ def test_it_is_what_the_correction_undoes(keys):
         [0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full(8, z)]) for z in (-0.03, 0.0, 0.04)])
     instrument = Instrument.model_validate({key: (STATED | {"memory_rows": 3.0})[key]
                                             for key in keys})
-    places = stated_instrument.places(instrument, points)
+    places = stated_places(instrument, points)
     np.testing.assert_allclose(places.transpose(1, 0, 2), sensor_positions(instrument, points),
                                rtol=0, atol=1e-15)
     time = np.linspace(0, 1, len(points))
-    shown = stated_instrument.values(instrument, field(places), time)
+    shown = stated_readings(instrument, field(places), time)
     model = sensor_model(instrument, points)
     linear = (model.operator @ field(model.points).ravel()).reshape(-1, 3)
     seen = [np.asarray(each) for each in field(places)]
     turned = Instrument(rotation_rad=instrument.rotation_rad)
     rest = np.column_stack([
-        nonlinear_part(instrument, stated_instrument.values(turned, np.array([each] * 3), time),
+        nonlinear_part(instrument, stated_readings(turned, np.array([each] * 3), time),
                        time)[:, sensor] for sensor, each in enumerate(seen)])
     np.testing.assert_allclose(shown, with_memory(instrument, linear + rest, time),
                                rtol=0, atol=1e-14)
-    ideal = stated_instrument.values(Instrument(), field(np.array([points] * 3)), time)
+    ideal = stated_readings(Instrument(), field(np.array([points] * 3)), time)
     assert np.abs(shown - ideal).max() > 1e-6  # the control: every key changes the readings
 
 

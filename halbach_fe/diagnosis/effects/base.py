@@ -372,3 +372,28 @@ def changed(nominal: NominalFields, study: Study) -> Floats:
     """Return B (n, 3) in T of the nominal blocks of ``study``, less that of ``nominal``."""
     return np.asarray(nominal.block_fields_of(study).sum(axis=0)
                       - nominal.block_fields.sum(axis=0))
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect at a place.
+
+    Attributes
+    ----------
+    effect : Effect
+    place : Place
+        Block, ring, seam or point at which the effect acts, or the instrument that it changes;
+        empty for effects of the whole magnet.
+    """
+
+    effect: Effect
+    place: Place
+
+    def apply(self, study: Study, values: Sequence[float]) -> Study:
+        """Return the study with the effect, see `Effect.apply`; in a campaign, in its maps."""
+        if not self.place.maps:
+            return self.effect.apply(study, self.place, values)
+        return study.with_tables({
+            one.name: {"instrument": self.effect.apply(
+                study.of_map(number), self.place, values).instrument}
+            for number, one in enumerate(study.maps) if one.name in self.place.maps})

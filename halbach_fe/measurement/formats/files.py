@@ -25,12 +25,11 @@ from halbach_fe.measurement.formats import (
     comsol,
     g4beamline,
     geant4,
-    implied_grid,
     openpmd,
     opera,
 )
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
-from halbach_fe.measurement.formats.grid import Grid, grid_of
+from halbach_fe.measurement.formats.grid import Grid, grid_of, implied_format, read_fluka, read_srw
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of, text_of_table
 from halbach_fe.measurement.formats.units import unit_symbol
@@ -38,7 +37,7 @@ from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
     FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read,
-              implied_grid.read_srw, implied_grid.read_fluka), strict=True))
+              read_srw, read_fluka), strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
@@ -180,7 +179,7 @@ def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
         return "g4beamline"
     if bdsim.is_bdsim(lines):
         return "bdsim"
-    if (implied := implied_grid.format_of(lines)) is not None:
+    if (implied := implied_format(lines)) is not None:
         return implied
     return "opera" if opera.is_opera(lines) else "columns"
 

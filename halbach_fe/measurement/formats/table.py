@@ -14,12 +14,12 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement import clock_times as times
 from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected, with_total_field
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.text import Line, comma_hint
+from halbach_fe.measurement.tables import look_like_clock, times_from_clock, times_from_texts
 from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
 
 OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
@@ -237,7 +237,7 @@ def _seconds(
     name, values = columns[column].text or "t", table.values[:, column]
     if column in table.texts:
         cells = table.texts[column]
-        found = None if len(cells) < len(values) else times.from_texts(
+        found = None if len(cells) < len(values) else times_from_texts(
             [cells[row][1] for row in range(len(values))])
         if found is None:
             line, cell = min(cells.values())
@@ -253,12 +253,12 @@ def _seconds(
             f"a number below {MAX_NUMBER:g}", "none" if np.isnan(values[bad][0]) else "more",
             "Correct it, or ignore the column: - in --columns."))
     if units.CLOCK.fullmatch(unit):
-        found = times.from_clock(values)
+        found = times_from_clock(values)
         if found is None:
             raise MeasurementError(must_be(f"time '{name}'", table.where, "times of day HHMMSS",
                                            "a number that is none"))
         return found
-    if unit == "s" and times.look_like_clock(values):
+    if unit == "s" and look_like_clock(values):
         raise MeasurementError(must_be(
             f"time '{name}'", table.where, "clearly in s", f"{values[0]:.0f} to {values[-1]:.0f}, "
             "which may as well be times of day, HHMMSS",
@@ -298,7 +298,7 @@ def _remarks(
                 declared.columns and declared.columns[index].strip() == "-"):
             continue
         if names.is_time(column):
-            looks = times.look_like_clock(table.values[:, index])
+            looks = look_like_clock(table.values[:, index])
             said.append(f"The times in '{column.text}' are not used, as their unit is not stated"
                         f"{' (they look like HHMMSS)' if looks else ''}: state "
                         "t[s], t[min], t[h] or t[hhmmss] in its place in --columns.")
@@ -317,7 +317,7 @@ def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[Col
         return tuple(columns)
     for index, column in enumerate(columns):
         cells = table.texts.get(index, {})
-        if names.is_time(column) and len(cells) == len(table.values) and times.from_texts(
+        if names.is_time(column) and len(cells) == len(table.values) and times_from_texts(
                 [cell for _, cell in cells.values()]) is not None:
             return (*columns[:index], replace(column, quantity="t"), *columns[index + 1:])
     return tuple(columns)

@@ -13,13 +13,13 @@ import numpy as np
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.sentences import wrong_unit
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
-from halbach_fe.synthetic.hidden_effects import gross_errors, instrument_effects, magnet_effects
+from halbach_fe.synthetic.hidden_effects import instrument_effects, magnet_effects
 from halbach_fe.synthetic.hidden_effects.effect_types import ChosenEffect, HiddenEffect, Site
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 EFFECTS: dict[str, HiddenEffect] = {
     effect.name: effect
-    for effect in (*magnet_effects.EFFECTS, *instrument_effects.EFFECTS, *gross_errors.EFFECTS)}
+    for effect in (*magnet_effects.EFFECTS, *instrument_effects.EFFECTS)}
 
 RequestedEffect = tuple[HiddenEffect, tuple[float, ...] | None]
 """An effect and its values; None if these are to be drawn."""

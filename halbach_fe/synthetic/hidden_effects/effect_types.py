@@ -12,11 +12,10 @@ from typing import Literal
 
 import numpy as np
 
-from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import Component
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
-from halbach_fe.synthetic.positions import between
 from halbach_fe.synthetic.true_magnet import TrueMagnet, Vector
 
 Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "vacuum", "few blocks",
