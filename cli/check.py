@@ -8,7 +8,7 @@ check.csv (the residual of every reading), check.html and its figures, oriented_
 map without broken rows and with its components along the right axes, inner_map.csv, its region that
 a field without sources describes, if it is not all, and corrected_map.csv, what a probe without
 errors would have read. Of a map of |B| alone only rows that are broken, repeated
-places and noise are checked, and the folder has check.json alone.
+places and noise are checked, and the folder has check.json and check.html.
 
 Several maps of one magnet are checked one by one and then joined: their relative poses follow from
 where they overlap and from one field without sources for all, no magnet is assumed. Maps that
@@ -19,14 +19,13 @@ joined.csv (all maps in the frame of the first one), joined.html, and a folder f
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CommandLineError, must_be
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from halbach_fe.core.files import InputFile
 
 
@@ -45,84 +44,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check the map, write the results, print a summary."""
-    if arguments.others:
-        return _join(arguments)
+    """Check the map, or all and where they lie to each other; write and print the results."""
     from halbach_fe.measurement.field_map import is_total_field
-    from halbach_fe.measurement.map_check import check_map
-    from halbach_fe.report.map_check import (
-        answer,
-        check_summary,
-        instrument_table,
-        sentences,
-        write_map_check,
-    )
-
-    data = common.read_one(arguments, arguments.map)
-    if arguments.output is not None:  # before the check, which may take a minute
-        common.own_folder(arguments, "halbach-fe check")
-    if is_total_field(data):
-        return _check_total(arguments, data)
-    with common.progress_bar("checking") as show:
-        check = check_map(data, (lambda _: None) if arguments.json else common.say, show)
-    if arguments.output is not None:
-        write_map_check(data, check, arguments.output, {
-            "map": common.digest(arguments.map)})
-    if arguments.json:
-        common.print_json(check_summary(data, check))
-        return 0
-    for sentence in sentences(check):
-        common.say(sentence)
-    common.print_table(instrument_table(check), "The instrument, by the map alone")
-    common.say_answer(arguments, answer(check),
-                      None if arguments.output is None else arguments.output / "check.html")
-    return 0
-
-
-def _check_total(arguments: argparse.Namespace, data: xr.Dataset) -> int:
-    """Check a map of |B| alone, which has no page."""
-    from halbach_fe.measurement.total_check import check_total
-    from halbach_fe.report.map_check import total_answer, total_sentences, write_total_check
-
-    check = check_total(data)
-    if arguments.output is not None:
-        write_total_check(data, check, arguments.output)
-    if arguments.json:
-        common.print_json(check.plain())
-        return 0
-    for sentence in total_sentences(check):
-        common.say(sentence)
-    common.say_answer(arguments, total_answer(check),
-                      None if arguments.output is None else arguments.output / "check.json")
-    return 0
-
-
-def _join(arguments: argparse.Namespace) -> int:
-    """Check several maps, and find where they lie to each other."""
-    from halbach_fe.measurement.map_join import join_maps
-    from halbach_fe.report.map_join import answer, pose_table, sentences, term_table, write_joined
 
     files = [arguments.map, *arguments.others]
-    arguments.listed_maps = _by_name(files)
-    maps = {name: common.read_one(arguments, file)
-            for name, file in arguments.listed_maps.items()}
-    if arguments.output is not None:
+    if arguments.others:
+        arguments.listed_maps = _by_name(files)
+    maps = [common.read_one(arguments, file) for file in files]
+    if arguments.output is not None:  # before the check, which may take a minute
         common.own_folder(arguments, "halbach-fe check")
+    say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
     with common.progress_bar("checking") as show:
-        joined = join_maps(maps, (lambda _: None) if arguments.json else common.say, show)
-    if arguments.output is not None:
-        write_joined(maps, joined, arguments.output, common.digests(
-            {f"map {name}": file for name, file in arguments.listed_maps.items()}))
-    if arguments.json:
-        common.print_json(joined.plain())
-        return 0
-    for sentence in sentences(joined):
-        common.say(sentence)
-    common.print_table(pose_table(joined), "Where the maps lie in the frame of the first one")
-    common.print_table(term_table(joined), "The instrument, by all maps together")
-    common.say_answer(arguments, answer(joined),
-                      None if arguments.output is None else arguments.output / "joined.html")
-    return 0
+        if arguments.others:
+            from halbach_fe.measurement.map_join import join_maps
+            from halbach_fe.report import map_join
+
+            named = dict(zip(arguments.listed_maps, maps, strict=True))
+            page = map_join.page(named, join_maps(named, say, show))
+        elif is_total_field(maps[0]):
+            from halbach_fe.measurement.total_check import check_total
+            from halbach_fe.report import map_check
+
+            page = map_check.total_page(maps[0], check_total(maps[0]))
+        else:
+            from halbach_fe.measurement.map_check import check_map
+            from halbach_fe.report import map_check
+
+            page = map_check.page(maps[0], check_map(maps[0], say, show))
+    return common.finish(arguments, page)
 
 
 def _by_name(files: list[InputFile]) -> dict[str, InputFile]:

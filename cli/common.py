@@ -218,7 +218,9 @@ def _described(arguments: argparse.Namespace) -> dict[str, str]:
 
     files = {DESCRIPTIONS.get(name, name.replace("_", " ")): value
              for name, value in vars(arguments).items() if isinstance(value, InputFile)}
-    files |= {f"map {name}": file for name, file in getattr(arguments, "listed_maps", {}).items()}
+    listed = getattr(arguments, "listed_maps", {})
+    files = {name: file for name, file in files.items() if file not in listed.values()} | {
+        f"map {name}": file for name, file in listed.items()}
     found = {}
     for name, file in files.items():
         with suppress(OSError):  # whoever reads it says what is wrong
@@ -645,16 +647,24 @@ def finish(arguments: argparse.Namespace, page: Page) -> int:
     """Write the files of a result, and print it as JSON, or its tables and its answer; return 0."""
     from halbach_fe.report.page import write_files
 
-    path = write_files(page, arguments.output, arguments.study.read_text(encoding="utf-8-sig"))
+    path = None if arguments.output is None else write_files(
+        page, arguments.output, getattr(arguments, "study", None))
     if arguments.json:
         print_json(page.summary)
         return 0
+    say_page(arguments, page, path)
+    return 0
+
+
+def say_page(arguments: argparse.Namespace, page: Page, path: Path | None = None) -> None:
+    """Print the tables and the answer of a page, and where it is if it was written."""
+    for sentence in page.remarks:
+        say(sentence)
     for title, rows in page.tables.items():
         print_table(rows, title)
-    if page.new_study is not None:
+    if page.new_study is not None and path is not None:
         say(f"Study: {arguments.output / page.new_study[0]}")
     say_answer(arguments, page.answer, path)
-    return 0
 
 
 def say_answer(arguments: argparse.Namespace, answer: Answer, page: Path | None = None) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from halbach_fe.diagnosis.cost import DiagnosisEstimate
     from halbach_fe.diagnosis.effects.base import Effect
-    from halbach_fe.diagnosis.result import Diagnosis, Floor
+    from halbach_fe.diagnosis.result import Floor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -128,12 +128,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Diagnose, write the results, print a summary."""
     from halbach_fe.diagnosis.diagnose import diagnose
     from halbach_fe.diagnosis.discriminating_measurements import separations
-    from halbach_fe.diagnosis.summary import diagnosis_summary
-    from halbach_fe.report.result_files import write_diagnosis
+    from halbach_fe.report.diagnosis import page
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
-    text = arguments.study.read_text(encoding="utf-8-sig")
     data = common.read_measurements(arguments, study)
     blocks, validation_map = common.blocks_and_held_out(arguments)
     floor = floors_of(arguments.check, data)
@@ -149,13 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
         diagnosis = diagnose(study, data, session, blocks, arguments.effects, validation_map,
                              common.say, floor_T=floor, time_limit_s=arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)
-    write_diagnosis(diagnosis, separating, study, text, arguments.output,
-                    origin=arguments.study.parent)
-    if arguments.json:
-        common.print_json(diagnosis_summary(diagnosis, separating))
-    else:
-        print_diagnosis(diagnosis, arguments)
-    return 0
+    return common.finish(arguments, page(diagnosis, separating, study))
 
 
 def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
@@ -174,17 +166,3 @@ def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:
                f"{estimate.fields} more fields of whole magnets. In all {times}, within a factor "
                f"of about {TIME_FACTOR:g}.")
     return 0
-
-
-def print_diagnosis(diagnosis: Diagnosis, arguments: argparse.Namespace) -> None:
-    """Print the missing effects, the scores before and after, and the answer."""
-    from halbach_fe.report.diagnosis import change_table, found_table, residual_table
-    from halbach_fe.report.diagnosis_answer import answer
-    from halbach_fe.report.words import BAYES_FACTOR_IN_WORDS
-
-    if diagnosis.found_anything:
-        common.print_table(found_table(diagnosis), "Missing from the study")
-        common.say(BAYES_FACTOR_IN_WORDS)
-    common.print_table(change_table(diagnosis), "The model before and after")
-    common.print_table(residual_table(diagnosis), "Rms difference of model and readings")
-    common.say_answer(arguments, answer(diagnosis), arguments.output / "diagnosis.html")

@@ -37,9 +37,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Infer, write the results, print the table of errors before and after."""
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.infer import infer, observation_of
-    from halbach_fe.inference.storage import inference_summary, write_inference
+    from halbach_fe.inference.storage import write_inference
     from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
     from halbach_fe.measurement.field_map import refuse_total_field
+    from halbach_fe.report.inference import page
     from halbach_fe.response.magnetic_axis import magnetic_axis
     from halbach_fe.response.stray_field import stray_field
     from halbach_fe.study.reader import read_study
@@ -91,31 +92,4 @@ def run(arguments: argparse.Namespace) -> int:
             stray_field=stray_field(magnet, session, result.posterior))
     if result.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
-    from halbach_fe.report.campaign_inference import (
-        overlap_table,
-        pose_table,
-        term_table,
-        write_updated_study,
-    )
-    from halbach_fe.report.inference import score_table, write_inference_report
-    from halbach_fe.report.magnetic_axis import axis_rows
-    from halbach_fe.report.stray_field import stray_rows
-
-    write_inference(result, arguments.output)
-    answer = write_inference_report(result, arguments.output, provenance={
-        "GetDP": session.getdp.version, **common.digests({
-            "study file": arguments.study, **common.map_files(arguments, study),
-            "held-out map": arguments.held_out, "blocks": arguments.blocks})})
-    if result.terms is not None:
-        write_updated_study(arguments.study, result, arguments.output)
-    if arguments.json:
-        common.print_json(inference_summary(result))
-    else:
-        common.print_table(score_table(result), "Differences of readings and predictions")
-        common.print_table(term_table(result), "The instruments, estimated with the blocks")
-        common.print_table(pose_table(result), "Where the maps lie in the magnet")
-        common.print_table(overlap_table(result), "Maps where they overlap")
-        common.print_table(axis_rows(result.magnetic_axis), "Magnetic centre, axis and roll")
-        common.print_table(stray_rows(result.stray_field), "Outside of the magnet")
-        common.say_answer(arguments, answer, arguments.output / "report.html")
-    return 0
+    return common.finish(arguments, page(result))

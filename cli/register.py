@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from halbach_fe.cli import common
@@ -25,8 +24,7 @@ from halbach_fe.core.numbers import parse_number
 if TYPE_CHECKING:
     import xarray as xr
 
-    from halbach_fe.inference.pose_result import OpenKey, Registration
-    from halbach_fe.study.measurement import Instrument
+    from halbach_fe.inference.pose_result import OpenKey
     from halbach_fe.study.model import Study
 
 
@@ -103,12 +101,11 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.pose_result import PosePrior
     from halbach_fe.inference.registration import register
-    from halbach_fe.report.registration import registration_summary, write_registration
+    from halbach_fe.report.registration import page
     from halbach_fe.study.reader import read_study
 
     study = read_study(arguments.study)
     data = common.read_measurements(arguments, study)
-    text = arguments.study.read_text(encoding="utf-8-sig")
     say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
     if isinstance(data, dict):
         for name in ("alternative", "most", "across_m", "turn_rad"):
@@ -117,61 +114,39 @@ def run(arguments: argparse.Namespace) -> int:
                 raise StudyError(must_be(
                     option, "the command line", "left out for a study that lists several maps",
                     "given", "Register one of the maps alone with it."))
-        return _run_campaign(arguments, study, text, data, say)
+        return _run_campaign(arguments, study, data, say)
     pose = PosePrior(arguments.across_m, arguments.turn_rad or PosePrior.turn_rad)
     with common.session(arguments, study) as session:
         found = register(build_magnet(study), data, session, open_keys=arguments.fit,
                          alternatives=arguments.alternative, most=arguments.most, pose=pose,
                          say=say)
-    write_registration(study, text, data, found, arguments.output, common.digests({
-        "study file": arguments.study, "measurements": arguments.measurements}))
-    if arguments.json:
-        common.print_json(registration_summary(found))
-        return 0
-    _print(arguments, found, arguments.output / "registration.html", study.instrument)
-    return 0
+    return common.finish(arguments, page(study, data, found))
 
 
 def _run_campaign(
-    arguments: argparse.Namespace, study: Study, text: str, data: dict[str, xr.Dataset],
+    arguments: argparse.Namespace, study: Study, data: dict[str, xr.Dataset],
     say: Callable[[str], None],
 ) -> int:
-    """Register all maps that the study lists."""
+    """Register all maps that the study lists, each with a page in a folder of its own."""
+    from halbach_fe.core.files import make_folder
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.campaign_registration import register_maps, registered_study
-    from halbach_fe.measurement.campaign import maps_of, with_paths_from
-    from halbach_fe.report.registration import (
-        NOMINAL,
-        UPDATED,
-        registration_summary,
-        write_campaign_registration,
-    )
+    from halbach_fe.measurement.campaign import maps_of
+    from halbach_fe.report.page import write_changed_study, write_files
+    from halbach_fe.report.registration import NOTE, STUDY_FILE, pages_of_maps
 
     maps = maps_of(study, data)
     with common.session(arguments, study) as session:
         found = register_maps(build_magnet(study.with_(maps=())), maps, session, arguments.fit, say)
-    registered = with_paths_from(registered_study(study, maps, found), arguments.study.parent,
-                                 arguments.output)
-    write_campaign_registration(registered, text, maps, found, arguments.output, common.digests(
-        {"study file": arguments.study} | common.map_files(arguments, study)))
+    write_changed_study(arguments.output / STUDY_FILE,
+                        [(registered_study(study, maps, found), NOTE)], arguments.study)
+    pages = pages_of_maps(maps, found)
+    paths = {name: write_files(page, make_folder(arguments.output / name))
+             for name, page in pages.items()}
     if arguments.json:
-        common.print_json({"maps": {name: registration_summary(poses)
-                                    for name, poses in found.items()}})
+        common.print_json({"maps": {name: page.summary for name, page in pages.items()}})
         return 0
-    for number, one in enumerate(maps):
-        common.say(f"Map {one.name}:")
-        _print(arguments, found[one.name], arguments.output / one.name / "registration.html",
-               one.study.instrument, UPDATED if number else NOMINAL, one.name)
+    for name, page in pages.items():
+        common.say(f"Map {name}:")
+        common.say_page(arguments, page, paths[name])
     return 0
-
-
-def _print(arguments: argparse.Namespace, found: Sequence[Registration], page: Path,
-           assumed: Instrument, *of_map: str) -> None:
-    """Print what was found about one map, see `halbach_fe.report.registration.answer`."""
-    from halbach_fe.report.registration import answer, place_table, pose_table, sentences
-
-    for sentence in sentences(found):
-        common.say(sentence)
-    common.print_table(pose_table(found, *of_map[:1]), "Poses of the map")
-    common.print_table(place_table(found), "Where the map lies in the magnet")
-    common.say_answer(arguments, answer(found, *of_map, assumed=assumed), page)

@@ -4,17 +4,14 @@ changes.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import write_text
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
@@ -42,11 +39,9 @@ from halbach_fe.inference.result import (
     TRAINING,
     InferenceResult,
 )
-from halbach_fe.measurement.campaign import with_paths_from
-from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.model import Study
 
-STUDY_FILE, SUMMARY_FILE = "study.diagnosed.toml", "diagnosis.json"
+STUDY_FILE = "study.diagnosed.toml"
 """Names of the files that a diagnosis writes."""
 
 DISPLAY_UNITS = {
@@ -157,37 +152,8 @@ def main_field_T(diagnosis: Diagnosis) -> float:  # noqa: N802 - a unit
     return float(np.abs(diagnosis.after.prediction_posterior.mean).max())
 
 
-def write_summary(
-    diagnosis: Diagnosis, separations: Sequence[Separation], folder: Path
-) -> None:
-    """Write diagnosis.json."""
-    text = json.dumps(diagnosis_summary(diagnosis, separations), indent=1, allow_nan=False)
-    write_text(folder / SUMMARY_FILE, text + "\n")
-
-
-def write_study(
-    text: str, study: Study, diagnosis: Diagnosis, folder: Path, origin: Path | None = None
-) -> None:
-    """Write study.diagnosed.toml, edited from the text of the study's file.
-
-    The paths of the maps that it lists start from ``origin``, the folder of that file, and are
-    changed to start from ``folder``.
-
-    Raises
-    ------
-    StudyError
-        If no valid study has the fitted amplitudes.
-    """
-    steps = list(_steps(study, diagnosis))
-    if origin is not None and study.maps:
-        moved = [(with_paths_from(each, origin, folder), comment) for each, comment in steps]
-        steps = [steps[0], (moved[0][0], "path from this folder"), *moved[1:]]
-    write_edited(folder / STUDY_FILE, text, steps)
-
-
-def _steps(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
+def changed_studies(study: Study, diagnosis: Diagnosis) -> Iterator[tuple[Study, str]]:
     """Yield the studies from that of the file to the diagnosed one, each with a comment."""
-    yield study, "copied from another file, so that this one is complete"
     for error in diagnosis.gross_errors:
         study = error.apply(study)
         yield study, f"gross error: {error.text}"

@@ -7,13 +7,16 @@ HTML of a folder is never read.
 from __future__ import annotations
 
 import base64
+import json
 import os
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -21,7 +24,10 @@ from pydantic import ValidationError
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
 from halbach_fe.core.result_folder import Record, Results, finished_results
 from halbach_fe.geometry.array_layout import nominal_blocks
+from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, Picture
+from halbach_fe.report.words import counted, in_a_row
+from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study, differences, magnet_description
 
 ORDER = ("design", "solve", "verify", "demagnetization", "forces", "tolerance", "plan", "sort",
@@ -249,3 +255,231 @@ def is_same_magnet(one: Study, other: Study) -> bool:
     along = np.einsum("ij,ij->i", [block.easy_axis for block in blocks],
                       [block.easy_axis for block in others])
     return bool((apart <= SAME_PLACE * widths).all() and (along >= SAME_DIRECTION).all())
+
+
+FINDING = ("register", "diagnose")
+"""Commands that write a study which later results should be of."""
+
+OF_MEASURED = ("infer", "multipoles", "homogeneity", "shim", "shim-tray")
+"""Commands whose results are of the measured magnet, and should be of such a study."""
+
+UPDATED_BY_MAP = ("infer", "diagnose", "shim", "shim-tray")
+"""Commands that update the blocks by a map, and take measured blocks too."""
+
+EXCEPTIONS = "array.exceptions"
+"""Key of the blocks that deviate from the array."""
+
+MOST_FILES, MOST_KEYS, MOST_VALUE = 6, 3, 40
+"""Largest numbers of files and of keys that a sentence names, and of characters of a value."""
+
+WRITTEN, OF_SAME_MAGNET, OF_ANOTHER_MAGNET = "written", "of the same magnet", "of another magnet"
+"""How a version of the study belongs to the first one: a command wrote it, or it has the same
+magnet, or neither."""
+
+OF_MAPPER = ("instrument", "instrument_sd", "maps")
+"""Tables of the study in which register writes the poses of maps and the probe."""
+
+
+def doubts(chapters: Sequence[Chapter]) -> list[str]:
+    """Return a sentence for everything that does not fit together."""
+    return [*_changed(chapters), *_out_of_date(chapters), *_other_files(chapters),
+            *_unused_findings(chapters), *_unused_blocks(chapters), *_unrelated(chapters),
+            *(text for text, kind in _versions(chapters) if kind == OF_ANOTHER_MAGNET)]
+
+
+def versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
+    """Return a sentence for every version of the study of which there are results by intent.
+
+    Each comes with whether a command wrote that version, `WRITTEN`, or not, `OF_SAME_MAGNET`.
+    """
+    return [(text, kind) for text, kind in _versions(chapters) if kind != OF_ANOTHER_MAGNET]
+
+
+def _changed(chapters: Sequence[Chapter]) -> list[str]:
+    """Name results that are not as their run has left them."""
+    return [f"Changed since the run in {one.label}: {', '.join(one.changed[:MOST_FILES])}."
+            for one in chapters if one.changed]
+
+
+def _out_of_date(chapters: Sequence[Chapter]) -> list[str]:
+    """Name results that were computed with an earlier version of another one."""
+    present = {digest for one in chapters for digest in one.record.files.values()}
+    found = []
+    for one in chapters:
+        names: dict[str, list[str]] = {}
+        for path, digest in one.record.inputs.items():
+            name = PurePath(path).name
+            holders = [other for other in chapters if other is not one
+                       and name in {PurePath(file).name for file in other.digests.values()}]
+            if holders and digest not in present:
+                hold = f"{_listed(holders)} {'holds' if len(holders) == 1 else 'hold'}"
+                names.setdefault(hold, []).append(name)
+        found += [f"{one.label} is out of date: it was computed with another {in_a_row(files)} "
+                  f"than {hold}. Run {one.record.command} again, or leave out what does not belong "
+                  "to it." for hold, files in names.items()]
+    return found
+
+
+def _other_files(chapters: Sequence[Chapter]) -> list[str]:
+    """Name files of one name that had different contents; studies are compared by their keys."""
+    by_name: dict[str, dict[str, set[str]]] = {}
+    results = {PurePath(file).name for one in chapters for file in one.digests.values()}
+    for one in chapters:
+        for path, digest in one.record.inputs.items():
+            by_name.setdefault(PurePath(path).name, {}).setdefault(one.label, set()).add(digest)
+    found = []
+    for name, by_label in by_name.items():
+        if name.endswith(".toml") or name in results:
+            continue
+        apart = [pair for pair in combinations(by_label, 2)
+                 if not by_label[pair[0]] & by_label[pair[1]]]
+        if apart:
+            found.append(f"{' and '.join(apart[0])} read different files called {name}.")
+    return found
+
+
+def _unused_findings(chapters: Sequence[Chapter]) -> list[str]:
+    """Name studies with findings that no result here is of."""
+    found = []
+    for one in chapters:
+        found_nothing = not any(page.said.answer is None or page.said.answer.changes_study
+                                for page in one.pages) or (
+            # a pose in which the magnet does not explain the map is none to use
+            one.verb == "register" and not one.sound)
+        written = [] if found_nothing or not one.record.inputs else [
+            name for name in one.digests.values() if name.endswith(".toml")]
+        later = [other for other in chapters if other.verb in OF_MEASURED]
+        if one.verb in FINDING and written and later and not any(
+                other.has_study_of(one) for other in chapters):
+            found.append(f"No result here is of {one.label}/{written[0]}: {_listed(later)} "
+                         f"{'is' if len(later) == 1 else 'are'} without what "
+                         f"{one.record.command} has found.")
+    return found
+
+
+def _unused_blocks(chapters: Sequence[Chapter]) -> list[str]:
+    """Name updates by a map without the measured blocks that other results here are of."""
+    known = [one for one in chapters if "BLOCKS" in one.record.named]
+    verbs = {one.verb for one in known}
+    without = [one for one in chapters if one.verb in UPDATED_BY_MAP and one.verb not in verbs
+               and "MAP" in one.record.named and "BLOCKS" not in one.record.named]
+    if not known or not without:
+        return []
+    return [f"{_listed(without)} {'is' if len(without) == 1 else 'are'} without the measured "
+            f"blocks that {_listed(known)} {'has' if len(known) == 1 else 'have'} read, and "
+            f"{'knows' if len(without) == 1 else 'know'} less of the magnet: run "
+            f"{in_a_row(list(dict.fromkeys(one.record.command for one in without)))} again with "
+            "--blocks."]
+
+
+def _unrelated(chapters: Sequence[Chapter]) -> list[str]:
+    """Name results without a study whose input no other result has to do with."""
+    found = []
+    for one in chapters:
+        inputs = set(one.record.inputs.values())
+        others = [other for other in chapters if other is not one]
+        if one.study is None and not any(
+                inputs & {*other.record.inputs.values(), *other.record.files.values()}
+                or other.uses(one) for other in others):
+            found.append(f"{one.label} is of a file that no other result here is of: "
+                         f"{', '.join(one.record.inputs) or 'an unknown one'}.")
+    return found
+
+
+def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
+    """Say how each version of the study differs from the first, and how it belongs to that."""
+    groups: list[tuple[Study, list[Chapter]]] = []
+    for one in chapters:
+        if (study := one.study) is None:
+            continue
+        of_same = [group for version, group in groups
+                   if not differences(_plain(version), _plain(study))]
+        if of_same:
+            of_same[0].append(one)
+        else:
+            groups.append((study, [one]))
+    found = []
+    for study, group in groups[1:]:
+        first = groups[0][0]
+        source = next(((other, name) for one in group for other in chapters
+                       for name in one.uses(other) if name.endswith(".toml")), None)
+        changed = differences(_plain(first), _plain(study))
+        if source is not None and source[0].verb == "register":
+            # its numbers are on its own page
+            changed = {key: values for key, values in changed.items()
+                       if key.partition(".")[0] not in OF_MAPPER}
+        texts = [_difference(key, old, new) for key, (old, new) in changed.items()]
+        more = f" and {len(texts) - MOST_KEYS} more" if len(texts) > MOST_KEYS else ""
+        changes = "; ".join(texts[:MOST_KEYS]) + more
+        of = f"{_listed(group)} {'is' if len(group) == 1 else 'are'} of"
+        if source is not None:
+            other, name = source
+            wrote = f"{of} {other.label}/{name}, which {other.record.command} wrote"
+            if other.verb == "register":
+                wrote += (" with the poses of maps and the errors of the probe that it found"
+                          f"{'. Beside these' if changes else '; nothing else differs'}")
+            found.append((f"{wrote}{f': {changes}' if changes else ''}.", WRITTEN))
+        else:
+            same = magnet_description(first) == magnet_description(study)
+            found.append((f"{of} another version of the study than {groups[0][1][0].label}: "
+                          f"{changes}.", OF_SAME_MAGNET if same else OF_ANOTHER_MAGNET))
+    return found
+
+
+def _plain(study: Study) -> dict[str, Any]:
+    """Return a study as plain data, without paths, which start from the folder of its file."""
+    found = study.model_dump(mode="json", exclude={"description"})
+    found["maps"] = [one | {"file": None} for one in found["maps"]]
+    return found
+
+
+def _difference(key: str, old: Any, new: Any) -> str:
+    """Say how a key differs between two versions of a study."""
+    if any(isinstance(value, list) and value and isinstance(value[0], dict)
+           for value in (old, new)):
+        before, now = len(old or ()), len(new or ())
+        if key == EXCEPTIONS and 0 < now - before <= MOST_KEYS and new[:before] == (old or []):
+            return f"{key} has {in_a_row([_exception(one) for one in new[before:]])} besides"
+        if before == now:
+            return f"{key} has {counted(now, 'entry', 'entries')}, as before, but not the same"
+        return f"{key} has {counted(now, 'entry', 'entries') if now else 'no entry'}, and " + (
+            f"{before or 'none'} before")
+    if old in (None, []):
+        return f"{key} is {'given' if isinstance(new, dict) else _short(new)}, and was not before"
+    if new in (None, []):
+        known = "given" if isinstance(old, dict) else _short(old)
+        return f"{key} is not given, and was {known} before"
+    return f"{key} is {_short(new)} instead of {_short(old)}"
+
+
+def _exception(entry: dict[str, Any]) -> str:
+    """Return an entry of `array.exceptions` in words: the block, and what it deviates by."""
+    usual = BlockException().model_dump(mode="json")
+    own = ", ".join(_key_in_words(key, value) for key, value in entry.items()
+                    if value != usual[key] and key not in ("ring", "slot"))
+    place = block_in_words(entry["ring"] or 0, entry["slot"] or 0) or "all blocks"
+    return f"{place} ({own})"
+
+
+def _key_in_words(key: str, value: Any) -> str:
+    """Return a key and its value; a displacement in mm."""
+    if key == "shift_m":
+        x, y, z = (f"{1e3 * part:.3f}".replace("-", "\u2212") for part in value)
+        return f"moved by x {x}, y {y}, z {z} mm"
+    return f"{key} = {_short(value)}"
+
+
+def _short(value: Any) -> str:
+    """Return a value of a key as a short text."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list) and all(isinstance(one, float) for one in value):
+        text = ", ".join(f"{one:.4g}" for one in value)
+    else:
+        text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= MOST_VALUE else f"{text[:MOST_VALUE]}…"
+
+
+def _listed(chapters: Sequence[Chapter]) -> str:
+    """Return the names of folders in words."""
+    return in_a_row([one.label for one in chapters])

@@ -21,8 +21,15 @@ from halbach_fe.core.result_folder import result_folder, single_file
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.campaign_folders import Chapter, Page, read_chapters
-from halbach_fe.report.campaign_remarks import OF_MEASURED, WRITTEN, doubts, versions
+from halbach_fe.report.campaign_folders import (
+    OF_MEASURED,
+    WRITTEN,
+    Chapter,
+    Page,
+    doubts,
+    read_chapters,
+    versions,
+)
 from halbach_fe.report.magnet_table import in_one_line
 from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
 from halbach_fe.report.page_record import Picture

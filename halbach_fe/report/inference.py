@@ -1,8 +1,9 @@
-"""Figures and the HTML page of an inference result."""
+"""Tables, figures and page of an updated magnet."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,27 +12,155 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
-from halbach_fe.report.answer import Answer
-from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
+from halbach_fe.inference.storage import inference_summary, write_inference
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.magnetic_axis import axis_rows, definition
 from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
-from halbach_fe.report.page import POSTERIOR, SMALL, figure_of, own_style, save, write_page
+from halbach_fe.report.page import (
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    PUBLISHED,
+    SECOND,
+    SMALL,
+    Drawn,
+    Figures,
+    Items,
+    Page,
+    Section,
+    Table,
+    Text,
+    View,
+    figure_of,
+    page_of,
+)
 from halbach_fe.report.prediction import (
     PublishedErrors,
     has_profile,
+    has_residual_maps,
     prediction_profile_figure,
     relative_error_figure,
     residual_maps_figure,
     standardized_residuals_figure,
     whitened_quantiles_figure,
 )
-from halbach_fe.report.stray_field import stray_pictures, stray_section
+from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import decimals, flux_density, place_of, ppm, relative, with_error
 from halbach_fe.response.homogeneity import PPM
+from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.multipoles import circle_models
+
+STUDY_FILE = "study.updated.toml"
+
+NOTE = "found by halbach-fe infer"
+
+UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3)}
+"""Unit that people read, and its factor, for the unit at the end of a term's name."""
+
+COLOURS = (POSTERIOR, SECOND, MEASURED, PUBLISHED, PRIOR)
+
+
+def term_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: what the update says about the instruments, and about uncertain
+    amplitudes; none if all are known.
+    """
+    rows = []
+    terms = [row for found in (result.terms, result.amplitudes) if found is not None
+             for row in zip(found.names, found.change, found.sd, found.prior_sd, strict=True)]
+    for name, change, sd, prior_sd in terms:
+        owner, _, term = name.rpartition(".")
+        what, _, unit = term.rpartition("_")
+        shown, factor = UNITS.get(unit, ("%", 100.0))
+        what = what if unit in UNITS else term
+        rows.append({"of": owner, "term": what.replace("_", " "),
+                     "change from the study": f"{factor * change:+.4f} ± {factor * sd:.4f} {shown}",
+                     "known before": f"± {factor * prior_sd:.3g} {shown}"})
+    return rows
+
+
+def pose_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: where the middles of the maps lie; none if that was known before."""
+    return [{"map": pose.name} | {
+        f"{axis} of its middle": f"{1e3 * value:.3f} ± {1e3 * sd:.3f} mm"
+        for axis, value, sd in zip("xyz", pose.middle_m, pose.middle_sd_m, strict=True)} | {
+        "turned about x, y, z": "± " + ", ".join(f"{1e3 * sd:.2g}" for sd in pose.turn_sd_rad)
+        + " mrad"} for pose in (result.terms.poses if result.terms else ())]
+
+
+def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: how maps agree where they overlap; none if they do not."""
+    return [{
+        "map": each.name, "as predicted by map": each.by,
+        "readings": f"{each.readings}{' held out' if each.held_out else ''}",
+        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "chi²/reading": decimals(each.chi2),
+        "verdict": "they disagree" if each.disagreement else "they agree"}
+        for each in result.overlaps]
+
+
+def maps_figure(result: InferenceResult) -> Figure:
+    """Draw where the maps lie in the magnet."""
+    figure = figure_of(3.6)
+    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    places, maps = 1e3 * result.observation.places, np.array(result.maps)
+    for number, name in enumerate(dict.fromkeys(result.maps)):
+        mine = maps == name
+        style = {"ls": "none", "marker": ".ox+d"[number % 5], "mfc": "none",
+                 "ms": 2 if number == 0 else 4, "color": COLOURS[number % len(COLOURS)]}
+        along.plot(places[mine, 2], np.hypot(*places[mine, :2].T), label=name, **style)
+        across.plot(places[mine, 0], places[mine, 1], **style)
+    along.set_xlabel("z in the magnet in mm")
+    along.set_ylabel("distance from the axis in mm")
+    figure.legend(*along.get_legend_handles_labels(), loc="outside upper center", ncols=4,
+                  frameon=False, markerscale=3)
+    across.set_aspect("equal", adjustable="datalim")
+    across.set_xlabel("x in the magnet in mm")
+    across.set_ylabel("y in the magnet in mm")
+    for axis in (along, across):
+        axis.grid(alpha=0.3)
+    return figure
+
+
+UNDEFINED = "not defined"
+
+
+def axis_rows(axis: MagneticAxis | None) -> list[dict[str, str]]:
+    """Return a row of text for each of centre, slope of the axis, and roll; none without axis."""
+    if axis is None:
+        return []
+    rows = []
+    if axis.centre_m is None or axis.centre_sd_m is None:
+        rows.append({"of the updated magnet": "magnetic centre", "value": UNDEFINED})
+    else:
+        for name, value, sd in zip("xyz", axis.centre_m, axis.centre_sd_m, strict=False):
+            rows.append({"of the updated magnet": f"magnetic centre, {name}",
+                         "value": f"{with_error(1e3 * value, 1e3 * sd)}\u00a0mm"})
+    if axis.slope_rad is not None and axis.slope_sd_rad is not None:
+        for name, value, sd in zip("xy", axis.slope_rad, axis.slope_sd_rad, strict=True):
+            rows.append({"of the updated magnet": f"magnetic axis, d{name}/dz",
+                         "value": f"{with_error(1e3 * value, 1e3 * sd)}\u00a0mrad"})
+    where = "" if axis.slope_rad is None else ", mean of the middle half"
+    rows.append({"of the updated magnet": f"roll about z{where}",
+                 "value": f"{with_error(1e3 * axis.roll_rad, 1e3 * axis.roll_sd_rad)}\u00a0mrad"})
+    return rows
+
+
+def definition(axis: MagneticAxis) -> str:
+    """Return how centre, axis and roll are defined for the magnet's order, in sentences."""
+    roll = ("The roll is the turn of the main multipole about z from that of the nominal magnet, "
+            "right-handed; in a magnet of finite length in the mean along its middle half, "
+            "weighted by the square of the field. The integral along z, whose roll shim states, "
+            "has another one if rings are turned against each other. In the table of multipoles, "
+            "a of the main order says the same of one circle, with the other sign.")
+    if axis.order == 1:
+        return ("A dipole has no axis. Its centre is the point near the middle, of a magnet of "
+                "finite length, where the gradient of the main component vanishes; a homogeneous "
+                f"field may have none there. {roll}")
+    return (f"The centre is where the multipole of order {axis.order - 1} vanishes"
+            + (", the axis the straight line through the centres along the middle half of the "
+               "magnet; the centre is its point at z = 0. " if axis.slope_rad is not None
+               else ". ") + roll)
+
 
 NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
@@ -39,6 +168,9 @@ NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 
 RANKED = 8
 """Number of the blocks that a page lists: those that deviate most."""
+
+MOST_TURNED = 5
+"""Largest number of rows of a table that has a column for each."""
 
 ALIKE = 0.03
 """Range of the contractions of all blocks up to which they are said instead of drawn."""
@@ -126,14 +258,12 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
     return rows
 
 
-@own_style
-def write_inference_report(
-    result: InferenceResult, folder: Path, published: PublishedErrors | None = None,
-    assumptions: Sequence[str] = (), provenance: Mapping[str, str] | None = None,
-) -> Answer:
-    """Write report.html and its figures into a folder; return the page's answer.
-
-    If the readings are on full circles, multipoles.csv is written too.
+@page_of.register
+def page(
+    result: InferenceResult, published: PublishedErrors | None = None,
+    assumptions: Sequence[str] = (),
+) -> Page:
+    """Return the page of an updated magnet.
 
     Parameters
     ----------
@@ -141,72 +271,194 @@ def write_inference_report(
         Relative errors from the literature to compare with.
     assumptions : sequence of str
         Sentences that state what the result rests on.
-    provenance : mapping, optional
-        Entries of the page's provenance table.
     """
-    unseen = ("of the held-out readings for prior and posterior" if result.held_out.any()
-              else "of the training readings for the prior (nothing was held out)")
-    contraction = result.contraction[~np.isnan(result.contraction)]  # missing blocks have none
-    profile = ("Readings with the predictions of prior and posterior, and the residuals of the "
-               "posterior, along the line of the strongest reading")
-    profiles = ({"profile.png": (prediction_profile_figure(result), profile)}
-                if has_profile(result) else {})
-    if (maps := residual_maps_figure(result)) is not None:
-        profiles["residual_maps.png"] = (
-            maps, "Measured less predicted over the map, before and after the update: what remains "
-            "should be noise, without a pattern")
-    if result.is_campaign:
-        profiles = {"maps.png": (maps_figure(result), "Where the maps lie in the magnet")}
-        profiles |= {f"profile-{name}.png": (
-            prediction_profile_figure(result, name), f"Map {name}. {profile}")
-            for name in dict.fromkeys(result.maps) if has_profile(result, name)}
-    if published is not None:
-        profiles["relative_error.png"] = (
-            relative_error_figure(result, published), "Relative error of the predictions of prior "
-            "and posterior along the same line")
-    figures = profiles | {
-        "residuals.png": (standardized_residuals_figure(result), "Standardized residuals of "
-                          "all readings (divided by the standard deviation of prediction and "
-                          "noise) for the prior (top) and the posterior (bottom). The grey band "
-                          "should hold 95 % of them; of the training readings it holds more for "
-                          "the posterior, which is fitted to them"),
-        "quantiles.png": (whitened_quantiles_figure(result), f"Quantiles of the whitened residuals "
-                          f"{unseen} against normal quantiles; they are whitened with the full "
-                          "covariance of prediction and noise, and lie on the line if the model "
-                          "is right"),
-        "blocks.png": (_magnetization_change_figure(result), "Posterior change of the "
-                       "magnetization along the easy axis, from nominal, by ring and slot"),
-    } | ({} if not len(contraction) or np.ptp(contraction) < ALIKE else {
-        "contraction.png": (_contraction_figure(result), "Contraction of each block: "
-                            "the decrease of its variance from prior to posterior; 0 % means that "
-                            "the readings contain no information about the block"),
-    }) | dict(stray_pictures(result.stray_field))
     multipoles: list[MultipoleTable] = [
         (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
         for model in ([] if result.is_campaign else circle_models(
             result.magnet, result.observation, result.response))]
+    rows, axis, stray = (score_table(result, published), axis_rows(result.magnetic_axis),
+                         result.stray_field)
+    profiles = _profiles(result, published)
+    figures = {**profiles, **_pictures(result), **stray_pictures(stray)}
+    doubtful = _doubtful(result)
+    files: dict[str, Callable[[Path], object] | None] = {
+        "summary.json": lambda path: write_inference(result, path.parent),
+        **dict.fromkeys(("prediction.csv", "posterior.h5"))}
     if multipoles:
-        write_multipole_csv(result.study, multipoles, folder / "multipoles.csv")
-    said = answer(result, multipoles)
-    write_page(
-        folder / "report.html", "inference.html.j2", save(figures, folder), study=result.study,
-        provenance=provenance, result=result, multipoles=middle_table(multipoles, result.study),
-        rows=score_table(result, published), published=published, assumptions=assumptions,
-        magnet_rows=magnet_rows(result.magnet),
-        answer=said, blocks=block_table(result),
-        contraction=_contraction_in_words(result, contraction),
-        terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
-        noise=[flux_density(float(end), 2)
-               for end in (result.noise.sd.min(), result.noise.sd.max())],
-        position_sd=[f"{1e3 * sd:.3g}" for sd in (
-            result.study.noise.position_sd_m or () if result.study.noise else ())],
-        solver_error=_solver_error(result), superposition=ppm(
-            PPM * float(result.response.superposition_error)),
-        axis=axis_rows(result.magnetic_axis), axis_definition=(
-            "" if result.magnetic_axis is None else definition(result.magnetic_axis)),
-        stray=stray_section(result.stray_field), view=view_of_inference(result),
-        view_colours=colours_in_words(result))
-    return said
+        files["multipoles.csv"] = partial(write_multipole_csv, result.study, multipoles)
+    return Page(
+        "infer", "the updated magnet", result.study, answer(result, multipoles),
+        inference_summary(result), [
+            Section([*doubtful, Table(block_table(result))], "The blocks that deviate most"),
+            _before_and_after(rows, published is not None), *_sections_of_maps(result),
+            Section([Items(assumptions)] if assumptions else [], "Assumptions"),
+            Section([View(lambda: view_of_inference(result), colours_in_words(result))]),
+            Section([] if result.magnetic_axis is None else [
+                *doubtful, f"{definition(result.magnetic_axis)} ± is the standard deviation.",
+                Table(axis)], "Magnetic centre, axis and roll"),
+            *(Section([*doubtful, *section.parts], section.title)
+              for section in sections_of_stray(stray)),
+            *_sections_of_circles(result, multipoles, doubtful),
+            Section([*map(Drawn, [*figures][1:])], "Pictures"),
+            Section([Table(_model_table(result))], "Model")],
+        {"Differences of readings and predictions": rows,
+         "The instruments, estimated with the blocks": term_table(result),
+         "Where the maps lie in the magnet": pose_table(result),
+         "Maps where they overlap": overlap_table(result),
+         "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
+        figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
+        new_study=None if result.terms is None else (STUDY_FILE, [(result.study, NOTE)]))
+
+
+def _doubtful(result: InferenceResult) -> list[Text]:
+    """Return a warning above numbers of an update that disagrees with its map; none of others."""
+    if not result.disagreement:
+        return []
+    what = ("Model and measurement disagree" if result.disagreement != result.too_near
+            else "The noise is stated too large")
+    return [Text(f"{what}: these numbers may be off by more than their ±.", "warning")]
+
+
+def _profiles(result: InferenceResult, published: PublishedErrors | None) -> Figures:
+    """Return the figures of readings and predictions, the first of which leads the page."""
+    profile = ("Readings with the predictions of prior and posterior, and the residuals of the "
+               "posterior, along the line of the strongest reading")
+    figures: dict[str, tuple[Callable[[], Figure], str]] = {}
+    if result.is_campaign:
+        figures["maps.png"] = (partial(maps_figure, result), "Where the maps lie in the magnet")
+        figures |= {f"profile-{name}.png": (
+            partial(prediction_profile_figure, result, name), f"Map {name}. {profile}")
+            for name in dict.fromkeys(result.maps) if has_profile(result, name)}
+    elif has_profile(result):
+        figures["profile.png"] = partial(prediction_profile_figure, result), profile
+    if has_residual_maps(result):
+        figures["residual_maps.png"] = (
+            partial(residual_maps_figure, result), "Measured less predicted over the map, before "
+            "and after the update: what remains should be noise, without a pattern")
+    if published is not None:
+        figures["relative_error.png"] = (
+            partial(relative_error_figure, result, published), "Relative error of the predictions "
+            "of prior and posterior along the same line")
+    return figures
+
+
+def _pictures(result: InferenceResult) -> Figures:
+    """Return the figures of residuals and blocks."""
+    unseen = ("of the held-out readings for prior and posterior" if result.held_out.any()
+              else "of the training readings for the prior (nothing was held out)")
+    contraction = _contraction(result)
+    return {
+        "residuals.png": (
+            partial(standardized_residuals_figure, result), "Standardized residuals of all "
+            "readings (divided by the standard deviation of prediction and noise) for the prior "
+            "(top) and the posterior (bottom). The grey band should hold 95 % of them; of the "
+            "training readings it holds more for the posterior, which is fitted to them"),
+        "quantiles.png": (
+            partial(whitened_quantiles_figure, result), f"Quantiles of the whitened residuals "
+            f"{unseen} against normal quantiles; they are whitened with the full covariance of "
+            "prediction and noise, and lie on the line if the model is right"),
+        "blocks.png": (
+            partial(_magnetization_change_figure, result), "Posterior change of the magnetization "
+            "along the easy axis, from nominal, by ring and slot"),
+    } | ({} if not len(contraction) or np.ptp(contraction) < ALIKE else {
+        "contraction.png": (
+            partial(_contraction_figure, result), "Contraction of each block: the decrease of its "
+            "variance from prior to posterior; 0 % means that the readings contain no information "
+            "about the block")})
+
+
+def _before_and_after(rows: Sequence[Mapping[str, str]], published: bool) -> Section:
+    """Return the section of the table of scores, and what its columns are."""
+    medians = ", and medians of relative errors as they are published" if published else ""
+    return Section([
+        f"Before and after the update: rms differences of readings and their predictions{medians}. "
+        "Held-out readings did not update the magnet.",
+        Table(rows, "turned" if len(rows) <= MOST_TURNED else ""), Text(
+            "**of the largest reading**: the rms difference after the update, relative to the "
+            "largest reading of all. **95 % band holds**: the share of the readings within the 95 "
+            "% band of their prediction. **rms residual/sd**: each reading's difference from its "
+            "prediction after the update, divided by the standard deviation of prediction, solver "
+            "and noise together; the root mean square of these. About 1 is expected for held-out "
+            "readings, less for training readings, to which the magnet was fitted. "
+            "**chi²/reading**: the mean of their squares, with all correlations; 1 is expected if "
+            "prior, model and noise are right. Before the update that of the training readings "
+            "tests prior, model and map together: it is the one of the answer above. After it, "
+            "chi² and the 95 % band test the error bars, by held-out readings only.", "small")],
+        "Before and after")
+
+
+def _sections_of_maps(result: InferenceResult) -> list[Section]:
+    """Return what the page says of several maps, of where they lie and of their instruments."""
+    overlaps, poses, terms = overlap_table(result), pose_table(result), term_table(result)
+    found = ["Estimated together with the magnetizations, whose error bars include what remains "
+             "uncertain here."]
+    if result.terms:
+        found += ["Translations are those of the middle of a map (of the first one on a common "
+                  "stage), rotations about it, along the magnet's axes; stage shifts are along "
+                  "those of the stage.", f"{STUDY_FILE} has the instruments that were found."
+                  if result.terms.at_rest else
+                  "They have not come to rest: their error bars may be too small."]
+    if result.amplitudes:
+        found.append("What the study has in tables [[uncertain]] is given as the change from what "
+                     "it says.")
+    return [
+        Section([] if not overlaps else [
+            "Where two maps overlap, the readings of one are compared with what an update by the "
+            "other alone predicts there. chi² is 1 on average if they are of the same magnet, and "
+            "pose, probe and noise are as stated or uncertain.", Table(overlaps)],
+            "Do the maps agree?"),
+        Section([] if not poses else ["In the magnet's axes, as the update found it.",
+                                      Table(poses)], "Where the maps lie"),
+        Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]
+
+
+def _sections_of_circles(
+    result: InferenceResult, tables: Sequence[MultipoleTable], doubtful: Sequence[Text]
+) -> list[Section]:
+    """Return what the page says of the multipoles of full circles; nothing without any."""
+    if not tables:
+        return []
+    said = middle_table(tables, result.study)
+    nearest = " and the z nearest to 0" if result.study.dimension == 3 else ""
+    others = "" if len(tables) == 1 else (
+        f" multipoles.csv has all {len(tables)} circles, each in units of the main multipole at "
+        f"its radius{nearest}.")
+    return [Section([
+        *doubtful, f"{said['reference']} ± is the standard deviation. Main multipole: "
+        f"{said['mains']}. They are those of the readings on the circle about the axis of the "
+        "magnet, where the study says that the map lies. With m readings, order n would contain "
+        "order m − n too; that part is subtracted, as the updated blocks make it in vacuum. Their "
+        "error bars take the solver's error of every reading in full: `halbach-fe multipoles` "
+        f"takes as many points as are needed, and has smaller bars.{others}",
+        Table(said["rows"], "numbers")], "Multipoles")]
+
+
+def _model_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: how the update was made, and of what magnet."""
+    study, noise = result.study, result.noise
+    sizes = dict.fromkeys(flux_density(float(end), 2) for end in (noise.sd.min(), noise.sd.max()))
+    positions = study.noise.position_sd_m if study.noise else None
+    moved = "" if not positions else (
+        f"; sd of positions {', '.join(f'{1e3 * sd:.3g}' for sd in positions)} mm")
+    blocks = result.measured_blocks
+    return [{"quantity": name, "value": value} for name, value in (
+        ("method of inference", result.kind), *magnet_rows(result.magnet),
+        ("finite-element method", study.solver.method),
+        ("unknown magnetizations, readings",
+         f"{len(result.response.parameters)}, {len(result.readings)}"),
+        ("prior", "the study's" if blocks is None else f"{len(blocks)} measured blocks"),
+        ("contraction of the blocks", _contraction_in_words(result, _contraction(result))),
+        ("noise of the readings", f"{' to '.join(sizes)}, "
+         f"{'independent' if noise.independent else 'correlated'}{moved}"),
+        ("error of the finite elements", _solver_error(result)),
+        ("superposition of the blocks",
+         f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what permeable "
+         "blocks and iron add to their fields"))]
+
+
+def _contraction(result: InferenceResult) -> Floats:
+    """Return the contractions of the blocks that there are."""
+    return result.contraction[~np.isnan(result.contraction)]
 
 
 def _solver_error(result: InferenceResult) -> str:

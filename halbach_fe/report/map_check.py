@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic, write_text
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach, inner, oriented
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     SECOND,
+    Items,
+    Page,
+    Section,
+    Table,
+    Text,
+    csv_file,
     figure_of,
-    own_style,
-    save,
-    write_page,
 )
 from halbach_fe.report.point_maps import draw, panels
 from halbach_fe.report.words import decimals, flux_density, relative, with_error
 from halbach_fe.study.types import COMPONENTS
+
+TITLE = "Check of a field map"
 
 REMAINS = 0.3
 """Correlation of neighbouring residuals from which they are no noise."""
@@ -149,15 +151,15 @@ def total_sentences(check: TotalCheck) -> list[str]:
             for kind, rows in check.broken.items()]
 
 
-def write_total_check(data: xr.Dataset, check: TotalCheck, folder: Path) -> None:
-    """Write check.json, and oriented_map.csv without broken rows if there are some."""
-    maps = {"map": data}
+def total_page(data: xr.Dataset, check: TotalCheck) -> Page:
+    """Return the page of the check of a map of |B|."""
+    maps, files = {"map": data}, {}
     if check.excluded.any():
         maps["oriented_map"] = data.isel(point=np.flatnonzero(~check.excluded))
-        write_map(maps["oriented_map"], folder / "oriented_map.csv")
-    write_text(folder / "check.json", json.dumps(check.plain() | {
-        "maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}},
-        indent=1, allow_nan=False) + "\n")
+        files = {"oriented_map.csv": partial(write_map, maps["oriented_map"])}
+    found = total_sentences(check)
+    return Page("check", TITLE, None, total_answer(check), check.plain() | _hashes(maps),
+                [Section([Items(found)] if found else [])], remarks=found, files=files)
 
 
 def _on_a_stage(check: MapCheck) -> bool:
@@ -388,56 +390,62 @@ def weighted_note(check: MapCheck) -> str:
             "of the map as it is given, where every reading counts alike.")
 
 
-@own_style
-def write_map_check(
-    data: xr.Dataset, check: MapCheck, folder: Path, provenance: Mapping[str, str]
-) -> None:
-    """Write check.json, check.csv, check.html, its figures, oriented_map.csv if it differs, and
-    corrected_map.csv if the map can tell.
-    """
-    points = points_of(data)
-    write_text(folder / "check.json", json.dumps(check_summary(data, check), indent=1,
-                                                  allow_nan=False) + "\n")
-    with atomic(folder / "check.csv") as temporary:
-        write_csv(dict(zip(("x_m", "y_m", "z_m"), points.T, strict=True)) | {
-            f"residual_{name}": column for name, column in zip(
-                FIELD_COLUMNS, check.residual_T.T, strict=True)} | {
-            "left_out": check.excluded.astype(int)}, {}, temporary)
-    files = ["check.json", "check.csv"]
-    if check.is_reoriented or check.excluded.any():
-        write_map(oriented(data, check), folder / "oriented_map.csv")
-        files.append("oriented_map.csv")
+def page(data: xr.Dataset, check: MapCheck) -> Page:
+    """Return the page of the check of a map, and the maps that are made of it."""
+    points, found, rows = points_of(data), sentences(check), residual_table(check)
+    instrument, said = instrument_table(check), undetermined(check)
+    maps = _maps_of(data, check)
     if (within := inner(data, check)) is not None:
-        write_map(within, folder / "inner_map.csv")
-        files.append("inner_map.csv")
-    if check.suffices:
-        write_map(corrected(data, check), folder / "corrected_map.csv")
-        files.append("corrected_map.csv")
-    figures = {
-        "check_maps.png": (_maps(points, np.asarray(data["B_T"].values), check), (
-            "The map: every column as it was measured, and its residual from the field that obeys "
-            "Maxwell's equations" + (
-                ". Crosses are rows that were left out" if check.excluded.any() else ""))),
-        "check_readings.png": (_readings(check), (
-            "Residuals in the order of the map. " + (
-                "Noise alone would be about as large everywhere; here it is not alone"
-                if check.uneven is not None else
-                "Noise is about as large everywhere") + ". A probe that moves makes steps and "
-            "waves"))}
-    write_page(folder / "check.html", "map_check.html.j2", save(figures, folder),
-               provenance=provenance, check=check, answer=answer(check),
-               found=sentences(check), files=", ".join(files),
-               undetermined=undetermined(check), instrument=instrument_table(check),
-               rows=residual_table(check), weighted=weighted_note(check))
+        maps["inner_map"] = within
+    left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
+    even = ("Noise alone would be about as large everywhere; here it is not alone"
+            if check.uneven is not None else "Noise is about as large everywhere")
+    return Page(
+        "check", TITLE, None, answer(check), check_summary(data, check), [
+            Section([*([Items(found)] if found else []), Text(
+                f"{check.readings} readings at {check.points} points, "
+                f"{1e3 * check.spacing_m:.3g} mm apart. No magnet is assumed: the map is compared "
+                "with the field of sources outside the mapped region. A map by itself cannot show "
+                "a common factor or sign of all components, a uniform offset, a shift of the whole "
+                "map, or a position axis that counts backwards.", "small")]),
+            Section([Table(rows, "numbers"), *(Text(text, "small") for text in [
+                weighted_note(check)] if text)], "What remains"),
+            Section(["Distances of the sensors are along the axes of the stage, and turns of the "
+                     "probe are against them; all belong to the components as they were found "
+                     "above.", Table(instrument)] if instrument else
+                    ["This map determines no error of the probe."], "The instrument"),
+            Section([Text(said, "small")] if said else [], "What was not asked or left out", True)],
+        {"The instrument, by the map alone": instrument}, rows, {
+            "check_maps.png": (
+                partial(_maps, points, np.asarray(data["B_T"].values), check), "The map: every "
+                "column as it was measured, and its residual from the field that obeys Maxwell's "
+                f"equations{left_out}"),
+            "check_readings.png": (
+                partial(_readings, check), f"Residuals in the order of the map. {even}. A probe "
+                "that moves makes steps and waves")},
+        files={"check.csv": csv_file(
+            dict(zip(("x_m", "y_m", "z_m"), points.T, strict=True)) | {
+                f"residual_{name}": column for name, column in zip(
+                    FIELD_COLUMNS, check.residual_T.T, strict=True)}
+            | {"left_out": check.excluded.astype(int)}, {})} | {
+                f"{name}.csv": partial(write_map, one) for name, one in maps.items()
+                if name != "oriented_map" or check.is_reoriented or check.excluded.any()},
+        remarks=found)
+
+
+def _maps_of(data: xr.Dataset, check: MapCheck) -> dict[str, xr.Dataset]:
+    """Return the maps in the right axes, by the names of their files."""
+    return {"oriented_map": oriented(data, check)} | (
+        {"corrected_map": corrected(data, check)} if check.suffices else {})
 
 
 def check_summary(data: xr.Dataset, check: MapCheck) -> dict[str, object]:
     """Return the results as plain data, with `readings_sha256` of the maps to which they belong."""
-    maps = {"map": data, "oriented_map": oriented(data, check)}
-    if check.suffices:
-        maps["corrected_map"] = corrected(data, check)
-    return check.plain() | {
-        "maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}}
+    return check.plain() | _hashes({"map": data} | _maps_of(data, check))
+
+
+def _hashes(maps: Mapping[str, xr.Dataset]) -> dict[str, object]:
+    return {"maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}}
 
 
 def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:

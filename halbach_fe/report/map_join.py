@@ -1,19 +1,17 @@
-"""Sentences, tables, files and page of maps that were joined."""
+"""Sentences, tables and page of maps that were joined."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
+from functools import partial
 
 import xarray as xr
 
-from halbach_fe.core.files import make_folder, write_text
 from halbach_fe.measurement.field_map import readings_sha256, write_map
 from halbach_fe.measurement.map_join import JoinedMaps, MapPose
+from halbach_fe.report import map_check
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.map_check import write_map_check
-from halbach_fe.report.page import write_page
+from halbach_fe.report.page import Items, Page, Section, Table, Text
 from halbach_fe.report.words import flux_density, in_a_row, with_error
 from halbach_fe.study.types import COMPONENTS
 
@@ -104,19 +102,31 @@ def term_table(joined: JoinedMaps) -> list[dict[str, str]]:
             for term in joined.terms]
 
 
-def write_joined(
-    maps: Mapping[str, xr.Dataset], joined: JoinedMaps, folder: Path,
-    provenance: Mapping[str, str],
-) -> None:
-    """Write joined.json, joined.csv and joined.html, and a folder with the check of each map."""
-    for name, data in maps.items():
-        write_map_check(data, joined.checks[name], make_folder(folder / name),
-                        {"map": provenance[f"map {name}"]})
-    write_map(joined.data, folder / "joined.csv")
+def page(maps: Mapping[str, xr.Dataset], joined: JoinedMaps) -> Page:
+    """Return the page of joined maps, with that of the check of each map."""
+    found, poses, terms = sentences(joined), pose_table(joined), term_table(joined)
     summary = joined.plain() | {
         "maps_sha256": {name: readings_sha256(data) for name, data in maps.items()},
         "joined_sha256": readings_sha256(joined.data)}
-    write_text(folder / "joined.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    write_page(folder / "joined.html", "map_join.html.j2", [], provenance=provenance,
-               answer=answer(joined), rows=pose_table(joined), found=sentences(joined),
-               overlaps=overlap_table(joined), terms=term_table(joined))
+    return Page(
+        "check", "Field maps, joined", None, answer(joined), summary, [
+            Section([*([Items(found)] if found else []), Text(
+                "No magnet is assumed. One field of sources outside all maps was fitted to them "
+                "together with their relative poses; each map was checked by itself before.",
+                "small")]),
+            Section(["Shift of the middle of each map, and turn about it, in the frame of the "
+                     "first map. joined.json has the covariance of all of them, and translation_m "
+                     "and rotation_rad as a study's [instrument] has them.", Table(poses)],
+                    "Where the maps lie"),
+            Section(["chi² per reading compares the readings that other maps have around them with "
+                     "what those maps predict, noise included; 1 is expected. The last columns are "
+                     "what the fit leaves of these readings, with a field of the map alone and "
+                     "with one field for all maps:", Table(overlap_table(joined))],
+                    "Where they overlap"),
+            Section([Table(terms) if terms else
+                     "The maps show no error of the probe, neither a common one nor one that only "
+                     "a part of them has: one gain explains all."], "The instrument")],
+        {"Where the maps lie in the frame of the first one": poses,
+         "The instrument, by all maps together": terms},
+        files={"joined.csv": partial(write_map, joined.data)}, stem="joined", remarks=found,
+        folders={name: map_check.page(data, joined.checks[name]) for name, data in maps.items()})

@@ -29,15 +29,17 @@ from tomlkit.items import Array, Trivia, Whitespace
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import must_be
-from halbach_fe.core.files import atomic, write_text
+from halbach_fe.core.files import atomic, make_folder, write_text
 from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, inputs_of_command
 from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
 from halbach_fe.report.words import faults_in_words
 from halbach_fe.study.edit_file import study_text, write_edited
 from halbach_fe.study.model import Study, is_nonlinear
+from halbach_fe.study.reader import read_study
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
@@ -53,6 +55,9 @@ UNITS = "%|ppm|[mµ]?T|[mµ]?m|mrad|kA/m|N|k?g|°C|kelvin"
 SMALL = SMALLEST_PT
 """Size of the small texts of figures in points; a figure has no smaller ones."""
 
+COMPLETE_NOTE = "copied from another file, so that this one is complete"
+"""Note in a changed study on what its file has read from others."""
+
 own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
@@ -63,15 +68,21 @@ Figures = Mapping[str, tuple[Callable[[], Figure], str]]
 
 
 class Text(NamedTuple):
-    """A paragraph; words between backticks are code."""
+    """A paragraph; words between backticks are code, those between pairs of asterisks bold."""
 
     text: str
     kind: str = ""
     """"small", or "warning"."""
 
 
+class Items(NamedTuple):
+    """Sentences in a list."""
+
+    sentences: Sequence[str]
+
+
 class Table(NamedTuple):
-    """Rows of text."""
+    """Rows of text; nothing is shown if there are none."""
 
     rows: Sequence[Mapping[str, str]]
     kind: str = ""
@@ -96,7 +107,7 @@ class View(NamedTuple):
 class Section:
     """Texts, tables and figures of a page in their order."""
 
-    parts: Sequence[str | Text | Table | Drawn | View | Callable[[], Markup]]
+    parts: Sequence[str | Text | Items | Table | Drawn | View | Callable[[], Markup]]
     """A plain string is a paragraph; a function returns HTML that only the page has."""
     title: str = ""
     """What stands above them; empty if nothing does."""
@@ -112,7 +123,8 @@ class Page:
     """The verb of halbach-fe."""
     title: str
     """Title of the page, after the study's name."""
-    study: Study
+    study: Study | None
+    """None of what needs no study."""
     answer: Answer
     summary: Mapping[str, object]
     """What the option --json prints, and the file .json holds."""
@@ -128,8 +140,12 @@ class Page:
     """Figures that a notebook shows in place of tables."""
     files: Mapping[str, Callable[[Path], object] | None] = field(default_factory=dict)
     """How each further file is written, by name; None if the one before it is written with it."""
-    new_study: tuple[str, Study, str] | None = None
-    """File of a changed study, the study, and the note that says in it what was changed."""
+    new_study: tuple[str, Sequence[tuple[Study, str]]] | None = None
+    """File of a changed study; the studies after each change, with a note that says it there."""
+    folders: Mapping[str, Page] = field(default_factory=dict)
+    """Pages of parts of the result, each in a folder of its own beside the page, by its name."""
+    remarks: Sequence[str] = ()
+    """Sentences that the terminal says before its tables."""
     stored: bool = True
     """Whether the summary is a file, too."""
     stem: str = ""
@@ -146,7 +162,8 @@ class Page:
     def beside(self) -> list[str]:
         """Names of the files beside the page and its figures."""
         study = [] if self.new_study is None else [self.new_study[0]]
-        return [*study, *self.files, *([f"{self.name}.json"] if self.stored else [])]
+        return [*study, *self.files, *([f"{self.name}.json"] if self.stored else []),
+                *(f"{name}/" for name in self.folders)]
 
     @property
     def unplaced(self) -> list[str]:
@@ -182,18 +199,19 @@ def csv_file(
 
 
 @own_style
-def write_files(page: Page, folder: Path, text: str | None = None) -> Path:
+def write_files(page: Page, folder: Path, file: Path | None = None) -> Path:
     """Write all files of a page into a folder, and return the path of the page itself.
 
-    ``text`` is that of the study's file, if there is one: a changed study keeps its comments.
+    ``file`` is that of the study, if there is one: a changed study keeps its comments.
     """
+    for name, part in page.folders.items():
+        write_files(part, make_folder(folder / name))
     for name, write in page.files.items():
         if write is not None:
             write(folder / name)
     if page.new_study is not None:
-        name, study, note = page.new_study
-        write_edited(folder / name, study_text(page.study) if text is None else text,
-                     [(study, note)])
+        name, steps = page.new_study
+        write_changed_study(folder / name, steps, file, page.study)
     if page.stored:
         write_text(folder / f"{page.name}.json",
                    json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
@@ -203,6 +221,23 @@ def write_files(page: Page, folder: Path, text: str | None = None) -> Path:
                rows=page.rows or next(iter(page.tables.values()), ()), page=page,
                drawn={picture.file: picture for picture in pictures})
     return path
+
+
+def write_changed_study(
+    path: Path, steps: Sequence[tuple[Study, str]], file: Path | None, whole: Study | None = None,
+) -> None:
+    """Write a study after some changes, which finds the maps that it lists.
+
+    It is edited from the text of the study's ``file``, or else from that of a ``whole`` study.
+    """
+    if file is None:
+        write_edited(path, "" if whole is None else study_text(whole), steps)
+        return
+    before = read_study(file)
+    if before.maps:
+        steps = [(with_paths_from(study, file.parent, path.parent), note)
+                 for study, note in [(before, "path from this folder"), *steps]]
+    write_edited(path, file.read_text(encoding="utf-8-sig"), [(before, COMPLETE_NOTE), *steps])
 
 
 def linearized(study: Study) -> list[str]:
@@ -321,15 +356,16 @@ def _templates() -> jinja2.Environment:
         loader=jinja2.PackageLoader("halbach_fe", "report"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals |= {"faults_of": faults_in_words}
-    environment.filters |= {"units_kept": units_kept, "with_code": _with_code}
+    environment.filters |= {"units_kept": units_kept, "marked": _marked}
     environment.tests |= {kind.__name__.lower(): lambda part, kind=kind: isinstance(part, kind)
-                          for kind in (Text, Table, Drawn, View)}
+                          for kind in (Text, Items, Table, Drawn, View)}
     return environment
 
 
-def _with_code(text: str) -> str:
-    """Return a text as HTML in which words between backticks are code."""
-    return re.sub("`(.*?)`", r"<code>\1</code>", html.escape(text))
+def _marked(text: str) -> Markup:
+    """Return a text as HTML, see `Text`."""
+    text = re.sub("`(.*?)`", r"<code>\1</code>", html.escape(text))
+    return Markup(re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", text))
 
 
 def units_kept(text: str) -> str:

@@ -189,21 +189,22 @@ def has_profile(result: InferenceResult, name: str | None = None) -> bool:
     return len(line.index) >= max(FEWEST_ON_A_LINE, len(heights) / 2)
 
 
-def residual_maps_figure(result: InferenceResult) -> Figure | None:
-    """Draw measured less predicted, before and after the update, over the points of the map.
+def has_residual_maps(result: InferenceResult) -> bool:
+    """Tell whether residuals can be drawn over the points of the map.
 
-    Returns
-    -------
-    Figure, or None
-        None if there is no such picture: the readings are Fourier coefficients, of several maps, or
-        on a line or circle, where the profile shows them.
+    Not of Fourier coefficients, of several maps, or on a line or circle, where the profile shows
+    them.
     """
+    if result.is_campaign or not all(result.observation.components):
+        return False
+    points = np.unique(result.observation.positions.round(9), axis=0)
+    return len(points) >= FEWEST_ON_A_LINE and curve(points) is None
+
+
+def residual_maps_figure(result: InferenceResult) -> Figure:
+    """Draw measured less predicted, before and after the update, over the points of the map."""
     observation = result.observation
-    if result.is_campaign or not all(observation.components):
-        return None
     points, number = np.unique(observation.positions.round(9), axis=0, return_inverse=True)
-    if len(points) < FEWEST_ON_A_LINE or curve(points) is not None:
-        return None
     before, after = result.readings - np.array(
         [result.prediction_prior.mean, result.prediction_posterior.mean])
     factor, unit = unit_for(float(np.abs(before).max()))

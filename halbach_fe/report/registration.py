@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import write_text
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import block_images
@@ -46,14 +44,14 @@ from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     SECOND,
+    Page,
+    Section,
+    Table,
+    Text,
     figure_of,
-    own_style,
-    save,
-    write_page,
 )
 from halbach_fe.report.words import counted, decimals, flux_density, in_a_row, with_error
 from halbach_fe.report.words import probability as in_per_cent
-from halbach_fe.study.edit_file import write_edited
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -515,60 +513,56 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
     } for each, probability in zip(found, stated_odds(found), strict=True)]}
 
 
-def write_registration(
-    study: Study, text: str, data: xr.Dataset, found: Sequence[Registration], folder: Path,
-    provenance: Mapping[str, str],
-) -> None:
-    """Write study.registered.toml, registration.json, registration.html and its figure."""
-    steps = [(found[0].study, NOTE)]
-    write_edited(folder / STUDY_FILE, text, steps)
-    if is_undirected(data):
-        data = directed(data, found[0].component)
-        write_map(data, folder / MAP_FILE)
-    _write_page(study, data, found, folder, provenance, NOMINAL)
+def page(
+    study: Study, data: xr.Dataset, found: Sequence[Registration], before: str = NOMINAL,
+    name: str = "",
+) -> Page:
+    """Return the page of where a map lies, with the study that says it.
 
-
-def write_campaign_registration(
-    study: Study, text: str, maps: Sequence[Map], found: Mapping[str, Sequence[Registration]],
-    folder: Path, provenance: Mapping[str, str],
-) -> None:
-    """Write study.registered.toml, and a folder with the page of every map.
-
-    Parameters
-    ----------
-    study : Study
-        The study with the poses that were found, and with paths of the maps from ``folder``.
-    text : str
-        Text of the study's file before.
-    maps : sequence of Map
-    found : mapping of str to sequence of Registration
-    folder : Path
-    provenance : mapping of str to str
+    Of one of the maps that a study lists, ``name`` is the map's; its study is that of the others.
     """
-    write_edited(folder / STUDY_FILE, text, [(study, NOTE)])
-    for number, one in enumerate(maps):
-        _write_page(one.study, one.data, found[one.name], folder / one.name, provenance,
-                    UPDATED if number else NOMINAL, one.name)
+    best, said, rows, places = found[0], sentences(found), pose_table(found, before), place_table(
+        found)
+    files = {}
+    if is_undirected(data):
+        data = directed(data, best.component)
+        files = {MAP_FILE: partial(write_map, data)}
+    updated = ", or the blocks as the maps before have updated them" if name else ""
+    doubts = doubt_table(best)
+    return Page(
+        "register", f"where {'map ' + name if name else 'the map'} lies in the magnet", study,
+        answer(found, before, name, assumed=study.instrument), registration_summary(found), [
+            Section([*said, Text(
+                "Every rotation by right angles and every place along the axis was tried, for a "
+                "map on a line beside the axis too. Pose, probe and open numbers were then fitted "
+                "together with the magnetizations of all blocks, whose prior is that of the study"
+                f"{updated}; error bars include what the blocks leave open.", "small")]),
+            Section([Table(rows), Text(
+                "chi² per reading is that of the updated blocks; about 1 is expected. Odds compare "
+                "poses that explain the map; there are none if none does.", "small")], "Poses"),
+            Section([Table(doubts)] if doubts else [], "Far from what was known before"),
+            Section(["The pose is where the middle of the map lies in the magnet, and how the map "
+                     "is turned about the axes of the magnet, once its own axes were put along "
+                     "those above.", Table(places, "numbers")]),
+            Section(["± is the standard deviation: rms over all terms of a kind. “Bx sees By” is "
+                     "the angle by which the Bx sensor is turned towards y. A sensor's place is "
+                     "from the probe's own point.", Table(probe_table(best))],
+                    "The probe, in pose 1")],
+        {"Poses of the map": rows, "Where the map lies in the magnet": places},
+        figures={"registration.png": (partial(_where, best, data), (
+            "The readings along the magnet's axis and in its cross-section, where the registration "
+            "puts them"))},
+        files=files, stem="registration", remarks=said,
+        new_study=None if name else (STUDY_FILE, [(best.study, NOTE)]))
 
 
-@own_style
-def _write_page(
-    study: Study, data: xr.Dataset, found: Sequence[Registration], folder: Path,
-    provenance: Mapping[str, str], before: str, name: str = "",
-) -> None:
-    """Write registration.json, registration.html and its figure, of one map."""
-    best = found[0]
-    write_text(folder / "registration.json",
-               json.dumps(registration_summary(found), indent=1, allow_nan=False) + "\n")
-    figures = {"registration.png": (_where(best, data), (
-        "The readings along the magnet's axis and in its cross-section, where the registration "
-        "puts them"))}
-    write_page(folder / "registration.html", "registration.html.j2", save(figures, folder), study,
-               provenance, answer=answer(found, before, name, assumed=study.instrument),
-               found=sentences(found), rows=pose_table(found, before),
-               places=place_table(found),
-               name=study.name, probe=probe_table(best), map=name,
-               doubts=doubt_table(best), undirected=bool(best.component))
+def pages_of_maps(
+    maps: Sequence[Map], found: Mapping[str, Sequence[Registration]]
+) -> dict[str, Page]:
+    """Return the page of each map that a study lists, by its name."""
+    return {one.name: page(one.study, one.data, found[one.name],
+                           UPDATED if number else NOMINAL, one.name)
+            for number, one in enumerate(maps)}
 
 
 def _where(best: Registration, data: xr.Dataset) -> Figure:

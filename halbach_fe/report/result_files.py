@@ -6,26 +6,22 @@ import base64
 import html
 import io
 from collections.abc import Mapping, Sequence
-from functools import singledispatch
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.result_folder import result_folder
-from halbach_fe.diagnosis.discriminating_measurements import Separation
-from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.summary import write_study, write_summary
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report import (
     assembly,
     campaign,
     demagnetization,
+    diagnosis,
     forces,
     homogeneity,
+    inference,
     multipoles,
     plan,
     ring_design,
@@ -37,16 +33,11 @@ from halbach_fe.report import (
     verification,
 )
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.diagnosis import change_table, found_table, write_diagnosis_report
-from halbach_fe.report.diagnosis_answer import answer as answer_of_diagnosis
-from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.page import geometry_figure, own_style, page_of, write_files
-from halbach_fe.report.prediction import prediction_profile_figure
-from halbach_fe.study.edit_file import study_text
-from halbach_fe.study.model import Study
 
-QUESTIONS = (assembly, campaign, demagnetization, forces, homogeneity, multipoles, plan,
-             ring_design, shim_tray, shimming, solution, sorting, tolerance, verification)
+QUESTIONS = (assembly, campaign, demagnetization, diagnosis, forces, homogeneity, inference,
+             multipoles, plan, ring_design, shim_tray, shimming, solution, sorting, tolerance,
+             verification)
 """Modules that register the page of their result, see `page_of`."""
 
 DOTS_PER_INCH = 100
@@ -88,50 +79,10 @@ Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
     'report.html'
     """
     folder = Path(folder)
-    if isinstance(result, InferenceResult):
-        with result_folder(folder, "halbach-fe infer", result.study.name):
-            write_inference(result, folder)
-            write_inference_report(result, folder)
-        return folder / "report.html"
-    if isinstance(result, Diagnosis):
-        study = result.corrected_study
-        with result_folder(folder, "halbach-fe diagnose", study.name):
-            return write_diagnosis(result, (), study, study_text(study), folder)
     page = page_of(result)
-    with result_folder(folder, f"halbach-fe {page.command}", page.study.name):
+    study = page.study.name if page.study else ""
+    with result_folder(folder, f"halbach-fe {page.command}", study):
         return write_files(page, folder)
-
-
-def write_diagnosis(
-    diagnosis: Diagnosis, separations: Sequence[Separation], study: Study, text: str, folder: Path,
-    assumptions: Sequence[str] = (), origin: Path | None = None,
-) -> Path:
-    """Write summary and page of a diagnosis, and the study with the identified effects added.
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-    separations : sequence of Separation
-        Further measurements that would distinguish rival effects.
-    study : Study
-        The study before the diagnosis.
-    text : str
-        Text of the study's file, whose comments are kept in study.diagnosed.toml.
-    folder : Path
-    assumptions : sequence of str
-        Sentences that are shown at the top of the page.
-    origin : Path, optional
-        Folder of the study's file, from which paths of maps start.
-
-    Returns
-    -------
-    Path
-        Path of the page.
-    """
-    write_summary(diagnosis, separations, folder)
-    write_diagnosis_report(diagnosis, separations, folder, assumptions)
-    write_study(text, study, diagnosis, folder, origin)
-    return folder / "diagnosis.html"
 
 
 @own_style
@@ -144,34 +95,14 @@ def html_of(result: object) -> str:
     TypeError
         If the result is of a type without a page.
     """
-    return _html_of(result)
-
-
-@singledispatch
-def _html_of(result: object) -> str:
+    if isinstance(result, Magnet):
+        points = points_from(result.study.observation.positions)
+        return picture(geometry_figure(result, points), f"The magnet {result.name}, with the "
+                       "magnetization of its blocks and the positions of its study")
     page = page_of(result)
     return words(page.answer) + "".join(
         [picture(page.figures[name][0](), page.figures[name][1]) for name in page.shown]
         or map(table, page.tables.values()))
-
-
-@_html_of.register
-def _(magnet: Magnet) -> str:
-    points = points_from(magnet.study.observation.positions)
-    return picture(geometry_figure(magnet, points), f"The magnet {magnet.name}, with the "
-                   "magnetization of its blocks and the positions of its study")
-
-
-@_html_of.register
-def _(result: InferenceResult) -> str:
-    return picture(prediction_profile_figure(result), "Readings, and what the model predicts "
-                   "before and after the update")
-
-
-@_html_of.register
-def _(diagnosis: Diagnosis) -> str:
-    return (words(answer_of_diagnosis(diagnosis)) + table(found_table(diagnosis))
-            + table(change_table(diagnosis)))
 
 
 def words(answer: Answer) -> str:

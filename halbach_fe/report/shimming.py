@@ -336,7 +336,7 @@ def page(shim: Shim) -> Page:
     return Page("shim", "how to shim it", shim.study, answer(shim), _summary(shim), sections,
                 {move_title: moves, title: rows}, rows, figures, new_study=(
         None if shim.shimmed_study is None else
-        (STUDY_FILE, shim.shimmed_study, f"shimmed: {len(shim.steps)} moves")))
+        (STUDY_FILE, [(shim.shimmed_study, f"shimmed: {len(shim.steps)} moves")])))
 
 
 def _of_the_moves(shim: Shim) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TypedDict
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,31 +33,9 @@ AROUND = 1.15
 """Half width of the figure's planes, relative to the largest distance of the line."""
 
 
-class StraySection(TypedDict):
-    """What a page says about the field outside: heading, sentences, rows of a table."""
-
-    title: str
-    text: str
-    rows: list[dict[str, str]]
-
-
 def line_name(stray: StrayField) -> str:
     """Return the name of the line at which |B| falls to the limit."""
     return f"{decimals(1e3 * stray.limit_T)}\u00a0mT line"
-
-
-def stray_section(stray: StrayField | None) -> StraySection | None:
-    """Return what a page says about the field outside; None if there is nothing to say."""
-    if stray is None:
-        return None
-    size = f"{decimals(1e3 * stray.limit_T)}\u00a0mT"
-    return {"title": f"Outside of the magnet: the {line_name(stray)}",
-            "text": stray.unknown or (
-                f"The largest distances at which |B| reaches {size}, the usual limit of access to "
-                "rooms of MRI magnets. The field is that of the magnet alone, without shields or "
-                "external fields." + ("" if not _is_uncertain(stray) else
-                " Without ± the standard deviation is below 0.5 mm.")),
-            "rows": stray_rows(stray)}
 
 
 def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Section]:
@@ -66,11 +43,16 @@ def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Sec
 
     ``drawn`` tells whether the figure of `stray_pictures` is in it.
     """
-    if (said := stray_section(stray)) is None:
+    if stray is None:
         return []
-    rows = said["rows"]
-    return [Section([said["text"], *([Table(rows)] if rows else []),
-                     *([Drawn(STRAY_FIGURE)] if drawn and rows else [])], said["title"])]
+    said = stray.unknown or (
+        f"The largest distances at which |B| reaches {decimals(1e3 * stray.limit_T)}\u00a0mT, the "
+        "usual limit of access to rooms of MRI magnets. The field is that of the magnet alone, "
+        "without shields or external fields." + ("" if not _is_uncertain(stray) else
+        " Without ± the standard deviation is below 0.5 mm."))
+    rows = stray_rows(stray)
+    return [Section([said, Table(rows), *([Drawn(STRAY_FIGURE)] if drawn and rows else [])],
+                    f"Outside of the magnet: the {line_name(stray)}")]
 
 
 def _is_uncertain(stray: StrayField) -> bool:

@@ -18,6 +18,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,6 @@ from matplotlib.figure import Figure
 from run import HERE, Z_STEP_M, profile_to_map
 
 from halbach_fe.cli import common
-from halbach_fe.cli.diagnose import print_diagnosis
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
@@ -37,25 +37,25 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, Registration
 from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, odds, register
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import read_map
+from halbach_fe.report import diagnosis, inference, registration
 from halbach_fe.report.answer import Answer as PageAnswer
-from halbach_fe.report.diagnosis_answer import answer
-from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
     PUBLISHED,
     SECOND,
+    Items,
+    Page,
+    Section,
+    Table,
+    Text,
     draw_cross_section,
-    own_style,
-    save,
-    write_page,
+    write_files,
 )
 from halbach_fe.report.prediction import PublishedErrors
-from halbach_fe.report.registration import place_table, pose_table, write_registration
-from halbach_fe.report.result_files import write_diagnosis
+from halbach_fe.report.registration import place_table, pose_table
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import read_study
 
@@ -326,13 +326,12 @@ def place_figure(poses: list[Registration]) -> Figure:
     return figure
 
 
-@own_style
 def run(arguments: argparse.Namespace) -> int:
     """Compare the answers, register, update and diagnose by the best, write the page."""
     folder = arguments.output
     measured = folder / "measured.csv"
     published = profile_to_map(HERE / "fig4_faser_on_axis.csv", measured, Z_STEP_M)
-    data, text = read_map(measured), STUDY.read_text(encoding="utf-8")
+    data = read_map(measured)
     with common.session(arguments) as session:
         hypotheses = QUICK_HYPOTHESES if arguments.quick else ALL_HYPOTHESES
         answers = [each for pose in (ANYWHERE, ON_THE_AXIS)
@@ -354,9 +353,9 @@ def run(arguments: argparse.Namespace) -> int:
         common.print_table([{name: row[name] for name in TERMINAL_COLUMNS} for row in rows],
                            "Median relative error of B_x at held-out readings")
         found = sentences(best, answers, fitted, published)
-        write_registration(read_study(STUDY), text, data, poses, folder / "registration", {})
-        write_inference(best.update, folder / "inferred")
-        write_inference_report(best.update, folder / "inferred", published)
+        for name, page in (("registration", registration.page(read_study(STUDY), data, poses)),
+                           ("inferred", inference.page(best.update, published))):
+            write_files(page, folder / name, STUDY)
         left = [f"The best answer ({best.hypothesis.name}) leaves chi² of "
                 f"{best.registration.chi2:.2g} per reading that was fitted and "
                 f"{best.registration.held_out_chi2:.2g} per reading that was held out, if a "
@@ -364,46 +363,52 @@ def run(arguments: argparse.Namespace) -> int:
         further = ["registration/registration.html: the poses and the probe",
                    "inferred/report.html: the updated magnet"]
         if not arguments.quick:
-            left += diagnosed(best, data, session, text, folder / "diagnosis")
+            left += diagnosed(best, data, session, folder / "diagnosis")
             further.append("diagnosis/diagnosis.html: what the registered model lacks")
     write_summary(answers, poses, folder / "profile.json")
-    write_page(
-        folder / "profile.html", "hypotheses.html.j2", save({
-            "profile.png": (profile_figure(answers, published), "The readings with the nominal "
-                            "magnet, scaled to the middle, and the relative errors of B_x; the "
-                            "published fringe field is grey"),
-            "places.png": (place_figure(poses), "Where the profile lies in the cross-section"),
-        }, folder), read_study(STUDY), common.digests({"profile": HERE / "fig4_faser_on_axis.csv",
-                                                       "study file": STUDY}),
-        title="What is the published FASER profile a profile of?", hypotheses=rows,
-        answer=PageAnswer(
-            "What is the published FASER profile a profile of?", found[0], " ".join(found[1:]),
+    asked = "What is the published FASER profile a profile of?"
+    columns = column_table(fitted, best.update)
+    write_files(Page(
+        "register", asked, read_study(STUDY), PageAnswer(
+            asked, found[0], " ".join(found[1:]),
             "make study-faser-diagnosis compares more answers, all poses and what is left."
-            if arguments.quick else "Read what is left, and the further pages below."),
-        split="Every fifth reading (index 5, 10, ..., 155) was set aside before anything was "
-              "fitted. Errors are medians of |predicted / measured - 1| of B_x over these, as the "
-              "paper defines them: in its fringe field (index 1-35 and 121-156) and in its "
-              "homogeneous field. Odds are by the evidence of the readings that were fitted, with "
-              "all blocks integrated out.",
-        columns=column_table(fitted, best.update),
-        poses=[] if arguments.quick else pose_table(poses),
-        places=[] if arguments.quick else place_table(poses),
-        left=left, further=further, files="profile.json, measured.csv")
+            if arguments.quick else "Read what is left, and the further pages below."), {}, [
+            Section([Text(
+                "Every fifth reading (index 5, 10, ..., 155) was set aside before anything was "
+                "fitted. Errors are medians of |predicted / measured - 1| of B_x over these, as "
+                "the paper defines them: in its fringe field (index 1-35 and 121-156) and in its "
+                "homogeneous field. Odds are by the evidence of the readings that were fitted, "
+                "with all blocks integrated out.", "small"), Table(rows)], "What was compared"),
+            Section([Table(columns)] if columns else [], "What the column may hold"),
+            Section([] if arguments.quick else [
+                Table(pose_table(poses)), Table(place_table(poses), "numbers")],
+                "Poses that explain the readings equally well"),
+            Section([Items(left)], "What is left"),
+            Section([Items(further)], "Further pages")],
+        figures={
+            "profile.png": (
+                partial(profile_figure, answers, published), "The readings with the nominal "
+                "magnet, scaled to the middle, and the relative errors of B_x; the published "
+                "fringe field is grey"),
+            "places.png": (partial(place_figure, poses),
+                           "Where the profile lies in the cross-section")},
+        files=dict.fromkeys(("profile.json", "measured.csv")), stored=False, stem="profile"),
+        folder)
     for sentence in found + left:
         common.say(sentence)
     common.say(f"Report: {folder / 'profile.html'}")
     return 0
 
 
-def diagnosed(best: Answer, data: xr.Dataset, session: Session, text: str,
-              folder: Path) -> list[str]:
+def diagnosed(
+    best: Answer, data: xr.Dataset, session: Session, folder: Path
+) -> list[str]:
     """Diagnose the registered study, write its page, return what it says first."""
     study = best.registration.study
     found = diagnose(study, data, session, say=common.say)
-    write_diagnosis(found, separations(found, data, session), study, text, folder)
-    print_diagnosis(found, argparse.Namespace(study=STUDY, output=folder))
-    said = answer(found)
-    return [said.said, said.trust]
+    page = diagnosis.page(found, separations(found, data, session), study)
+    common.finish(argparse.Namespace(study=STUDY, output=folder, json=False), page)
+    return [page.answer.said, page.answer.trust]
 
 
 def write_summary(answers: list[Answer], poses: list[Registration], path: Path) -> None:

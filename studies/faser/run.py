@@ -20,9 +20,9 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
-from halbach_fe.report.inference import score_table, write_inference_report
+from halbach_fe.report.inference import page, score_table
+from halbach_fe.report.page import write_files
 from halbach_fe.report.prediction import PublishedErrors
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
@@ -92,12 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
                f"{len(published.z)} readings.")
     with common.session(arguments) as session:
         update = infer(build_magnet(study), read_map(measured), session)
-    write_inference(update, arguments.output)
-    write_inference_report(update, arguments.output, published,
-                           assumptions(update, arguments.z_step_m))
+    written = write_files(page(update, published, assumptions(update, arguments.z_step_m)),
+                          arguments.output)
     common.print_table(score_table(update, published),
                        "Median relative error of B_x on the axis, before and after the update")
-    common.say(f"Report: {arguments.output / 'report.html'}")
+    common.say(f"Report: {written}")
     return 0
 
 

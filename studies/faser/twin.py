@@ -20,12 +20,12 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.measurement.observation import observe
-from halbach_fe.report.inference import write_inference_report
+from halbach_fe.report.inference import page
 from halbach_fe.report.magnetizations import error_summary, write_magnetizations
+from halbach_fe.report.page import write_files
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import predict
@@ -65,8 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         seen = observe(line, points, ~np.isnan(axis["B_T"].values))
         on_axis = response_matrix(build_magnet(line), seen,
                                   replace(session, folder=arguments.output / "axis"))
-    write_inference(update, arguments.output)
-    write_inference_report(update, arguments.output)
+    write_files(page(update), arguments.output)
     measured = seen.apply(np.nan_to_num(axis["B_T"].values))
     blocks = json.loads((HERE / "twin" / "truth" / "truth.json").read_text())["blocks"]
     truth = np.array([one["magnetization_A_per_m"] for one in blocks]).ravel()

@@ -30,11 +30,12 @@ from halbach_fe.diagnosis.summary import (
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.report.diagnosis import change_table, found_table, write_diagnosis_report
+from halbach_fe.report.diagnosis import change_table, found_table
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
+from tests.support.pages import write_result
 from tests.support.short_dipole import TEXT
 
 EFFECTS = {effect.name: effect for effect in catalogue()}
@@ -71,7 +72,7 @@ def flat(dipole, session, generator):
 def test_a_cross_section(flat, tmp_path):
     found, further = flat
     assert [one.hypothesis.effect.name for one in found.identified] == ["gain_x"]
-    write_diagnosis_report(found, further, tmp_path)
+    write_result(found, tmp_path, further)
     page = (tmp_path / "diagnosis.html").read_text()
     assert page.count("<img alt=") == 5
     assert "along z" not in page.split("<h2>Structure")[1].split("<img")[0]  # no M_z
@@ -90,7 +91,7 @@ def test_a_line(short_dipole, session, generator, tmp_path):
     (one,) = found.identified
     rivals = {candidate.effect for candidate, _ in one.selection.alternatives}
     assert {one.hypothesis.effect.name, *rivals} >= {"background", "offset_x"}
-    write_diagnosis_report(found, further, tmp_path)
+    write_result(found, tmp_path, further)
     page = (tmp_path / "diagnosis.html").read_text()
     assert "The map does not tell" in page
     assert "<strong>Measure next: the same map with the probe turned by 180° about z." in page
@@ -101,10 +102,10 @@ def test_a_line(short_dipole, session, generator, tmp_path):
     for candidate, _ in one.selection.alternatives:
         assert titles[candidate.effect] in row["it could be"]
     assert not any(group.kind == "angle" for group in found.groups_before)  # on the axis
-    write_diagnosis_report(found, [], tmp_path)  # nothing would tell
+    write_result(found, tmp_path)  # nothing would tell
     assert "Measure next" not in (tmp_path / "diagnosis.html").read_text()
     alone = replace(one, selection=replace(one.selection, alternatives=()))
-    write_diagnosis_report(replace(found, identified=(alone,)), [], tmp_path)
+    write_result(replace(found, identified=(alone,)), tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert "The map does not tell" not in page
     assert "no other effect explains the readings as well" in page
@@ -261,8 +262,7 @@ def test_held_out_readings_are_heard(
 def test_the_page_of_what_is_unknown(flat, tmp_path):
     found, _ = flat
     unknown = UnknownCause("either", 40.0, True, False, 2e-4, (0.05, 0.0, 0.0), None)
-    write_diagnosis_report(replace(found, identified=(), after=found.before, unknown=unknown), [],
-                           tmp_path)
+    write_result(replace(found, identified=(), after=found.before, unknown=unknown), tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert 'class="answer doubtful"' in page
     assert "tells a field from the sensors" in page

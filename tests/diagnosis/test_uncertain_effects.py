@@ -7,7 +7,6 @@ from dataclasses import replace
 import magpylib
 import numpy as np
 import pytest
-import tomlkit
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.api import shim
@@ -16,14 +15,13 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.summary import STUDY_FILE, write_study
+from halbach_fe.diagnosis.summary import STUDY_FILE
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
-from halbach_fe.report.inference import write_inference_report
 from halbach_fe.response.block_variation import shared_deviations
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.stats.gaussian import Gaussian
@@ -33,6 +31,7 @@ from halbach_fe.study.uncertain import number_changes, shifted
 from tests.conftest import circle
 from tests.diagnosis.campaign import drawn, field
 from tests.support.cuboids import DOCUMENT, NOISE_T
+from tests.support.pages import write_result
 
 QUADRUPOLE = {"multipole_order": 2, "rings": 4, "ring_length_m": 0.045}
 SHORT = {"rings": 2, "ring_length_m": 0.08, "inner_radius_m": 0.09, "block": {
@@ -99,8 +98,7 @@ def test_the_update_after_a_diagnosis_is_no_surer_than_it_may_be(
     found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
     (tilt,) = found.identified
     assert tilt.hypothesis.effect.name == "mapper_tilt_x"
-    write_study(tomlkit.dumps(study.model_dump(mode="json", exclude_none=True)), study, found,
-                tmp_path)
+    write_result(found, tmp_path)
     again = read_study(tmp_path / STUDY_FILE)
     assert again == found.study  # the file says the same
     chi2, result = update(again, shown, polarizations, session.within("update"))
@@ -130,8 +128,7 @@ def test_what_the_map_does_not_tell_apart_is_estimated_together(session, tmp_pat
     (rival,) = named.rivals
     assert {named.name, rival.name} == {"radial_gap", "inner_radius"}
     assert found.study == with_uncertain_effects(study, [named])
-    write_study(tomlkit.dumps(study.model_dump(mode="json", exclude_none=True)), study, found,
-                tmp_path)
+    write_result(found, tmp_path)
     assert read_study(tmp_path / STUDY_FILE) == found.study
     assert "the others with uncertain amplitudes about 0" in answer(found).step
     assert answer(found).trust.startswith("Only in part")
@@ -287,7 +284,7 @@ def test_the_page_of_a_magnet_that_alone_is_uncertain(session, generator, tmp_pa
     study = parse_study(DOCUMENT | {"uncertain": [
         {"name": "remanence", "sd": 0.01, "change": {"array.remanence_T": 1.0}}]})
     shown = field_map(POINTS, field(study, drawn(study, generator), POINTS))
-    write_inference_report(infer(build_magnet(study), shown, session), tmp_path)
+    write_result(infer(build_magnet(study), shown, session), tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert "remanence" in page
     assert "has the instruments that were found" not in page

@@ -19,7 +19,6 @@ from halbach_fe.inference.result import TOO_NEAR
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.observation import observe
-from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.prediction import main_line
 from halbach_fe.response.deviation_field import with_magnetizations
 from halbach_fe.response.matrix import response_matrix
@@ -34,7 +33,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
-from tests.support.pages import page
+from tests.support.pages import page, write_result
 
 NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-5}]}
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
@@ -164,7 +163,7 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     places = update.observation.positions[line.index]
     assert np.ptp(np.arctan2(places[:, 1], places[:, 0])) < 2 * np.pi / 16
     write_inference(update, tmp_path)
-    write_inference_report(update, tmp_path)
+    write_result(update, tmp_path)
     with xr.open_dataset(tmp_path / "posterior.h5", engine="h5netcdf") as stored:
         np.testing.assert_allclose(stored["posterior_mean"], update.posterior.mean)
         np.testing.assert_allclose(np.sqrt(np.diag(stored["posterior_covariance"])),
@@ -180,7 +179,7 @@ def test_3d_array_is_learnt_and_predicts_what_it_did_not_see(short_dipole, gener
     share = f"{low:.0f} to {high:.0f}" if f"{low:.0f}" != f"{high:.0f}" else f"{low:.0f}"
     assert f"by {share}\u00a0% of the prior's variance" in text.replace("&#39;", "'")
     monkeypatch.setattr("halbach_fe.report.inference.ALIKE", -1.0)
-    write_inference_report(update, tmp_path)
+    write_result(update, tmp_path)
     assert page(tmp_path / "report.html").count("<img alt=") == 6
 
 
@@ -268,7 +267,7 @@ def test_the_axis_from_fourier_coefficients(short_dipole, generator, session):
     assert (unseen.part, unseen.readings) == ("held-out map", 63)
     assert unseen.chi2_posterior == pytest.approx(1.0, abs=0.75)  # sd 0.18
     assert unseen.median_relative_error_posterior < 0.3 * unseen.median_relative_error_prior
-    write_inference_report(update, session.folder)
+    write_result(update, session.folder)
 
 
 def test_held_out_components_whose_points_were_seen(short_dipole, generator, session):
@@ -297,7 +296,7 @@ def test_report_says_when_the_model_does_not_fit(short_dipole, generator, sessio
     data["B_T"].values[:, 2] += 1e-3  # an offset of the z sensor: no magnet makes it
     update = infer(build_magnet(study), data, session)
     assert update.prior_conflict > update.conflict_limit
-    write_inference_report(update, tmp_path)
+    write_result(update, tmp_path)
     assert "Model and measurement disagree" in (tmp_path / "report.html").read_text()
 
 
@@ -390,7 +389,7 @@ def test_two_radii_with_unequal_noise(dipole, generator, session):
     line = main_line(update)
     assert (line.axis, line.place.tolist()) == ("harmonic", list(range(1, 9)))
     assert len(set(update.observation.radii[line.index])) == 1
-    write_inference_report(update, session.folder)
+    write_result(update, session.folder)
     page = (session.folder / "report.html").read_text()
     assert "of the training readings for the prior (nothing was held out)" in page
     assert "T, correlated" in page
@@ -470,7 +469,7 @@ def test_readings_that_vanish_by_symmetry(short_dipole, session):
     (score,) = update.scores
     assert score.median_relative_error_posterior is None
     write_inference(update, session.folder)
-    write_inference_report(update, session.folder)
+    write_result(update, session.folder)
     assert "Infinity" not in (session.folder / "summary.json").read_text()
 
 

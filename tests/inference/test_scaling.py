@@ -17,7 +17,6 @@ from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.inference import write_inference_report
 from halbach_fe.response import matrix as response_module
 from halbach_fe.response.matrix import StoredMatrix, response_matrix
 from halbach_fe.stats import linear_gaussian
@@ -26,6 +25,7 @@ from halbach_fe.stats.linear_gaussian import update, whitened
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.reader import parse_study
 from tests.oracles.cuboids import cuboid_field, long_dipole
+from tests.support.pages import write_result
 
 
 def correlated(generator, count):
@@ -249,7 +249,7 @@ def test_two_thousand_blocks(long_array, tmp_path):
         np.testing.assert_allclose(stored[name].mean, one.mean)
         np.testing.assert_allclose(stored[name].sd, one.sd)
     assert np.abs(stored["posterior"].sd - stored["prior"].sd).max() > 0.01 * update.prior.sd.max()
-    write_inference_report(update, tmp_path)
+    write_result(update, tmp_path)
     assert Path(tmp_path / "report.html").stat().st_size < 15e6
 
 

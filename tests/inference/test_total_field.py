@@ -20,7 +20,6 @@ from halbach_fe.inference.registration import register
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
-from halbach_fe.report.inference import write_inference_report
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.registration import sentences
 from halbach_fe.response.deviation_field import Deviations
@@ -30,7 +29,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from tests.inference.test_infer import iron_campaign
 from tests.support.cuboids import DOCUMENT
-from tests.support.pages import page
+from tests.support.pages import page, write_result
 
 NOISE_T = 1e-5
 AXIS = np.linspace(-0.05, 0.05, 6) + 1e-3
@@ -209,7 +208,7 @@ def test_the_pages_of_an_update_by_the_magnitude(generator, session, tmp_path):
     """Page, table of predictions and view are written, and say |B|."""
     update = infer(build_magnet(study_of(2)), total_map(2, 1, generator), session)
     write_inference(update, tmp_path)
-    write_inference_report(update, tmp_path)
+    write_result(update, tmp_path)
     assert "|B|" in page(tmp_path / "report.html")
     table = (tmp_path / "prediction.csv").read_text().splitlines()
     assert len(table) == 1 + len(POINTS)

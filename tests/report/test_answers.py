@@ -397,7 +397,7 @@ def test_every_page_has_an_answer():
     found = {path.stem: answers_in(path.read_text())
              for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
     assert not [name for name, answers in found.items() if not all(answers)]
-    assert sum(map(len, found.values())) > 5  # the others are made of a Page, which has one
+    assert sum(map(len, found.values())) > 1  # the others are made of a Page, which has one
     assert not all(answers_in("write_page(path, template, pictures, study)"))  # the control
 
 

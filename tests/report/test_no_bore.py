@@ -12,10 +12,10 @@ import tomlkit
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report import field_traces_3d, magnet_view_3d, page
+from halbach_fe.report import magnet_view_3d, page
 from halbach_fe.report import solution as solution_page
-from halbach_fe.report.field_traces_3d import cut_trace
 from halbach_fe.report.magnet_table import in_one_line, magnet_rows
+from halbach_fe.report.magnet_view_3d import cut_trace
 from halbach_fe.report.page import write_files
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.response.solution import solve
@@ -95,7 +95,7 @@ def test_multipoles_say_that_there_is_no_axis(dimension, session):
 def test_very_many_blocks(monkeypatch):
     """Above their limits pictures draw less and say so."""
     for module, name in ((magnet_view_3d, "MOST_UNEQUAL"), (page, "MOST_POINTING"),
-                         (page, "MOST_MEASURED"), (field_traces_3d, "MOST_SUMMED")):
+                         (page, "MOST_MEASURED"), (magnet_view_3d, "MOST_SUMMED")):
         monkeypatch.setattr(module, name, 20)
     places = [(0.025 * i, 0.025 * j, 0.03 * k)
               for i in range(-2, 3) for j in range(-2, 3) for k in range(2)]

@@ -7,6 +7,8 @@ import re
 from html.parser import HTMLParser
 
 from halbach_fe.core.versions import version
+from halbach_fe.report.page import write_files
+from halbach_fe.report.result_files import page_of
 
 
 class _Parts(HTMLParser):
@@ -67,3 +69,8 @@ def command_of(path):
     """The command of a page's next step, as it is copied from there."""
     code = re.search(r"<code>(.*?)</code>", path.read_text(encoding="utf-8"), re.DOTALL)
     return " ".join(html.unescape(re.sub("<.*?>", "", code[1])).split())
+
+
+def write_result(result, folder, *details):
+    """Write the page of a result and its files into any folder, also one of another command."""
+    return write_files(page_of(result, *details), folder)
