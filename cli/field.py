@@ -73,8 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
     columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
     if min(map(len, offsets)) > 1:
         kicks = found.kicks()
-        for axis, (kick, sd) in zip("uv", kicks, strict=True):
-            columns |= {f"kick_{axis}_T2_m2": kick.ravel(), f"sd_kick_{axis}_T2_m2": sd.ravel()}
+        for across, (kick, sd) in zip("uv", kicks, strict=True):
+            columns |= {f"kick_{across}_T2_m2": kick.ravel(),
+                        f"sd_kick_{across}_T2_m2": sd.ravel()}
         write_text(folder / "kick_map.txt", kick_map(
             found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
     write_text(folder / "integrals.csv", csv_text(columns))
