@@ -492,7 +492,7 @@ def input_file(text: str) -> InputFile:
 
 def count(text: str) -> int:
     """Parse a whole number of at least 0."""
-    return _at_least(0, text)
+    return at_least(0, text)
 
 
 def finite_number(text: str) -> float:
@@ -505,7 +505,7 @@ def finite_number(text: str) -> float:
 
 def positive(text: str) -> int:
     """Parse a whole number of at least 1."""
-    return _at_least(1, text)
+    return at_least(1, text)
 
 
 def whole(text: str) -> int:
@@ -517,7 +517,8 @@ def whole(text: str) -> int:
             f"must be a whole number, not {printable(text, MAX_QUOTED)!r}") from None
 
 
-def _at_least(least: int, text: str) -> int:
+def at_least(least: int, text: str) -> int:
+    """Parse a whole number of at least ``least``."""
     value = whole(text)
     if value < least:
         raise argparse.ArgumentTypeError(f"must be at least {least}, not {value}")

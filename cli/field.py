@@ -2,13 +2,14 @@
 
 The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With --posterior
 the bars are those of the measured magnet, otherwise those of the study's prior. With --inside
-points may lie inside blocks of permeability 1. Writes field.csv and integrals.csv, and for a grid
-of lines kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
+points may lie inside blocks. Writes field.csv and integrals.csv, and for a grid of lines
+kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import CommandLineError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.tables import csv_text
 from halbach_fe.study.types import COMPONENTS
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for end in ("from", "to"):
         parser.add_argument(f"--{end}-m", type=common.finite_number, nargs=3, required=True,
                             metavar=("X", "Y", "Z"), help=f"where the line goes {end}")
-    parser.add_argument("--count", type=common.positive, default=201, metavar="N",
+    parser.add_argument("--count", type=partial(common.at_least, 3), default=201, metavar="N",
                         help="number of points of a line (default: 201)")
     parser.add_argument("--across-m", type=common.finite_number, nargs=2, default=(0.0, 0.0),
                         metavar=("U", "V"), help="half widths of a grid of parallel lines: of a "
@@ -41,33 +41,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     parser.add_argument("--inside", action="store_true",
-                        help="points may lie inside blocks of permeability 1")
+                        help="points may lie inside blocks")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute the field, write the tables, print the integrals of the middle line."""
-    from halbach_fe.design.tolerance import assembled_prior
+    from halbach_fe.api import field
     from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
+    from halbach_fe.inference.same_magnet import disagreement_of
     from halbach_fe.inference.storage import read_posterior
     from halbach_fe.report.words import with_error
-    from halbach_fe.response.field_on_lines import FEWEST, Lines, field_on_lines
+    from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.reader import read_study
 
-    start, end = np.array(arguments.from_m), np.array(arguments.to_m)
-    if arguments.count < FEWEST or np.array_equal(start, end):
-        raise CommandLineError(must_be(
-            "--count and --to-m", "the command line", f"at least {FEWEST} points, and another "
-            "point than --from-m", f"{arguments.count} points"))
-    magnet = build_magnet(read_study(arguments.study))
-    read = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
-    known = (assembled_prior(magnet, magnet.nominal_magnetization) if read is None
-             else distributions_of(magnet, read)["posterior"])
     offsets = tuple(np.linspace(-half, half, arguments.lines) if half else np.zeros(1)
                     for half in arguments.across_m)
-    lines = Lines(start, end, (offsets[0], offsets[1]), arguments.count)
+    lines = Lines(np.array(arguments.from_m), np.array(arguments.to_m), (offsets[0], offsets[1]),
+                  arguments.count)
+    magnet = build_magnet(read_study(arguments.study))
+    read = read_posterior(magnet, arguments.posterior) if arguments.posterior else None
     with common.session(arguments, magnet.study) as session:
-        found = field_on_lines(magnet, lines, known, session, arguments.inside)
+        found = field(magnet, lines, session, read, arguments.inside)
     folder = arguments.output
     write_text(folder / "field.csv", csv_text(_points(found)))
     grid = np.meshgrid(*offsets, indexing="ij")
@@ -77,9 +71,20 @@ def run(arguments: argparse.Namespace) -> int:
         for axis, values, bars in zip(COMPONENTS, mean.T, sd.T, strict=True):
             columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
     columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
-    write_text(folder / "integrals.csv", csv_text(columns))
     if min(map(len, offsets)) > 1:
-        write_text(folder / "kick_map.txt", kick_map(found.lines.length, offsets, found.kicks()))
+        kicks = found.kicks()
+        for across, (kick, sd) in zip("uv", kicks, strict=True):
+            columns |= {f"kick_{across}_T2_m2": kick.ravel(),
+                        f"sd_kick_{across}_T2_m2": sd.ravel()}
+        write_text(folder / "kick_map.txt", kick_map(
+            found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
+    write_text(folder / "integrals.csv", csv_text(columns))
+    doubt = disagreement_of(read)
+    if arguments.json:
+        common.print_json({"lines": len(lines.points), "points_per_line": lines.count,
+                           "reservation": doubt or None, "folder": str(folder),
+                           **{name: values.tolist() for name, values in columns.items()}})
+        return 0
     middle = len(columns["u_m"]) // 2
     common.print_table([{
         "component": axis, **{
@@ -88,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
             for order, name, unit, key in ((1, "first", "T m", "T_m"), (2, "second", "T m²",
                                                                          "T_m2"))}}
         for axis in COMPONENTS], "Integrals of B along the middle line")
-    if doubt := disagreement_of(read):
+    if doubt:
         common.say(doubt)
     common.say(f"Wrote {lines.points.shape[0]} lines of {lines.count} points: {folder}")
     return 0

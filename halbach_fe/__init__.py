@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from halbach_fe.api import demagnetization as demagnetization
     from halbach_fe.api import diagnose as diagnose
     from halbach_fe.api import export as export
+    from halbach_fe.api import field as field
     from halbach_fe.api import homogeneity as homogeneity
+    from halbach_fe.api import import_blocks as import_blocks
     from halbach_fe.api import import_map as import_map
     from halbach_fe.api import multipoles as multipoles
     from halbach_fe.api import plan as plan
@@ -80,6 +82,8 @@ if TYPE_CHECKING:
     from halbach_fe.report.result_files import write_report as write_report
     from halbach_fe.response.discretization_error import Verification as Verification
     from halbach_fe.response.discretization_error import verify as verify
+    from halbach_fe.response.field_on_lines import FieldOnLines as FieldOnLines
+    from halbach_fe.response.field_on_lines import Lines as Lines
     from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
     from halbach_fe.response.magnetic_axis import magnetic_axis as magnetic_axis
@@ -98,7 +102,7 @@ _HOME = {
                      "write_study"), "magnets"),
     "new": "magnets", "explain": "explanation", "Explanation": "explanation",
     "field_map": "measurement.field_map", "write_map": "measurement.field_map",
-    **dict.fromkeys(("import_map", "export", "prior"), "api"),
+    **dict.fromkeys(("import_map", "import_blocks", "export", "prior", "field"), "api"),
     "register": "inference.registration", "Registration": "inference.pose_result",
     "prior_from_blocks": "inference.block_prior",
     "read_study": "study.reader", "build_magnet": "geometry.magnet",
@@ -108,6 +112,7 @@ _HOME = {
     "JoinedMaps": "measurement.map_join", "Session": "solver.session",
     "solve": "response.solution", "infer": "inference.infer", "diagnose": "api",
     "verify": "response.discretization_error", "multipoles": "api", "homogeneity": "api",
+    "Lines": "response.field_on_lines", "FieldOnLines": "response.field_on_lines",
     "stray_field": "response.stray_field", "StrayField": "response.stray_field",
     "magnetic_axis": "response.magnetic_axis", "MagneticAxis": "response.magnetic_axis",
     "forces": "design.forces",

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
+from dataclasses import field as value_of
 from pathlib import Path
 
 import numpy as np
@@ -47,10 +48,13 @@ from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.formats.blocks import DeclaredBlocks
+from halbach_fe.measurement.formats.blocks import import_blocks as read_foreign_blocks
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.files import WRITERS, export_map
 from halbach_fe.measurement.formats.files import import_map as read_foreign_map
 from halbach_fe.measurement.instrument import check_total_field
+from halbach_fe.response.field_on_lines import FieldOnLines, Lines, field_on_lines
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
     Homogeneity,
@@ -68,6 +72,7 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.free_blocks_file import write_free_blocks
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.hidden_effects import parse_hidden_effect
@@ -117,6 +122,36 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
     if "columns" in declared:
         declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
     return read_foreign_map(as_path(path), DeclaredFormat(**declared), format).data  # type: ignore[arg-type]
+
+
+@typed
+def import_blocks(path: str | Path, **declared: object) -> BlockTable | FreeBlocks:
+    """Read a table of blocks in own columns and units.
+
+    Parameters
+    ----------
+    path : str or Path
+        Text or a workbook (.xlsx).
+    **declared
+        What the table does not state: columns (a list), length_unit, field_unit, angle_unit, axes,
+        fixed, and so on, as the options of ``halbach-fe import-blocks`` are named.
+
+    Returns
+    -------
+    BlockTable or FreeBlocks
+        Measured blocks; or, of a table with positions, the columns of ``array.free_blocks``.
+
+    Raises
+    ------
+    StudyError
+        If an option has another name.
+    MeasurementError
+        If the table cannot be read; the message says what to add.
+    """
+    refuse_unknown(declared, [one.name for one in fields(DeclaredBlocks)], "hf.import_blocks")
+    if "columns" in declared:
+        declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
+    return read_foreign_blocks(as_path(path), DeclaredBlocks(**declared))  # type: ignore[arg-type]
 
 
 @typed
@@ -235,7 +270,7 @@ class HomogeneityResult(ShownInNotebook):
     distributions: Mapping[str, Gaussian]
     disagreement: str | None = None
     stray_field: StrayField | None = None
-    of_map: Mapping[str, Homogeneity] = field(default_factory=dict)
+    of_map: Mapping[str, Homogeneity] = value_of(default_factory=dict)
     map_misfit: float = 1.0
     map_remarks: tuple[str, ...] = ()
 
@@ -366,6 +401,46 @@ def multipoles(
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
         for model in models], disagreement_of(posterior), left_out)
+
+
+@typed
+def field(
+    magnet: Magnet, lines: Lines, session: Session = NOT_KEPT,
+    posterior: Mapping[str, Gaussian] | InferenceResult | None = None, inside: bool = False,
+) -> FieldOnLines:
+    """Return B and H on parallel lines with their bars, for field integrals and kick maps.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    lines : Lines
+        From a start to an end in m, `halbach_fe.Lines`.
+    session : Session, optional
+    posterior : mapping of str to Gaussian, or InferenceResult, optional
+        By default the bars are those of the study's prior of an assembled magnet.
+    inside : bool
+        Whether points may lie inside blocks.
+
+    Raises
+    ------
+    StudyError
+        If a point cannot be computed.
+    MeasurementError
+        If the posterior is that of another magnet.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> ring = hf.halbach_ring(order=1, blocks=8, inner_radius_m=0.02, outer_radius_m=0.04,
+    ...                        length_m=0.05, remanence_T=1.2)
+    >>> found = hf.field(ring, hf.Lines((0, 0, -0.2), (0, 0, 0.2), count=101))
+    >>> integral, sd = found.integrals(1)  # (1, 3) in T m
+    >>> bool(sd[0, 0] > 0)
+    True
+    """
+    known = (assembled_prior(magnet, magnet.nominal_magnetization) if posterior is None
+             else distributions_of(magnet, posterior)["posterior"])
+    return field_on_lines(magnet, lines, known, session, inside)
 
 
 @alone

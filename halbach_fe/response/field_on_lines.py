@@ -6,8 +6,8 @@ potential ``Phi = int |int B_across ds'|^2 ds`` in T^2 m^3 they are ``-1/2 grad 
 (P. Elleaume, EPAC 1992, p. 661).
 The integrals are Simpson's: lines through faces of blocks, where B jumps, need more points.
 
-Inside blocks of permeability 1 the field is a closed form too: B is mu_0 H, that of all charges,
-plus the polarization of the block.
+Inside a block B is mu_0 H, that of all charges, plus the polarization of the block, ``B_r + chi
+mu_0 H``. With permeability 1 all of it is a closed form.
 """
 
 from __future__ import annotations
@@ -25,13 +25,11 @@ from halbach_fe.core.numbers import MU_0
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.exact_block_field import external_field, unit_fields
+from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
 from halbach_fe.solver.formulation_choice import check_points
+from halbach_fe.solver.separate_blocks import applies, present_blocks, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-
-FEWEST = 3
-"""Fewest points of a line; Simpson's rule needs them."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,17 @@ class Lines:
 
     start: Floats
     end: Floats
-    across: tuple[Floats, Floats]
-    count: int
+    across: tuple[Floats, Floats] = (np.zeros(1), np.zeros(1))
+    count: int = 201
+
+    def __post_init__(self) -> None:
+        for name in ("start", "end"):
+            object.__setattr__(self, name, np.array(getattr(self, name), float))
+        fewest = 3  # Simpson's rule needs them
+        if self.count < fewest or np.array_equal(self.start, self.end):
+            raise StudyError(must_be(
+                "lines", "the field", f"of at least {fewest} points, and end elsewhere than they "
+                "start", f"{self.count} points from {self.start.tolist()} to {self.end.tolist()}"))
 
     @property
     def length(self) -> float:
@@ -128,24 +135,31 @@ class FieldOnLines:
             values = cumulative_simpson(values, dx=step, axis=1, initial=0.0)
         return np.asarray(values)
 
-    def kick_potential(self) -> tuple[Floats, Floats]:
-        """Return Phi (lines,) in T^2 m^3 and its standard deviation, linearized about the mean."""
+    @cached_property
+    def _potential(self) -> Floats:
+        """Phi (lines, 1 + q) in T^2 m^3 and the root of its covariance, linearized at the mean."""
         step = self.lines.length / (self.lines.count - 1)
         across = self._integrated(self.mean) @ self.lines.axes[:2].T
         roots = np.einsum("lncq,ac->lnaq", self._integrated(self.root), self.lines.axes[:2])
-        own = cumulative_simpson((across**2).sum(axis=2), dx=step, axis=1)[:, -1]
-        change = 2 * np.einsum("lna,lnaq->lnq", across, roots)
-        return np.asarray(own), np.linalg.norm(
-            cumulative_simpson(change, dx=step, axis=1)[:, -1], axis=-1)
+        density = np.concatenate([(across**2).sum(axis=2)[..., None],
+                                  2 * np.einsum("lna,lnaq->lnq", across, roots)], axis=2)
+        return np.asarray(cumulative_simpson(density, dx=step, axis=1)[:, -1])
 
-    def kicks(self) -> tuple[Floats, Floats]:
-        """Return the kicks (n, m) in T^2 m^2 along both axes across, times (B rho)^2."""
-        shape = tuple(len(one) for one in self.lines.across)
-        potential = self.kick_potential()[0].reshape(shape)
-        first, second = (np.asarray(np.gradient(
-            potential, offsets, axis=axis, edge_order=2 if len(offsets) > 2 else 1))
+    def kick_potential(self) -> tuple[Floats, Floats]:
+        """Return Phi (lines,) in T^2 m^3 and its standard deviation."""
+        return self._potential[:, 0], np.linalg.norm(self._potential[:, 1:], axis=1)
+
+    def kicks(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+        """Return the kicks (n, m) in T^2 m^2 along both axes across, times (B rho)^2.
+
+        Each comes with its standard deviation.
+        """
+        potential = self._potential.reshape(*map(len, self.lines.across), -1)
+        first, second = (-0.5 * np.gradient(
+            potential, offsets, axis=axis, edge_order=2 if len(offsets) > 2 else 1)
             for axis, offsets in enumerate(self.lines.across))
-        return -0.5 * first, -0.5 * second
+        return ((first[..., 0], np.linalg.norm(first[..., 1:], axis=2)),
+                (second[..., 0], np.linalg.norm(second[..., 1:], axis=2)))
 
 
 def field_on_lines(
@@ -162,7 +176,7 @@ def field_on_lines(
         Of all parameters of the response matrix.
     session : Session
     inside : bool
-        Whether points may lie inside blocks, of a magnet of permeability 1 without iron.
+        Whether points may lie inside blocks; see `_through_blocks` for what magnets.
 
     Raises
     ------
@@ -170,30 +184,23 @@ def field_on_lines(
         If a point is not in air, and it was not asked for, or cannot be computed.
     """
     points = lines.points.reshape(-1, 3)
-    count = len(magnetizations.mean)
     number = _blocks_of(magnet, points)
     if not inside and (number >= 0).any():
         raise StudyError(must_be(
             "points", magnet.name, "in air", f"{int((number >= 0).sum())} of {len(points)} inside "
             "blocks", "If B and H inside them are wanted, add --inside."))
     if (number >= 0).any():
-        offset, matrix = _closed_form(magnet, points, number, count)
-        error = np.zeros(offset.shape)
+        mean, root, error, polarization = _through_blocks(
+            magnet, points, number, magnetizations, session)
     else:
         model = response_matrix(magnet, flux_density_at(points), session)
-        offset, matrix, error = (values.reshape(len(points), 3, *values.shape[1:]) for values in (
-            model.offset, model.whole, model.error))
-    of_block = np.zeros((len(points), 3, count))
-    for row in np.flatnonzero(number >= 0):
-        of_block[row, range(3), range(3 * number[row], 3 * number[row] + 3)] = MU_0
-    flat, own = matrix.reshape(-1, count), of_block.reshape(-1, count)
+        mean = model.offset + model.whole @ magnetizations.mean
+        root, error = model.whole @ magnetizations.root, model.error
+        polarization = np.zeros((len(points), 3, 1 + root.shape[1]))
     shape = lines.points.shape
     names = np.array([*(block.name for block in magnet.blocks), ""])
-    return FieldOnLines(
-        lines, (offset.ravel() + flat @ magnetizations.mean).reshape(shape),
-        (flat @ magnetizations.root).reshape(*shape, -1), error.reshape(shape),
-        np.column_stack([own @ magnetizations.mean, own @ magnetizations.root]).reshape(*shape, -1),
-        names[number].reshape(shape[:2]))
+    return FieldOnLines(lines, mean.reshape(shape), root.reshape(*shape, -1), error.reshape(shape),
+                        polarization.reshape(*shape, -1), names[number].reshape(shape[:2]))
 
 
 def _blocks_of(magnet: Magnet, points: Floats) -> NDArray[np.intp]:
@@ -204,29 +211,80 @@ def _blocks_of(magnet: Magnet, points: Floats) -> NDArray[np.intp]:
     return found
 
 
-def _closed_form(
-    magnet: Magnet, points: Floats, number: NDArray[np.intp], count: int
-) -> tuple[Floats, Floats]:
-    """Return B (n, 3) in T of external fields, and B (n, 3, parameters) per A/m.
+def _through_blocks(
+    magnet: Magnet, points: Floats, number: NDArray[np.intp], magnetizations: Gaussian,
+    session: Session,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return mean (n, 3), root (n, 3, q) and bar (n, 3) of B in T, and J (n, 3, 1 + q) in T.
+
+    ``number`` (n,) is the block that a point is in, -1 in air. Permeability and iron answer to the
+    nominal magnet only: what they add to the field of deviations, a few per cent of it, is an
+    error bar.
 
     Raises
     ------
     StudyError
-        If permeability or iron react, or magnetizations are not uniform in blocks.
+        If blocks are not uniformly magnetized, or the magnet is not solved by moments.
     """
-    uniform = count == 3 * len(magnet.blocks) and all(
-        len(block.parts) == 1 for block in magnet.blocks)
-    if magnet.dimension != 3 or not magnet.is_vacuum or not uniform:
+    blocks, count = magnet.blocks, len(magnetizations.mean)
+    uniform = count == 3 * len(blocks) and all(len(block.parts) == 1 for block in blocks)
+    if not uniform or magnet.has_losses or not applies(magnet):
         raise StudyError(must_be(
-            "points inside blocks", magnet.name, "of a 3D magnet of uniform blocks with recoil "
-            "permeability 1 and without iron", "another magnet",
-            "Set array.recoil_permeability = 1, which changes B inside by some per cent, or leave "
-            "the points out."))
+            "points inside blocks", magnet.name, "of a 3D magnet of uniform blocks without "
+            "irreversible losses, and with no other iron than coaxial tubes and discs",
+            "another magnet", "Leave the points out, or the key that says so of the magnet."))
     outside = number < 0
     points = points.copy()
     points[outside] = check_points(magnet, points[outside])
-    matrix = np.empty((len(points), 3, count))
-    for block, field in enumerate(unit_fields(magnet.blocks, points)):
-        field[number == block] += np.eye(3)  # B = mu_0 H + J
-        matrix[:, :, 3 * block:3 * block + 3] = MU_0 * field
-    return external_field(magnet, points), matrix
+    strength, error = external_field(magnet, points) + field_of(blocks, points), 0 * points
+    if not magnet.is_vacuum:
+        reaction, error = _reaction(magnet, points, number, session)
+        strength += reaction
+    tensors = np.array([block.recoil_tensor for block in blocks])
+    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
+                              magnetizations.root]).reshape(len(blocks), 3, -1)
+    remanence = MU_0 * tensors @ change
+    of_change = sum((field @ remanence[block] for block, field in enumerate(
+        unit_fields(blocks, points))), np.zeros((*points.shape, change.shape[2])))
+    largest = np.abs(tensors - np.eye(3)).max(initial=0.0) if not magnet.iron else 1.0
+    error = error + largest * np.abs(of_change[..., 0])
+    of_change[..., 0] += strength
+    polarization = np.zeros_like(of_change)
+    nominal = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
+    remanence[..., 0] += nominal
+    for block in set(number[~outside]):
+        here = number == block
+        chi = tensors[block] - np.eye(3)
+        polarization[here] = remanence[block] + chi @ of_change[here]
+        error[here] = error[here] @ np.abs(tensors[block])
+    flux = of_change + polarization
+    return flux[..., 0], flux[..., 1:], error, polarization
+
+
+def _reaction(
+    magnet: Magnet, points: Floats, number: NDArray[np.intp], session: Session
+) -> tuple[Floats, Floats]:
+    """Return what permeability and iron add to mu_0 H of the nominal magnet, and its error bar.
+
+    Both are (n, 3) in T; ``number`` (n,) is the block that a point is in, -1 in air.
+    """
+    from halbach_fe.solver.moments.solve import field_within  # imports numba
+
+    solved = solve_separate(magnet, session)
+    present = present_blocks(magnet.blocks)
+    place = np.array([present.index(magnet.blocks[block]) if block >= 0 and (
+        magnet.blocks[block] in present) else -1 for block in number])
+
+    def sources(places: Floats) -> Floats:
+        iron = solved.iron.field(places) if solved.iron is not None else 0.0
+        return field_of(magnet.blocks, places) + iron
+
+    field, error = np.zeros_like(points), np.zeros_like(points)
+    free = place < 0 if solved.blocks else np.ones(len(points), bool)
+    field[free], error[free] = solved.field_with_errors(points[free])
+    for block in set(place[~free]):
+        here = place == block
+        strength, bar = field_within(solved.blocks[0], block, present[block], points[here], sources)
+        field[here] = strength - field_of(magnet.blocks, points[here])
+        error[here] = bar + (solved.iron.error(points[here]) if solved.iron is not None else 0.0)
+    return field, error

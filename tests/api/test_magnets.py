@@ -210,9 +210,8 @@ def test_a_displaced_map_is_explained_in_python(generator):
 OTHER_NAMES = {"check": "check_map", "design": "design_rings", "report": "campaign_report"}
 """Functions whose names say more than those of their commands."""
 
-OF_THE_SHELL = {"cache", "doctor", "schema", "completion", "import-blocks", "field"}
-"""Commands about the installation and the command line, and two whose parts Python has as arrays:
-tables of blocks (`hf.magnet_of_blocks`) and fields at points (``magnet.field_T``)."""
+OF_THE_SHELL = {"cache", "doctor", "schema", "completion"}
+"""Commands about the installation and the command line."""
 
 
 def without_function(verbs, names):

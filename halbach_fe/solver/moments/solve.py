@@ -40,6 +40,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction, Neighbours
 from halbach_fe.study.solver import CELLS_PER_SIDE
@@ -254,6 +255,65 @@ def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[F
     share = np.interp(_distances(larger, points), list(ERROR_SHARE), list(ERROR_SHARE.values()))
     floor = 5e-4  # smallest error bar relative to the reaction, for the expansions of far clusters
     return field, np.repeat((share * change + floor * size)[:, None], 3, axis=1)
+
+
+def field_within(
+    moments: Moments, number: int, block: MagnetBlock, points: Floats, sources: Applied,
+) -> tuple[Floats, Floats]:
+    """Return mu_0 H and its error bar, both (n, 3) in T, at points (n, 3) in m inside a block.
+
+    ``number`` is that of the block in ``moments``, and ``sources`` returns mu_0 H of all remanences
+    and of iron. `Moments.reaction` has charges on the faces of the cells of this block. Here its
+    polarization is its mean and, to first order in chi, the deviation ``D`` that the field of that
+    mean makes. The field of ``D`` is that of a block with the ``D`` of the point throughout, in
+    closed form, and the sum over Gauss nodes of what the others differ from it, which vanishes
+    where the kernel is singular. The bar is the change by half as many nodes a side, plus chi times
+    the field of ``D``, as large as what the next order would add.
+    """
+    cells, chi = moments.cells, block.recoil_tensor - np.eye(3)
+    own, mean = cells.block == number, cells.mean(moments.induced)
+    induced = moments.induced.copy()
+    induced[own] = np.average(mean[own], axis=0, weights=cells.volume[own])
+    others = moments.interaction.field_function(induced)
+
+    def deviation(places: Floats) -> tuple[Floats, Floats]:
+        """Return mu_0 H of the means, and the polarization that it makes."""
+        field = sources(places) + others(places)
+        return field, field @ chi.T
+
+    first, here = deviation(points)
+    unit = next(iter(unit_fields([block], points)))
+    per_side, divisions, of_deviation = 6, 3, []
+    for cells_per_side in (per_side, per_side // 2):
+        grid = cells_of([block], cells_per_side, divisions)
+        nodes, volume = grid.nodes.reshape(-1, 3), (grid.weights * grid.volume[:, None]).ravel()
+        there = deviation(nodes)[1]
+        average = np.average(there, axis=0, weights=volume)
+        of_deviation.append(np.einsum("nij,nj->ni", unit, here - average)
+                            + _spheres_less(points, here, nodes, there, volume))
+    field, coarse = of_deviation
+    second = np.linalg.norm(field, axis=1) * np.linalg.norm(chi, ord=2)
+    bar = np.linalg.norm(field - coarse, axis=1) + second
+    return first + field, np.repeat(bar[:, None], 3, axis=1)
+
+
+def _spheres_less(
+    points: Floats, here: Floats, nodes: Floats, there: Floats, volume: Floats
+) -> Floats:
+    """Return mu_0 H (n, 3) in T of spheres about nodes (m, 3) in m, of volumes (m,) in m^3.
+
+    Their polarization is ``there`` (m, 3) in T, less ``here`` (n, 3) in T at the points (n, 3).
+    """
+    found, radius = np.empty_like(points), np.cbrt(3 * volume / (4 * np.pi))
+    for row, (point, own) in enumerate(zip(points, here, strict=True)):
+        apart, change = point - nodes, there - own
+        distance = np.linalg.norm(apart, axis=1)
+        far = distance > radius  # elsewhere the point is in the sphere, whose field is uniform
+        apart, distance = apart[far], distance[far]
+        along = 3 * np.einsum("mi,mi->m", change[far], apart) / distance**5
+        field = along[:, None] * apart - change[far] / distance[:, None]**3
+        found[row] = volume[far] @ field / (4 * np.pi) - change[~far].sum(axis=0) / 3
+    return found
 
 
 def _distances(cells: Cells, points: Floats) -> Floats:
