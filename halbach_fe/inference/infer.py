@@ -269,6 +269,7 @@ def infer(
         log_evidence=update.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
         measured_blocks=blocks.serial if blocks and not prior else None,
+        table_doubts=of_blocks.doubts if of_blocks and not prior else (),
         left_out=update.discarded_information,
         terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
                               at_rest, _poses(open_terms, maps, whole))
