@@ -11,8 +11,10 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 from types import FrameType
 
 from halbach_fe.cli import streams
@@ -46,6 +48,13 @@ NO_MEMORY = re.compile(
 """Texts of libraries whose errors are not MemoryError: they could not be loaded, start a thread, or
 allocate memory."""
 
+PATIENCE_S = 5.0
+"""Time in s that a command has to end after a signal. GetDP and the processes of a pool take less
+than one."""
+
+STOP = 0
+"""No signal's number: it ends the thread that reads them."""
+
 OF_THE_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ESTALE,
                errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENAMETOOLONG}
 """Errors of the system for which halbach-fe is not to blame, wherever they come from."""
@@ -56,6 +65,7 @@ def guarded(run: Callable[[], int]) -> int:
 
     SIGTERM and the closing of the terminal act like Ctrl-C: GetDP is stopped, and no result is left
     half-written. Signals that are ignored (by nohup, or as a shell's background job) stay ignored.
+    A library that does not return to Python, as Gmsh for minutes, is ended after `PATIENCE_S`.
     """
     streams.prepare()
     os.environ["MPLBACKEND"] = "agg"  # a notebook's, which may not exist here, would be imported
@@ -70,7 +80,7 @@ def guarded(run: Callable[[], int]) -> int:
                 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
                 if signal.getsignal(number) is not signal.SIG_IGN}
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _ended_in_time(set(previous)):
             warnings.simplefilter("once", HalbachWarning)
             warnings.showwarning = lambda message, *_: say(f"warning: {message}")
             claim_buffers()
@@ -83,6 +93,37 @@ def guarded(run: Callable[[], int]) -> int:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _ended_in_time(numbers: Set[int]) -> Iterator[None]:
+    """End this process `PATIENCE_S` after one of some signals, unless the block ends before.
+
+    Python calls handlers of signals between its own instructions only. Its wake-up file gets the
+    number of a signal at once, and a thread reads it there. What is being written has a temporary
+    name, and GetDP ends without its parent: the process may end as if it were killed.
+    """
+    ended, (reading, writing) = Event(), os.pipe()
+    os.set_blocking(writing, False)
+
+    def wait() -> None:
+        while (number := os.read(reading, 1)[0]) != STOP:
+            if number in numbers and not ended.wait(PATIENCE_S):
+                say("interrupted")
+                os._exit(130)
+
+    thread = Thread(target=wait, daemon=True)
+    before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(before)
+        os.write(writing, bytes([STOP]))
+        thread.join()
+        os.close(reading)
+        os.close(writing)
 
 
 def _exit_code(error: BaseException) -> int:

@@ -106,7 +106,7 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
     """
     blocks = magnet.blocks if magnet.dimension == 2 else magnet.blocks[:magnet.blocks_by_ring[0]]
     radius = boundary_radius(magnet, kind)
-    wanted = _equilateral(magnet, radius)
+    wanted = fewest_triangles(magnet, radius)
     coarser = max(1.0, (wanted / COUNTED) ** 0.5)
     mesh = magnet.study.mesh
     # model_copy does not validate: this mesh may be coarser than a study is allowed to ask for
@@ -114,7 +114,7 @@ def plane_size(magnet: Magnet, kind: str) -> tuple[float, float]:
         "block_size_m": mesh.block_size_m * coarser,
         "bore_size_m": (mesh.bore_size_m or mesh.block_size_m) * coarser})}))
     triangles, rim = _count_triangles(drawn, blocks[:DRAWN], radius)
-    excess = triangles - _equilateral(drawn, radius)
+    excess = triangles - fewest_triangles(drawn, radius)
     if len(blocks) > DRAWN:  # every further block adds the same number of triangles
         fewer, _ = _count_triangles(drawn, blocks[:DRAWN // 2], radius)
         excess += (triangles - fewer) / (DRAWN // 2) * (len(blocks) - DRAWN)
@@ -140,9 +140,10 @@ def _count_triangles(
         return len(mesh.getElementsByType(triangle)[0]), rim
 
 
-def _equilateral(magnet: Magnet, radius: float) -> float:
+def fewest_triangles(magnet: Magnet, radius: float) -> float:
     """Return the number of equilateral triangles of the wanted size that fill the disk.
 
+    A mesh has more, up to a third, because every curve is cut into whole edges.
     The size depends on the radius as `set_element_sizes` has it.
     """
     mesh, bore = magnet.study.mesh, magnet.bore_radius

@@ -727,12 +727,13 @@ def tolerance(
     check_number("draws", "tolerance", draws, *DRAWS, whole=True)
     check_number("seed", "tolerance", seed, 0, whole=True)
     check_objective(magnet, reference, limit_units, limit_ppm)
-    measured = None if blocks is None else prior_from_blocks(magnet, blocks).gaussian
+    measured = None if blocks is None else prior_from_blocks(magnet, blocks)
     model, generator = objective_of(magnet, reference, session), np.random.default_rng(seed)
-    prior = measured or assembled_prior(magnet, model.nominal)
-    if isinstance(model, MultipoleModel):
-        return predict_tolerance(model, magnet, prior, draws, generator, limit_units)
-    return predict_homogeneity(model.homogeneity, magnet, prior, draws, generator, limit_ppm)
+    prior = measured.gaussian if measured else assembled_prior(magnet, model.nominal)
+    found = (predict_tolerance(model, magnet, prior, draws, generator, limit_units)
+             if isinstance(model, MultipoleModel) else
+             predict_homogeneity(model.homogeneity, magnet, prior, draws, generator, limit_ppm))
+    return replace(found, table_doubts=measured.doubts if measured else None)
 
 
 @alone

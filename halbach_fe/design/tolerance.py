@@ -49,6 +49,8 @@ class Tolerance(ShownInNotebook):
         |C_N| of the samples, in T, or T m if integrated along z.
     limit : float or None
         Limit of all |c_n|, in units of 1e-4.
+    table_doubts : tuple of str or None
+        Why the table of measured blocks may not be of this magnet; None without a table.
     quantiles : ndarray, shape (len(`QUANTILES`), k)
         Quantiles of |c_n|, in units of 1e-4.
     share : float or None
@@ -62,6 +64,7 @@ class Tolerance(ShownInNotebook):
     sizes: Floats
     main: Floats
     limit: float | None
+    table_doubts: tuple[str, ...] | None = None
 
     @property
     def quantiles(self) -> Floats:
@@ -110,6 +113,8 @@ class HomogeneityTolerance(ShownInNotebook):
         Deviations of |B| from its mean.
     limit : float or None
         Limit of the rms deviation in ppm.
+    table_doubts : tuple of str or None
+        Why the table of measured blocks may not be of this magnet; None without a table.
     share, share_sd : float or None
         Share of the magnets within the limit, from 0 to 1, and its standard error; None without a
         limit.
@@ -122,6 +127,7 @@ class HomogeneityTolerance(ShownInNotebook):
     rms_ppm: Floats
     peak_to_peak_ppm: Floats
     limit: float | None
+    table_doubts: tuple[str, ...] | None = None
 
     @property
     def share(self) -> float | None:

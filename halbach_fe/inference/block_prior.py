@@ -71,6 +71,12 @@ it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
 NDFEB_PER_K = -0.0012
 """Temperature coefficient of the remanence of NdFeB, for the size of the error that is told."""
 
+NAMED = 3
+"""Number of blocks far from the others that a sentence names."""
+
+MAD_TO_SD = 1.4826
+"""Standard deviation of normal numbers over the median of their absolute values."""
+
 MANY_SD = 5.0
 """Number of the study's standard deviations by which no mean of its own blocks is off by chance."""
 
@@ -117,6 +123,8 @@ class MeasuredPrior:
     placed : bool
         Whether the prior of a block is its own measurement, not the distribution of its type.
     types : tuple of TypeSamples
+    far : str
+        A sentence that names single blocks far from the others; empty if there are none.
     doubts : tuple of str
         Sentences about why the table and the study may not be of the same blocks.
     """
@@ -126,6 +134,7 @@ class MeasuredPrior:
     placed: bool
     types: tuple[TypeSamples, ...]
     doubts: tuple[str, ...] = ()
+    far: str = ""
 
     @property
     def count(self) -> int:
@@ -236,9 +245,42 @@ def _prior_as_meant(magnet: Magnet, table: BlockTable, used: Set[int]) -> Measur
     nominal = np.concatenate([block.magnetization[:size] for block in blocks])
     doubts = (*_temperature_doubts(magnet, table), *_mean_doubts(magnet, members),
               *(_noise_doubts(magnet, gaussian, nominal) if placed else ()))
-    for doubt in doubts:
-        warnings.warn(doubt, HalbachWarning, stacklevel=2)
-    return MeasuredPrior(gaussian, nominal, placed, types, doubts)
+    far = _far_blocks(magnet, table, deviations)
+    for said in (*doubts, far):
+        if said:
+            warnings.warn(said, HalbachWarning, stacklevel=2)
+    return MeasuredPrior(gaussian, nominal, placed, types, doubts, far)
+
+
+def _far_blocks(magnet: Magnet, table: BlockTable, deviations: Floats) -> str:
+    """Name the blocks that deviate from nominal many times farther than the others, from their
+    median and beyond what the study states; return nothing if there are none.
+
+    ``deviations`` (rows, d) are along the nominal magnetization, and angles across it.
+    """
+    if len(deviations) < MIN_SAMPLES:
+        return ""
+    settings = magnet.study.prior
+    away = deviations - np.median(deviations, axis=0)
+    stated = np.array([settings.magnitude_sd, *2 * (np.radians(settings.direction_sd_deg),)])
+    usual = np.maximum(MAD_TO_SD * np.median(np.abs(away), axis=0), stated[:away.shape[1]])
+    times = np.abs(away) / np.where(usual > 0, usual, np.inf)
+    far = np.flatnonzero(times.max(axis=1) > MANY_SD)
+    far = far[np.argsort(-times.max(axis=1)[far])]
+    if not len(far):
+        return ""
+
+    def words(row: int) -> str:
+        along, angle = float(away[row, 0]), float(np.degrees(np.linalg.norm(away[row, 1:])))
+        if np.argmax(times[row]):
+            return f"{table.serial[row]} is turned by {angle:.2g}°"
+        side = "stronger" if along > 0 else "weaker"
+        return f"{table.serial[row]} is {100 * abs(along):.2g} % {side}"
+
+    named = ", block ".join(map(words, far[:NAMED].tolist()))
+    more = f" and {len(far) - NAMED} more are so far off" if len(far) > NAMED else ""
+    return (f"Relative to the median of all, block {named}{more}: up to {times.max():.0f} times "
+            "what is usual here. Are these rows of the table right?")
 
 
 def _temperature_doubts(magnet: Magnet, table: BlockTable) -> list[str]:

@@ -32,7 +32,6 @@ from halbach_fe.inference.result import (
     MapPose,
     Prediction,
 )
-from halbach_fe.inference.same_magnet import distribution_of
 from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
@@ -44,7 +43,12 @@ from halbach_fe.measurement.instrument import (
     turn_of,
 )
 from halbach_fe.measurement.observation import Observation
-from halbach_fe.response.block_variation import neighbour_deviations, study_prior, with_others
+from halbach_fe.response.block_variation import (
+    distribution_of,
+    neighbour_deviations,
+    study_prior,
+    with_others,
+)
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
@@ -269,6 +273,7 @@ def infer(
         log_evidence=update.log_evidence,
         kind="linearized" if magnet.is_nonlinear else "closed form",
         measured_blocks=blocks.serial if blocks and not prior else None,
+        table_doubts=of_blocks.doubts if of_blocks and not prior else (),
         left_out=update.discarded_information,
         terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
                               at_rest, _poses(open_terms, maps, whole))

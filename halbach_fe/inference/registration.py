@@ -35,7 +35,7 @@ from halbach_fe.measurement.field_map import checked_map, directed, is_undirecte
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
-from halbach_fe.study.types import COMPONENTS
+from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 SAME_TURN = 0.1
 """Angle in rad up to which a map is turned like another on its stage: more than the error of the
@@ -139,6 +139,13 @@ def _registered(
 ) -> list[Registration]:
     """Return the poses of a map by some hypotheses about what is open, see `register`."""
     fit, magnet, pace = fits[0], fits[0].magnet, Pace(say)
+    reach = float(np.hypot(magnet.radius, magnet.half_length))
+    extent = np.linalg.norm(np.ptp(fit.points, axis=0))
+    if look_like_mm(np.ptp(fit.points, axis=0)[None], reach)[0]:
+        raise MeasurementError(must_be(
+            "positions", "the map", f"within reach of the magnet, {reach:.2g} m from its middle",
+            f"a map that extends over {extent:.3g} m", "Are they in millimetres? Then set "
+            "instrument.length_unit_m = 0.001 in the study."))
     say("searching the pose among rotations by right angles and shifts along the axis")
     starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0],
                           pace, fit.total)

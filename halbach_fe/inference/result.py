@@ -342,6 +342,8 @@ class InferenceResult(ShownInNotebook):
     measured_blocks : tuple of str or None
         Serial numbers of the measured blocks from which the prior follows; None if it is the
         study's prior.
+    table_doubts : tuple of str
+        Sentences about why the table of measured blocks may not be of this magnet.
     left_out : float
         Upper bound of the relative change of a posterior variance by discarded information, see
         `halbach_fe.stats.linear_gaussian.LinearPosterior`.
@@ -390,6 +392,7 @@ class InferenceResult(ShownInNotebook):
     log_evidence: float
     kind: Literal["closed form", "linearized", "samples"]
     measured_blocks: tuple[str, ...] | None = None
+    table_doubts: tuple[str, ...] = ()
     left_out: float = 0.0
     terms: InstrumentTerms | None = None
     amplitudes: Amplitudes | None = None
@@ -534,6 +537,8 @@ class InferenceResult(ShownInNotebook):
         """Sentences if prior, model and maps cannot all be right, else an empty string."""
         found = [self._conflict or self.too_near, self.held_out_conflict, self._doubted,
                  *(each.disagreement for each in self.overlaps)]
+        if any(found) and not self.too_near:
+            found += self.table_doubts
         return " ".join(sentence for sentence in found if sentence)
 
     @cached_property
@@ -581,7 +586,8 @@ class InferenceResult(ShownInNotebook):
         if self.held_back:
             measured = self.measured_blocks is not None
             return Reservation(f"Only in part. {held_back_in_words(self.held_back, measured)}")
-        said = shared_in_words(self.shared_doubts, self.magnet.dimension == 2)
+        said = shared_in_words(self.shared_doubts, self.magnet.dimension == 2) or " ".join(
+            self.table_doubts)
         return Reservation(f"Only with care. {said}" if said else "")
 
     @property

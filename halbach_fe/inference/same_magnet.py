@@ -10,7 +10,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.response.block_variation import Variations
+from halbach_fe.response.block_variation import distribution_of
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study, differences, magnet_description
 
@@ -78,24 +78,3 @@ def disagreement_of(posterior: Mapping[str, Gaussian] | InferenceResult | None) 
     if isinstance(posterior, InferenceResult):
         return posterior.disagreement or posterior.reservation
     return getattr(posterior, "disagreement", None)
-
-
-def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian:
-    """Return a distribution of a magnet's parameters in A/m.
-
-    Raises
-    ------
-    MeasurementError
-        If it is none, or has another number of parameters.
-    """
-    if not isinstance(distribution, Gaussian):
-        raise MeasurementError(must_be(
-            name, f"study {magnet.name}", "a Gaussian", f"a {type(distribution).__name__}"))
-    variations = Variations.of(magnet)
-    expected = (len(magnet.nominal_magnetization) + (len(variations.names) if variations else 0)
-                + len(magnet.study.uncertain_of_magnet))
-    if len(distribution.mean) != expected:
-        raise MeasurementError(must_be(
-            name, f"study {magnet.name}", f"of the {expected} parameters of its magnet",
-            str(len(distribution.mean)), "Is it that of another magnet?"))
-    return distribution

@@ -107,7 +107,11 @@ def field_map(
     >>> data["B_T"].sel(component="y").values
     array([0.4 , 0.39])
     """
-    points, given = np.array(points_m, float), np.array(B_T, float)
+    try:
+        points, given = np.array(points_m, float), np.array(B_T, float)
+    except (TypeError, ValueError) as error:
+        raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
+                                       f"what is none: {error}")) from None
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
     if points.shape != (len(points), 3) or given.shape != (len(points), len(components)) or (
             len(set(columns)) != len(components)):

@@ -35,6 +35,11 @@ AGAIN = ("State in the study how far that may be off, and update again.",
 """The next step, and its command, if something of all blocks is in doubt."""
 
 
+OF_THE_TABLE = ("Answer what is asked of the table of blocks, correct it or the study, and update "
+                "again.", "halbach-fe infer STUDY --measurements MAP --blocks BLOCKS -o DIR")
+"""The next step, and its command, if the table of blocks may not be of this magnet."""
+
+
 def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> Answer:
     """Say what field the updated magnet has, how well it predicts, and what to do next.
 
@@ -67,7 +72,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
         *(LOOK if single or (shared and "update again" not in result.reservation) else
-          AGAIN if shared else _after_agreement(result)), sound=not (single or shared),
+          AGAIN if shared else OF_THE_TABLE if result.table_doubts else _after_agreement(result)),
+        sound=not result.reservation,
         gist=_blocks(result, "The blocks deviate"), numbers=numbers)
 
 

@@ -67,7 +67,7 @@ def _summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
         "rms_shift_A_per_m": float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))),
         "common_mode_sd": magnet.study.prior.common_mode_sd,
         "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
-        "doubts": list(prior.doubts),
+        "doubts": list(prior.doubts), "far": prior.far,
         "not_normal": [samples.label for samples in prior.types if not samples.normal],
         "types": [
             {"type": samples.label, "n": len(samples.deviations),
@@ -160,6 +160,8 @@ def answer(prior: MeasuredPrior) -> Answer:
              f"distributed normally (Anderson-Darling test, p below {NOT_NORMAL} after Holm's "
              "correction)."
              + ("" if prior.placed else " The prior treats them as normal nevertheless."))
+    if prior.far:
+        said += f" {prior.far}"
     if prior.doubts:
         trust = f"Not yet. {' '.join(prior.doubts)}"
     return Answer(

@@ -111,7 +111,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
         said = (f"{made}{said[0].lower() if made else said[0]}{said[1:]} That is the magnet as "
                 f"designed ({ordered:.3g} units with blocks as ordered), to which their "
                 "tolerances add little.")
-    share, prior = found.share, found.study.prior
+    share = found.share
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
@@ -123,10 +123,19 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
              "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
             ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR"))
-    return Answer(
-        question, said,
-        f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
-        f"{whole(len(found.sizes))} magnets were drawn.", *step)
+    return Answer(question, said, f"{_trust(found)} {whole(len(found.sizes))} magnets were drawn.",
+                  *step, sound=not found.table_doubts)
+
+
+def _trust(found: Tolerance | HomogeneityTolerance) -> str:
+    """Say what the drawn magnets rest on: the study's tolerances, or a table of blocks."""
+    if found.table_doubts:
+        return f"Not yet. {' '.join(found.table_doubts)}"
+    if found.table_doubts is None:
+        return (f"Yes, as far as the study's prior is right: "
+                f"{tolerances_in_words(found.study.prior)}")
+    return ("Yes, as far as the table of measured blocks is right, from which the magnets were "
+            f"drawn. {NOMINAL}")
 
 
 def _made_by_tolerances(found: Tolerance) -> str:
@@ -264,7 +273,7 @@ def _homogeneity_answer(found: HomogeneityTolerance) -> Answer:
             f"peak) from their mean field in {found.model.region.text}, 95 % by less than "
             f"{ppm(most)} ({ppm(widest)}). With all blocks as ordered it is "
             f"{ppm(found.ordered.rms_ppm)} ppm rms.")
-    share, prior = found.share, found.study.prior
+    share = found.share
     if share is not None and found.limit is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
@@ -283,9 +292,12 @@ def _homogeneity_answer(found: HomogeneityTolerance) -> Answer:
     text, small = solver_error_text(found.model, half)
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,
-        f"Yes, as far as the study's prior is right: {tolerances_in_words(prior)} "
-        f"{whole(len(found.rms_ppm))} magnets were drawn. {text}", *step,
-        sound=small)
+        f"{_trust(found)} {whole(len(found.rms_ppm))} magnets were drawn. {text}", *step,
+        sound=small and not found.table_doubts)
+
+
+NOMINAL = ("Shapes and places count as nominal: what their tolerances make comes on top of these "
+           "numbers.")
 
 
 def tolerances_in_words(prior: Prior) -> str:
@@ -295,8 +307,7 @@ def tolerances_in_words(prior: Prior) -> str:
     mounted = (f", and mounting turns each block by {prior.mounting_sd_deg:.3g}°"
                if prior.mounting_sd_deg > 0 else "")
     return (f"each block varies by {100 * prior.magnitude_sd:g} % and "
-            f"{prior.direction_sd_deg:g}°{together}{mounted}. Shapes and places count as nominal: "
-            "what their tolerances make comes on top of these numbers.")
+            f"{prior.direction_sd_deg:g}°{together}{mounted}. {NOMINAL}")
 
 
 def _deviation_figure(found: HomogeneityTolerance) -> Figure:

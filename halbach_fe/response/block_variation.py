@@ -26,7 +26,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import Observation
@@ -328,3 +328,24 @@ def _either_side(
                 f"{uncertain.sd:g} (in the unit of the key, as m and T)",
                 f"Correct it. The change by that step: {error}")) from None
     return (sides[0], sides[1]), between
+
+
+def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian:
+    """Return a distribution of a magnet's parameters in A/m.
+
+    Raises
+    ------
+    MeasurementError
+        If it is none, or has another number of parameters.
+    """
+    if not isinstance(distribution, Gaussian):
+        raise MeasurementError(must_be(
+            name, f"study {magnet.name}", "a Gaussian", f"a {type(distribution).__name__}"))
+    variations = Variations.of(magnet)
+    expected = (len(magnet.nominal_magnetization) + (len(variations.names) if variations else 0)
+                + len(magnet.study.uncertain_of_magnet))
+    if len(distribution.mean) != expected:
+        raise MeasurementError(must_be(
+            name, f"study {magnet.name}", f"of the {expected} parameters of its magnet",
+            str(len(distribution.mean)), "Is it that of another magnet?"))
+    return distribution

@@ -29,6 +29,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.response.block_variation import distribution_of
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
@@ -104,6 +105,7 @@ def magnetic_axis(
     >>> hf.magnetic_axis(magnet, session, result.posterior).order
     1
     """
+    distribution_of(magnet, magnetizations, "magnetizations")
     flat, order, bore = magnet.dimension == 2, magnet.array.multipole_order, magnet.bore_radius
     radius = RADIUS * bore
     reach = 0.0 if flat else LENGTH * magnet.array_half_length

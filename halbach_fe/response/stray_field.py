@@ -22,6 +22,7 @@ from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import vector
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.response.block_variation import distribution_of
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
@@ -190,6 +191,7 @@ def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) ->
     """Return the field of a magnet alone, of the mean magnetizations."""
     blocks = magnet.blocks
     if magnetizations is not None:
+        distribution_of(magnet, magnetizations, "magnetizations")
         uniform = magnetizations.mean[:len(magnet.parameter_names)]
         blocks = with_magnetizations(magnet, uniform)
     vacuum = field_in_vacuum(blocks)

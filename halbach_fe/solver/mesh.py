@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import MeshError, OutputError
+from halbach_fe.core.errors import MeshError, OutputError, must_be
+from halbach_fe.core.threads import machine_memory
 from halbach_fe.geometry.domain import Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.model import Study
@@ -26,6 +27,13 @@ MESH_NAME = "mesh.msh"
 REGIONS_NAME = "regions.json"
 MERIDIAN = "meridian"
 """Prefix of the file names of the mesh of the (r, z) half-plane."""
+
+LEAST_BYTES = {2: 7200, 3: 2000}
+"""Fewest bytes that the solve needs per element, by dimension: in a plane GetDP's 3600 for each of
+two unknowns (`halbach_fe.response.resource_estimate`), in space those of this program alone."""
+
+FAR_IRON = 10.0
+"""Times the radius of the blocks, beyond which iron is rather in another unit than a shield."""
 
 # Dimension of a cell by meshio's name of its type.
 _DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad": 2, "tetra10": 3}
@@ -139,9 +147,12 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
     ------
     OutputError
         If the files cannot be written.
+    MeshError
+        If this machine has too little memory for it.
     """
     from halbach_fe import geo  # imports Gmsh, which only meshing needs
 
+    _check_memory(magnet)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         files = MeshFiles(folder / MESH_NAME, folder / REGIONS_NAME)
@@ -150,6 +161,28 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
     except OSError as error:
         raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
     return files
+
+
+def _check_memory(magnet: Magnet) -> None:
+    """Refuse a mesh for which all memory of this machine is too little, before Gmsh begins it."""
+    from halbach_fe import geo
+
+    kind = "cross_section" if magnet.dimension == 2 else "extruded"
+    elements = geo.fewest_triangles(magnet, boundary_radius(magnet, kind))
+    if magnet.dimension == 3:
+        elements *= 3 * (len(geo.layers(magnet)) - 1)
+    needed, there = elements * LEAST_BYTES[magnet.dimension], machine_memory()
+    if needed <= there:
+        return
+    times = max((body.radius for body in magnet.iron), default=0.0) / magnet.array.outer_radius_m
+    hint = "Enlarge mesh.block_size_m or mesh.growth."
+    if times > FAR_IRON:
+        hint = (f"The iron reaches {times:.0f} times as far out as the blocks: is it in another "
+                f"unit? If it is not, e{hint[1:]}")
+    raise MeshError(must_be(
+        "mesh", f"study {magnet.name}", f"small enough for the {there / 2**30:.0f} GiB of memory "
+        "of this machine", f"some {elements / 1e6:.3g} million elements, which need more than "
+        f"{needed / 2**30:.0f} GiB", hint))
 
 
 def meridian_size(magnet: Magnet) -> float:

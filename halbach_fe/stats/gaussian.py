@@ -14,6 +14,8 @@ import scipy.sparse as sparse
 from numpy.typing import DTypeLike, NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.numbers import check_number
 
 Numbers = TypeVar("Numbers", NDArray[np.float64], NDArray[np.complex128])
 
@@ -132,7 +134,19 @@ class Gaussian:
                        else _row_square_sums(matrix @ self.root))
 
     def sample(self, count: int, generator: np.random.Generator) -> Floats:
-        """Draw ``count`` samples, shape (count, m)."""
+        """Draw ``count`` samples, shape (count, m), by a generator such as
+        ``numpy.random.default_rng(1)``.
+
+        Raises
+        ------
+        StudyError
+            If they are none.
+        """
+        check_number("count", "sample", count, 0, whole=True)
+        if not isinstance(generator, np.random.Generator):
+            raise StudyError(must_be("generator", "sample", "a random generator",
+                                     f"a {type(generator).__name__}",
+                                     "Give numpy.random.default_rng(1)."))
         draws = generator.standard_normal((count, self.root.shape[1]))
         return self.mean + np.asarray(self.root @ draws.T).T
 

@@ -9,20 +9,29 @@ import difflib
 import tomllib
 import types
 import typing
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.iron import TableCurve
 from halbach_fe.study.model import Study, iron_of
+
+LARGE_TURN_RAD, OFF_STEP = 0.3, 0.05
+"""Angle above which no mapper is turned by mistake, and the distance, in steps of 15 degrees, from
+the next one beyond which it is not turned on purpose."""
+
+LARGE_BLOCK_M = 1.0
+"""Size of no block of a magnet: it would weigh some tons."""
 
 
 @typed
@@ -84,7 +93,27 @@ def read_study(path: str | Path) -> Study:
                     else "Correct that line.")
         ) from None
     document = with_free_blocks(document, path.parent, where)
-    return _with_table(parse_study(document, where), path.parent, where)
+    study = _with_table(parse_study(document, where), path.parent, where)
+    for doubt in _doubted_units(study):
+        warnings.warn(f"{where[0].upper()}{where[1:]}: {doubt}", HalbachWarning, stacklevel=3)
+    return study
+
+
+def _doubted_units(study: Study) -> list[str]:
+    """Return sentences about numbers that are possible, but rather in another unit."""
+    found = []
+    for instrument in (study.instrument, *(one.instrument for one in study.maps)):
+        for turn in instrument.rotation_rad if instrument else ():
+            steps = turn / (np.pi / 12)  # on purpose mappers are turned by some 15 degrees
+            by_hand = round(turn, 2) == turn  # what halbach-fe register finds has more digits
+            if by_hand and abs(turn) > LARGE_TURN_RAD and abs(steps - round(steps)) > OFF_STEP:
+                found.append(f"`instrument.rotation_rad` turns the map by {np.degrees(turn):.0f}°. "
+                             f"Were degrees meant? Then write {np.radians(turn):.3g} for "
+                             f"{turn:.4g}.")
+    thick = study.array.outer_radius_m - study.array.inner_radius_m
+    if study.array.rings and thick > LARGE_BLOCK_M:
+        found.append(f"its blocks are {thick:.3g} m thick. Were other units than metres meant?")
+    return found
 
 
 def parse_study(document: dict[str, Any], where: str = "study") -> Study:

@@ -92,6 +92,36 @@ def test_what_waits_is_not_begun_after_an_interrupt(tmp_path):
     assert not psutil.wait_procs(children, timeout=30)[1]
 
 
+STUCK = """
+import ctypes, sys
+from halbach_fe.cli import guard
+guard.PATIENCE_S = float(sys.argv[1])
+def run():
+    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)
+    lock(mutex)
+    print("locked", flush=True)
+    lock(mutex)  # never returns, whatever signal comes
+sys.exit(guard.guarded(run))
+"""
+
+
+@pytest.mark.parametrize("patience_s", [0.3, 100.0])
+def test_a_library_that_does_not_return_is_ended(tmp_path, patience_s):
+    """Gmsh meshes for minutes without looking at signals; with long patience, the control."""
+    script = tmp_path / "stuck.py"
+    script.write_text(STUCK)
+    process = subprocess.Popen([sys.executable, str(script), str(patience_s)], text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout.readline() == "locked\n"
+    process.send_signal(signal.SIGTERM)
+    if patience_s > 1:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=0.6)
+        process.kill()
+    said = process.communicate(timeout=30)[1].strip()
+    assert (process.returncode, said) == ((130, "interrupted") if patience_s < 1 else (-9, ""))
+
+
 def test_errors_travel_between_processes():
     for one in (NotConvergedError("no", (1.0, 2.0)), GetDPError("no"), StudyError("no")):
         there = pickle.loads(pickle.dumps(one))

@@ -7,6 +7,7 @@ blocks have mu_r = 1, so that M is the moment over the volume.
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 
 import magpylib
@@ -16,15 +17,19 @@ import pytest
 import scipy.stats as stats
 import xarray as xr
 
+from halbach_fe.api import tolerance
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
+from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, shared_doubts
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report.inference_answer import answer as inference_answer
 from halbach_fe.report.page import write_files
 from halbach_fe.report.prior import answer, page
+from halbach_fe.report.tolerance import answer as tolerance_answer
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors
 from halbach_fe.solver.ring_harmonics_2d import (
     SectorMagnetization,
@@ -39,6 +44,7 @@ from halbach_fe.stats.small_samples import (
 )
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic import bodies
+from halbach_fe.synthetic.magpylib_field import vacuum_field
 from tests.oracles.lone_block import moment_matrix
 
 VOLUME = np.pi * (0.1865**2 - 0.104**2) / 16 * 0.08
@@ -236,6 +242,48 @@ def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, 
     with pytest.warns(HalbachWarning, match=r"known to \d+ % only, where the study alone states "):
         assert "Not yet" in answer(prior(truth, sigma=moments / 2)).trust
     assert prior(1.3 * truth, vacuum_dipole(prior__common_mode_sd=0.2)).doubts == ()
+
+
+def test_a_block_far_from_the_others_is_named(vacuum_dipole, generator):
+    """One 30 % stronger, or turned by 12 degrees; blocks as they are made are the control."""
+    study = vacuum_dipole(prior__magnitude_sd=0.01, prior__direction_sd_deg=1.0)
+    slots, rings, _ = blocks_and_truth(study, generator)
+    nominal = np.array([block.magnetization for block in build_magnet(study).blocks])
+    drawn = nominal * (1 + 0.01 * generator.standard_normal((len(nominal), 1)))
+
+    def found(vectors):
+        return prior_from_blocks(build_magnet(study), table_of(study, slots, vectors, rings))
+
+    assert found(drawn).far == ""
+    strong, turned = drawn.copy(), drawn.copy()
+    strong[4] *= 1.3
+    turned[6] = rotation_about_z(0.21) @ turned[6]
+    with pytest.warns(HalbachWarning, match="block B4 is (29|3.) % stronger: up to"):
+        assert "block B4 is" in answer(found(strong)).said
+    with pytest.warns(HalbachWarning, match="block B6 is turned by 1[23]°"):
+        found(turned)
+
+
+@pytest.mark.parametrize("factor", [1.3, 1.0])
+def test_a_doubted_table_is_no_prior_without_a_word(vacuum_dipole, generator, factor):
+    """Beside a map of such a magnet `infer` agrees with itself, and with any other it does not."""
+    study = vacuum_dipole(noise={"regions": [{"name": "all", "sigma_T": 1e-4}]})
+    magnet = build_magnet(study)
+    slots, rings, truth = blocks_and_truth(study, generator, spread=0.002)
+    points = generator.uniform(-0.04, 0.04, (30, 3))
+    nominal = vacuum_field(bodies.magnet_of(study).bodies, points)
+    table = table_of(study, slots, factor * truth, rings)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HalbachWarning)
+        alike, other = (infer(magnet, field_map(points, of * nominal), blocks=table)
+                        for of in (factor, 1.5))
+        drawn = tolerance(magnet, blocks=table, draws=100)
+    verdicts = [inference_answer(alike), inference_answer(other), tolerance_answer(drawn)]
+    said = ["on average 30 % stronger" in each.trust for each in verdicts]
+    assert said == [factor > 1] * 3
+    assert [each.trust[:4] for each in verdicts] == (
+        ["Only", "No. ", "Not "] if factor > 1 else ["Yes.", "No. ", "Yes,"])
+    assert [each.sound for each in verdicts] == [factor == 1, False, factor == 1]
 
 
 def test_a_table_with_a_common_uncertainty_is_not_doubted(vacuum_dipole, generator):
@@ -608,7 +656,8 @@ def test_samples_that_are_not_normal_are_said(vacuum_dipole, generator, tmp_path
         assert stored["parameter"].values[0] == "r01s01.Mx"
     truth[slots.index(4)] *= 0.85  # one block that was partly demagnetized
     table = table_of(study, slots, truth)
-    with pytest.warns(HalbachWarning, match="type 4 do not look normally"):
+    with (pytest.warns(HalbachWarning, match="block B3 is 14 % weaker"),
+          pytest.warns(HalbachWarning, match="type 4 do not look normally")):
         write_files(page(magnet, prior_from_blocks(magnet, table)), tmp_path)
     assert "Only as mean and spread" in (tmp_path / "prior.html").read_text()
     summary = json.loads((tmp_path / "prior.json").read_text())

@@ -170,6 +170,12 @@ def test_sensors_that_a_map_does_not_have_are_not_in_its_table(magnet, generator
                    for name in ("of By", "of Bz", "the By", "the Bz", "By sees", "Bz sees"))
 
 
+def test_a_map_in_mm_is_refused_before_the_search(magnet, generator, tmp_path):
+    in_mm = field_map(1e3 * GRID, generator.standard_normal(GRID.shape))
+    with pytest.raises(MeasurementError, match=r"Are they in millimetres\? Then set instrument"):
+        register(magnet, in_mm, Session.open(tmp_path))
+
+
 def test_a_mirrored_magnet_is_refused(magnet, generator, tmp_path):
     """A dipole whose field turns by 30 degrees along z is not its mirror image.
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.stray_field import stray_figure
+from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.stray_field import NEAREST, stray_field
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
@@ -106,6 +108,17 @@ def test_a_lone_cube_far_from_the_axis(tmp_path):
     aside = (1e-7 * moment / 5e-4)**(1 / 3) * float(np.max(
         (1 + 3 * np.cos(angle)**2)**(1 / 6) * np.sin(angle)))
     assert stray.radial.distance_m == pytest.approx(0.1 + aside, rel=2e-3)
+
+
+@pytest.mark.parametrize("count", [-1, 1])
+def test_a_posterior_of_other_blocks_is_refused(magnet, count):
+    """Zeros for as many parameters, or for a block more or less; without, the control."""
+    size = len(magnet.parameter_names)
+    assert stray_field(magnet, magnetizations=Gaussian(np.zeros(size), np.eye(size))).radial is None
+    size += 3 * count
+    for question in (stray_field, magnetic_axis):
+        with pytest.raises(MeasurementError, match=r"Is it that of another magnet\?"):
+            question(magnet, NOT_KEPT, Gaussian(np.zeros(size), np.eye(size)))
 
 
 def test_the_pictures_show_the_field(tmp_path, magnet):

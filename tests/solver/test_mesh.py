@@ -54,6 +54,22 @@ def test_shipped_studies_mesh_to_their_volumes(tmp_path, name, larger):
         assert found[region.tag] == pytest.approx(expected, rel=tolerance), region.name
 
 
+@pytest.mark.parametrize(("size_m", "radius_m"), [(0.05, 0.3), (0.001, 9.0)])
+def test_a_mesh_beyond_the_memory_is_refused(tmp_path, dipole, size_m, radius_m):
+    """Iron in other units than the blocks: Gmsh would mesh for hours. The near iron is the control.
+
+    The far one would need 3 TB.
+    """
+    magnet = build_magnet(dipole(mesh={"block_size_m": size_m, "growth": 2.0}, iron_ring={
+        "inner_radius_m": radius_m, "outer_radius_m": radius_m + 0.3,
+        "relative_permeability": 1000.0}))
+    if radius_m < 1:
+        assert build_mesh(magnet, tmp_path).mesh.exists()
+        return
+    with pytest.raises(MeshError, match=r"The iron reaches 50 times as far out as the blocks"):
+        build_mesh(magnet, tmp_path)
+
+
 def test_same_study_same_mesh(tmp_path, dipole, short_dipole):
     for study in (dipole(), short_dipole()):
         first = build_mesh(build_magnet(study), tmp_path / "a")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from halbach_fe.core.errors import StudyError
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.stats.linear_gaussian import contraction, posterior, predict, update, whitened
@@ -25,6 +26,16 @@ def problem(generator, n=12, m=5):
     prior = Gaussian(generator.standard_normal(m), root)
     matrix, sigma = generator.standard_normal((n, m)), generator.uniform(0.1, 0.5, n)
     return matrix, generator.standard_normal(n), independent_noise(sigma), prior
+
+
+@pytest.mark.parametrize(("count", "generator", "said"), [
+    (-1, np.random.default_rng(1), "at least 0"), (2.5, np.random.default_rng(1), "a whole number"),
+    (3, 1, "a random generator; instead received a int. Give numpy")])
+def test_samples_that_cannot_be_drawn(count, generator, said):
+    known = Gaussian(np.zeros(2), np.eye(2))
+    assert known.sample(3, np.random.default_rng(1)).shape == (3, 2)
+    with pytest.raises(StudyError, match=said):
+        known.sample(count, generator)
 
 
 def test_one_reading_of_one_parameter():

@@ -6,11 +6,12 @@ import contextlib
 import math
 
 import pytest
+import tomlkit
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from halbach_fe.core.errors import HalbachError, StudyError
+from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.iron import TableCurve
 from halbach_fe.study.materials import MU_0
@@ -416,3 +417,24 @@ def test_a_map_in_place_of_the_study(tmp_path):
         (tmp_path / name).write_text("x_m,y_m,z_m,Bx_T\n0,0,0,1\n")
         with pytest.raises(StudyError, match=said):
             read_study(tmp_path / name)
+
+
+@pytest.mark.parametrize(("turn", "asked"), [
+    ("2", "by 115°. Were degrees meant\\? Then write 0.0349 for 2."), ("0.5", "by 29°"),
+    ("1.57", ""), ("3.14", ""), ("0.7854", ""), ("0.2", ""), ("-1.2345", "")])
+def test_a_turn_in_degrees_is_asked_about(tmp_path, turn, asked):
+    """Right angles, and what `register` finds, are the controls."""
+    path = tmp_path / "study.toml"
+    path.write_text((ROOT / "studies/quadrupole/study.toml").read_text()
+                    + f"\n[instrument]\nrotation_rad = [0, 0, {turn}]\n")
+    with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
+        read_study(path)
+
+
+@pytest.mark.parametrize(("outer", "asked"), [("1.5", "its blocks are 1.4 m thick"), ("0.9", "")])
+def test_blocks_of_tons_are_asked_about(tmp_path, outer, asked):
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(changed(DIPOLE, array__inner_radius_m=0.1,
+                                          array__outer_radius_m=float(outer))))
+    with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
+        read_study(path)
