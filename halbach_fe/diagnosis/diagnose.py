@@ -52,7 +52,7 @@ from halbach_fe.diagnosis.map_errors import (
     possible_positions,
 )
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
-from halbach_fe.diagnosis.model_selection import Candidate, probabilities
+from halbach_fe.diagnosis.model_selection import EFFECT_PRIOR_ODDS, Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     PositionNoise,
@@ -294,10 +294,7 @@ def _diagnose(
         if number > 0 or judgement.is_clear or _has_converged(identified, found):
             found = named_effects(corrected, search, judgement, found)
         found = with_first_rivals(found, identified, rivals)
-        estimate = position_noise if judgement.fits else estimate_position_noise(
-            update, campaign, search.marginal,
-            np.hstack([search.columns, *judgement.whitened_terms()]), search.training,
-            position_noise)
+        estimate = vibration_beyond(judgement, update, campaign, search, position_noise)
         if not closing and not have_settled(position_noise, estimate):
             sizes = [f"{1e3 * noise.sd_m:.2g} mm{f' in map {noise.map}' if noise.map else ''}"
                      for noise in estimate]
@@ -386,6 +383,28 @@ def _diagnose(
         solver_error=solver_error, imitated=imitation, converged=converged, positions=positions,
         limits=limits, floor_T=floor_T, suspected=suspected,
         uncompared=search.uncompared if closing or search.uncompared else None)
+
+
+def vibration_beyond(
+    judgement: Judgement, update: InferenceResult, campaign: Campaign, search: Search,
+    current: tuple[PositionNoise, ...],
+) -> tuple[PositionNoise, ...]:
+    """Return the random errors of positions beyond what effects and terms of any shape explain.
+
+    Terms with nearly as many functions as there are points explain all errors of these. So
+    vibration in place of terms is compared with them by its evidence beside the same effects.
+    """
+    best = judgement.best
+    if not judgement.fits:
+        return estimate_position_noise(
+            update, campaign, search.marginal,
+            np.hstack([search.columns, *judgement.whitened_terms()]), search.training, current)
+    columns = [k for number in best.effects for k in search.candidates[number].columns]
+    found = estimate_position_noise(update, campaign, search.marginal, search.columns[:, columns],
+                                    search.training, current, smooth=False)
+    gain = sum(one.over_none + np.log(EFFECT_PRIOR_ODDS) for one in found)
+    terms = best.log_odds - judgement.competition.explanation(best.effects, ()).log_odds
+    return found if gain > terms else current
 
 
 def _place_of(outlier: Outlier) -> tuple[str | None, int, str]:

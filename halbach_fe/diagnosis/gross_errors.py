@@ -271,8 +271,10 @@ class _Search:
         None if the map has no gross error, or no error explains the misfit.
         """
         before = self.misfit(MapConvention())
-        if before.standard <= MIN_MISFIT or self.present < MIN_READINGS:
+        if self.present < MIN_READINGS:
             return None
+        if before.standard <= MIN_MISFIT:
+            return self.hidden_by_symmetry(before) if self.table else None
         if before.relative < MIN_MISFIT_OF_WRONG_UNIT:
             self.lengths = self.flux_densities = (1.0,)
         combined = before.relative > MIN_MISFIT_OF_SEVERAL_ERRORS
@@ -301,6 +303,25 @@ class _Search:
                     each for _, each in others]), before.relative,
                     self.misfit(convention).relative)
         return None
+
+    def hidden_by_symmetry(self, nominal: _Misfit) -> GrossError | None:
+        """Return the single error that changes nothing in the nominal magnet, but in the measured
+        blocks, such as a reversed z axis. None if no error explains more than that there is none.
+
+        Other causes are the same in both, so that they do not seem to be such an error: it must
+        leave a third of what disagrees with the measured blocks.
+        """
+        self.lengths = self.flux_densities = (1.0,)
+        before = self.misfit(MapConvention(), measured_blocks=True)
+        good = [(misfit, each) for each in self.conventions(1)
+                if self.misfit(each).standard <= INDISTINGUISHABLE_MISFIT_RATIO * nominal.standard
+                and self.explains(before, misfit := self.misfit(each, measured_blocks=True), each)]
+        if not good:
+            return None
+        (after, convention), *others = sorted(
+            _best(good), key=lambda trial: (rank(trial[1]), trial[0].standard))
+        return GrossError(convention, self.distinct(convention, [each for _, each in others]),
+                          before.relative, after.relative)
 
     def beside_a_wrong_block(
         self, before: _Misfit, tried: Sequence[tuple[_Misfit, MapConvention]]

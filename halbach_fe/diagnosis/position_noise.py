@@ -71,16 +71,19 @@ class PositionNoise:
         The likeliest standard deviation of a position along each axis.
     map : str or None
         Name of the map among those that the study lists; None if it lists none.
+    over_none : float
+        Log Bayes factor over no such errors, with noise of the stated size.
     """
 
     log_bayes_factor: float
     sd_m: float
     map: str | None = None
+    over_none: float = 0.0
 
 
 def estimate_position_noise(
     update: InferenceResult, campaign: Campaign, marginal: Marginal, columns: Floats,
-    residual: Floats, current: Sequence[PositionNoise],
+    residual: Floats, current: Sequence[PositionNoise], smooth: bool = True,
 ) -> tuple[PositionNoise, ...]:
     """Estimate the position noise of each map from its training readings.
 
@@ -96,6 +99,8 @@ def estimate_position_noise(
         Whitened training readings less their prior prediction.
     current : sequence of PositionNoise
         The position noise that the study of ``update`` already has.
+    smooth : bool
+        Whether smooth fields and errors of the sensors may explain part of the readings.
 
     Returns
     -------
@@ -113,14 +118,14 @@ def estimate_position_noise(
             noise = _of_map(update, one, points[one.rows], own,
                             marginal if len(own) == len(residual) else Marginal.of(
                                 marginal.whitened[own]),
-                            columns[own], residual[own], known.get(name))
+                            columns[own], residual[own], known.get(name), smooth)
             found += [] if noise is None else [replace(noise, map=name)]
     return tuple(found)
 
 
 def _of_map(
     update: InferenceResult, scanned: ScannedMap, points: Floats, own: Ints, marginal: Marginal,
-    columns: Floats, residual: Floats, current: PositionNoise | None,
+    columns: Floats, residual: Floats, current: PositionNoise | None, with_smooth: bool,
 ) -> PositionNoise | None:
     """Estimate the position noise of a map; None if there is no evidence of it.
 
@@ -132,7 +137,7 @@ def _of_map(
         The map's points in the magnet.
     own : ndarray of int, shape (rows,)
         Numbers of the map's readings among all training readings.
-    marginal, columns, residual, current
+    marginal, columns, residual, current, with_smooth
         See `estimate_position_noise`, for these readings only.
     """
     count = len(residual)
@@ -150,7 +155,8 @@ def _of_map(
     magnet = update.noise_magnet.with_study(scanned.study_of(update.study))
     moved = noise.whitening @ readings_per_displacement(magnet, analysis, points, np.ones(3))
     scale, smooth = SMOOTH_SCALE * float(np.median(noise.sd)), []
-    for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)):
+    for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)) if (
+            with_smooth) else ():
         readings = scale * (analysis @ terms.fields.reshape(len(terms.fields), -1).T)
         smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAY_RATES[0])))
     nuisance = np.hstack([marginal.whitened, EFFECT_SCALE * columns, *smooth])
@@ -223,7 +229,7 @@ def compare_noise_models(
 
     log_evidences = np.array([log_evidence(sd) for sd in CANDIDATE_SDS_M])
     mean = float(special.logsumexp(log_evidences) - np.log(len(log_evidences)))
-    factor = mean - log_evidence(0.0)
+    over_none = factor = mean - log_evidence(0.0)
     if factor > DETECTION_LOG_ODDS:
         larger = best(partial(log_evidence, 0.0), 1.0, MAX_NOISE_FACTOR)
         factor = min(factor, mean - log_evidence(0.0, larger))
@@ -231,7 +237,7 @@ def compare_noise_models(
         return PositionNoise(factor, 0.0)
     top = int(np.argmax(log_evidences))
     near = CANDIDATE_SDS_M[[max(top - 1, 0), min(top + 1, len(log_evidences) - 1)]]
-    return PositionNoise(factor, best(log_evidence, *near.tolist()))
+    return PositionNoise(factor, best(log_evidence, *near.tolist()), over_none=over_none)
 
 
 def _compressed(root: Floats) -> Floats:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import magpylib
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
@@ -44,6 +47,21 @@ def field(study: Study, polarizations: np.ndarray, points: np.ndarray) -> np.nda
         cuboid.polarization = cuboid.orientation.inv().apply(polarization)
         total += cuboid.getB(points)
     return total
+
+
+def table_of(study: Study, polarizations: np.ndarray, generator: np.random.Generator) -> BlockTable:
+    """The blocks (n, 3) in T as a coil would have measured them, each to 0.1 %."""
+    blocks = build_magnet(study).blocks
+    volume, count, ones = blocks[0].volume, len(blocks), np.ones(len(blocks))
+    moments = volume / MU_0 * np.array([
+        Rotation.from_euler("z", -block.angle_deg, degrees=True).apply(polarization)
+        for block, polarization in zip(blocks, polarizations, strict=True)])
+    sd = 1e-3 * np.linalg.norm(moments, axis=1)
+    return BlockTable(
+        tuple(map(str, range(count))), ("",) * count, np.array([block.ring for block in blocks]),
+        np.array([block.slot for block in blocks]),
+        moments + sd[:, None] * generator.standard_normal(moments.shape), sd, volume * ones,
+        np.nan * ones)
 
 
 def measured(study, generator, points=CIRCLES, at=None):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
@@ -22,11 +21,9 @@ from halbach_fe.diagnosis.search import possible
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_delivery
 from tests.diagnosis.campaign import (
@@ -37,6 +34,7 @@ from tests.diagnosis.campaign import (
     drawn,
     field,
     measured,
+    table_of,
     with_array,
 )
 
@@ -168,17 +166,7 @@ def test_whole_blocks_beside_a_wrong_calibration_of_the_coil(session, generator,
     effect of that block would explain it better.
     """
     blocks, polarizations = build_magnet(STUDY).blocks, drawn(STUDY, generator)
-    volume, number = blocks[0].volume, 16
-    moments = 1.015 * volume / MU_0 * np.array([
-        Rotation.from_euler("z", -block.angle_deg, degrees=True).apply(polarization)
-        for block, polarization in zip(blocks, polarizations, strict=True)])
-    sd = 1e-3 * np.linalg.norm(moments, axis=1)
-    count, ones = len(blocks), np.ones(len(blocks))
-    table = BlockTable(
-        tuple(map(str, range(count))), ("",) * count, np.array([block.ring for block in blocks]),
-        np.array([block.slot for block in blocks]),
-        moments + sd[:, None] * generator.standard_normal(moments.shape), sd, volume * ones,
-        np.nan * ones)
+    number, table = 16, table_of(STUDY, 1.015 * polarizations, generator)
     built = polarizations.copy()
     if name == "blocks_swapped":  # on opposite sides of a ring
         opposite = number + 6 if number % 12 < 6 else number - 6

@@ -15,7 +15,7 @@ from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
-from tests.diagnosis.campaign import CIRCLES, STUDY, measured, with_array
+from tests.diagnosis.campaign import CIRCLES, STUDY, drawn, field, measured, table_of, with_array
 
 NONE = np.eye(3)
 
@@ -78,6 +78,20 @@ def test_a_map_that_is_written_wrongly(case, right):
         np.testing.assert_allclose(points_of(read) * [factor, factor, 1], points_of(right),
                                    atol=2e-3)  # a radius to 2 %, by a field that is off by 1 %
         np.testing.assert_allclose(read["B_T"], right["B_T"], atol=1e-12)
+
+
+@pytest.mark.parametrize("case", ["reversed_z", "right", "displaced", "without a table"])
+def test_an_error_that_only_measured_blocks_show(case, generator):
+    """Of Bx and By alone the two ends of this magnet are alike, but for its blocks. A map that is
+    displaced by as much as usual is none.
+    """
+    built = drawn(STUDY, generator)
+    at = CIRCLES * [1, 1, 1 if case in ("right", "displaced") else -1]
+    true = field(STUDY, built, at + np.array([0.0, 0.0, 1e-3]) * (case == "displaced"))
+    data = field_map(CIRCLES, np.where([True, True, False], true, np.nan))
+    table = None if case == "without a table" else table_of(STUDY, built, generator)
+    found = [error.names for error in find_gross_errors(STUDY, data, table)]
+    assert found == ([("reversed_z",)] if case == "reversed_z" else [])
 
 
 @pytest.mark.parametrize(("case", "keys"), {

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 
+from halbach_fe.diagnosis.diagnose import vibration_beyond
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.outliers import Outlier, excluding, find_outliers, outliers_of
 from halbach_fe.diagnosis.position_noise import (
@@ -184,6 +185,29 @@ def test_vibration(added, root, gradient, clean, generator):
         assert found.log_bayes_factor > 50
     else:
         assert found == ()
+
+
+@pytest.mark.parametrize("gain", [1e2, 1e6])
+def test_vibration_in_place_of_terms_of_any_shape(gain, root, gradient, clean, generator):
+    """Terms with as many functions as there are points explain vibration as well. It is named if
+    its evidence is larger than theirs: here 500 or so, of 168 readings.
+    """
+    shift = SHAKEN_M * generator.standard_normal((len(POINTS), 3))
+    residual = clean + np.einsum("ncj,nj->nc", gradient, shift).ravel()
+    some = np.arange(len(POINTS)) % 24 == 0
+    rows = np.repeat(some, 3)
+    search = SimpleNamespace(marginal=Marginal.of(root[rows] / NOISE_T), candidates=(),
+                             columns=np.zeros((rows.sum(), 0)), training=residual[rows] / NOISE_T)
+    judgement = SimpleNamespace(
+        fits=True, best=SimpleNamespace(effects=(), log_odds=gain),
+        competition=SimpleNamespace(explanation=lambda *of: SimpleNamespace(log_odds=0.0)))
+    found = vibration_beyond(judgement, update_of(residual[rows], root[rows], POINTS[some]),
+                             campaign_of(POINTS[some]), search, ())
+    if gain > 1e3:
+        assert found == ()
+    else:  # 56 points along three axes, of which the blocks take a part: 4 sd
+        assert found[0].sd_m == pytest.approx(SHAKEN_M, rel=0.3)
+        assert gain < found[0].over_none < 1e6
 
 
 def test_a_study_with_vibration():
