@@ -148,6 +148,10 @@ class FieldOnLines:
         return -0.5 * first, -0.5 * second
 
 
+OF_LINES = "--from-m and --to-m"
+"""What places the points, for messages."""
+
+
 def field_on_lines(
     magnet: Magnet, lines: Lines, magnetizations: Gaussian, session: Session,
     inside: bool = False
@@ -180,6 +184,7 @@ def field_on_lines(
         offset, matrix = _closed_form(magnet, points, number, count)
         error = np.zeros(offset.shape)
     else:
+        check_points(magnet, points, OF_LINES)
         model = response_matrix(magnet, flux_density_at(points), session)
         offset, matrix, error = (values.reshape(len(points), 3, *values.shape[1:]) for values in (
             model.offset, model.whole, model.error))
@@ -224,7 +229,7 @@ def _closed_form(
             "the points out."))
     outside = number < 0
     points = points.copy()
-    points[outside] = check_points(magnet, points[outside])
+    points[outside] = check_points(magnet, points[outside], OF_LINES)
     matrix = np.empty((len(points), 3, count))
     for block, field in enumerate(unit_fields(magnet.blocks, points)):
         field[number == block] += np.eye(3)  # B = mu_0 H + J

@@ -113,7 +113,7 @@ def test_what_is_refused():
         solved(lines, inside=True, permeability=1.05)
     edge = Lines(np.array([0.01, 0.04, -0.02]), np.array([0.01, 0.04, 0.02]),
                  (np.zeros(1), np.zeros(1)), 5)
-    with pytest.raises(StudyError, match="edge"):
+    with pytest.raises(StudyError, match=r"`--from-m and --to-m` of .* on an edge"):
         solved(edge, inside=True)
 
 
