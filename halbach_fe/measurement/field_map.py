@@ -228,6 +228,7 @@ def points_of(data: xr.Dataset) -> Floats:
     return np.column_stack([data[name].values for name in POSITION_COLUMNS])
 
 
+@typed
 def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 

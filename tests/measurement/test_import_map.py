@@ -8,7 +8,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.measurement.field_map import (
+    check_magnitudes,
+    field_map,
+    points_of,
+    read_map,
+    write_map,
+)
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import export_map, format_of, import_map
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
@@ -443,6 +449,7 @@ def test_what_is_advised_for_another_unit_can_be_followed(tmp_path, unit, factor
         ",".join([*cells[:3], *(repr(factor * float(cell)) for cell in cells[3:])])
         for cells in (row.split(",") for row in rows[head + 1:] if row)]
     with pytest.raises(MeasurementError, match=rf"name the columns Bx_{unit}, .* and convert"):
-        imported(tmp_path, "\n".join(rows))
+        path.write_text("\n".join(rows))
+        check_magnitudes(read_map(path))
     rows[head] = rows[head].replace("_T", f"_{unit}")
     assert same(imported(tmp_path, "\n".join(rows)))
