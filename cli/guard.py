@@ -80,11 +80,12 @@ def guarded(run: Callable[[], int]) -> int:
                 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
                 if signal.getsignal(number) is not signal.SIG_IGN}
     try:
-        with warnings.catch_warnings(), _ended_in_time(set(previous)):
+        with warnings.catch_warnings():
             warnings.simplefilter("once", HalbachWarning)
             warnings.showwarning = lambda message, *_: say(f"warning: {message}")
-            claim_buffers()
-            return run()
+            claim_buffers()  # before there is a thread, which takes memory for its own
+            with _ended_in_time(set(previous)):
+                return run()
     except (Exception, KeyboardInterrupt) as error:
         if received:  # libraries that are interrupted may raise errors of their own
             say("interrupted")

@@ -131,8 +131,8 @@ def doubts_in_words(found: Sequence[Term]) -> str:
         return ""
     more = len(found) - MOST_NAMED
     named = "; ".join(one.in_words for one in found[:MOST_NAMED])
-    return ("For that these would have to be changed far beyond what was known before: "
-            f"{named}{f'; and {more} more' if more > 0 else ''}.")
+    return ("To agree with the readings, these would have to be changed far beyond what was known "
+            f"before: {named}{f'; and {more} more' if more > 0 else ''}.")
 
 
 def shared_in_words(found: Sequence[Term], cross_section: bool) -> str:

@@ -228,6 +228,7 @@ def points_of(data: xr.Dataset) -> Floats:
     return np.column_stack([data[name].values for name in POSITION_COLUMNS])
 
 
+@typed
 def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 
@@ -622,21 +623,23 @@ def check_magnitudes(data: xr.Dataset) -> None:
         raise MeasurementError(must_be(
             "positions", where, f"within {10 * MAX_LENGTH_M:g} m", f"{farthest:g}",
             "Are they in millimetres? Then set instrument.length_unit_m = 0.001 in the study, or "
-            "convert the map by halbach-fe import-map."))
+            "name the columns x_mm, y_mm, z_mm and convert the map by halbach-fe import-map."))
     values, sigmas = data["B_T"].values, data.get("sigma_T")
     if is_total_field(data):
         values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
     by_component = np.nan_to_num(np.abs(values)).max(axis=0).reshape(-1)
     largest = float(by_component.max())
     if largest > MAX_FIELD_T:
-        unit, factor = ("gauss", 1e-4) if largest > 2000 else ("millitesla", 1e-3)
+        unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
+                               ("millitesla", "mT", 1e-3))
         beyond = by_component > MAX_FIELD_T
         some = "" if (beyond | (by_component == 0)).all() else " and ".join(
             column for column, wrong in zip(FIELD_COLUMNS, beyond, strict=True) if wrong)
         raise MeasurementError(must_be(
             some or "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
-            "study, or convert the map by halbach-fe import-map." + (
+            f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
+            "halbach-fe import-map." + (
                 f" If only {some} is in {unit}, multiply this column of the file by {factor:g}."
                 if some else "")))
     elif TOTAL_COLUMN in data:

@@ -34,7 +34,7 @@ from halbach_fe.report.page import (
     linearized,
     page_of,
 )
-from halbach_fe.report.words import ppm, share_in_words, whole
+from halbach_fe.report.words import decimals, ppm, share_in_words, whole
 from halbach_fe.response.multipoles import plain
 from halbach_fe.study.inference import Prior
 from halbach_fe.study.model import Study
@@ -103,13 +103,13 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     largest = found.sizes.max(axis=1)
     half, most = np.quantile(largest, (0.5, 0.95))
     worst = found.model.orders[int(np.argmax(found.quantiles[1]))]
-    said = (f"Half of the magnets have all unwanted multipoles below {half:.3g} units of 1e-4, "
-            f"95 % below {most:.3g}; the largest is mostly that of order {worst}.")
+    said = (f"Half of the magnets have all unwanted multipoles below {decimals(half)} units of "
+            f"1e-4, 95 % below {decimals(most)}; the largest is mostly that of order {worst}.")
     ordered = float(found.known.sizes.max())
     if ordered > OF_THE_DESIGN * half:
         made = _made_by_tolerances(found)
         said = (f"{made}{said[0].lower() if made else said[0]}{said[1:]} That is the magnet as "
-                f"designed ({ordered:.3g} units with blocks as ordered), to which their "
+                f"designed ({decimals(ordered)} units with blocks as ordered), to which their "
                 "tolerances add little.")
     share = found.share
     if share is not None:
@@ -118,13 +118,21 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     question = "Which multipoles do the tolerances of the blocks make?"
     if lacks_main(found.known):
         return of_no_main(question, said, "Not in these units", "tolerance STUDY")
-    step = (("Measure the blocks before assembly, and see what sorting them into the slots that "
-             "they fit gains.",
-             "halbach-fe sort STUDY BLOCKS -o DIR") if share is None or share < ENOUGH else
+    step = (_sorting(found) if found.table_doubts or share is None or share < ENOUGH else
             ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR"))
     return Answer(question, said, f"{_trust(found)} {whole(len(found.sizes))} magnets were drawn.",
                   *step, sound=not found.table_doubts)
+
+
+def _sorting(found: Tolerance | HomogeneityTolerance) -> tuple[str, str]:
+    """Return the next step, and its command, if the blocks make a part of the errors."""
+    if found.table_doubts:
+        return ("Answer what is asked of the table of blocks, correct it or the study, and ask "
+                "again.", "halbach-fe tolerance STUDY --blocks BLOCKS -o DIR")
+    measure = "Measure the blocks before assembly, and see" if found.table_doubts is None else "See"
+    return (f"{measure} what sorting them into the slots that they fit gains.",
+            "halbach-fe sort STUDY BLOCKS -o DIR")
 
 
 def _trust(found: Tolerance | HomogeneityTolerance) -> str:
@@ -146,8 +154,8 @@ def _made_by_tolerances(found: Tolerance) -> str:
         return ""
     number = int(np.argmax(np.where(own, half, 0.0)))
     return ("The largest multipole that only the tolerances make is "
-            f"c_{found.model.orders[number]}: below {half[number]:.3g} units in half of the "
-            f"magnets, below {most[number]:.3g} in 95 %. With what the design makes: ")
+            f"c_{found.model.orders[number]}: below {decimals(half[number])} units in half of the "
+            f"magnets, below {decimals(most[number])} in 95 %. With what the design makes: ")
 
 
 @page_of.register
@@ -285,10 +293,9 @@ def _homogeneity_answer(found: HomogeneityTolerance) -> Answer:
              "blocks can use their errors against it, but takes only a part of it away.",
              "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
              "halbach-fe sort STUDY BLOCKS -o DIR")
-            if found.ordered.rms_ppm > OF_THE_DESIGN * half else
-            ("Measure the blocks before assembly, and see what sorting them into the slots that "
-             "they fit gains.",
-             "halbach-fe sort STUDY BLOCKS -o DIR"))
+            if found.ordered.rms_ppm > OF_THE_DESIGN * half else _sorting(found))
+    if found.table_doubts:
+        step = _sorting(found)
     text, small = solver_error_text(found.model, half)
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,

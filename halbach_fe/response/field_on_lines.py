@@ -162,6 +162,10 @@ class FieldOnLines:
                 (second[..., 0], np.linalg.norm(second[..., 1:], axis=2)))
 
 
+OF_LINES = "--from-m and --to-m"
+"""What places the points, for messages."""
+
+
 def field_on_lines(
     magnet: Magnet, lines: Lines, magnetizations: Gaussian, session: Session,
     inside: bool = False
@@ -193,6 +197,7 @@ def field_on_lines(
         mean, root, error, polarization = _through_blocks(
             magnet, points, number, magnetizations, session)
     else:
+        check_points(magnet, points, OF_LINES)
         model = response_matrix(magnet, flux_density_at(points), session)
         mean = model.offset + model.whole @ magnetizations.mean
         root, error = model.whole @ magnetizations.root, model.error
@@ -235,6 +240,7 @@ def _through_blocks(
             "another magnet", "Leave the points out, or the key that says so of the magnet."))
     outside = number < 0
     points = points.copy()
+<<<<<<< HEAD
     points[outside] = check_points(magnet, points[outside])
     strength, error = external_field(magnet, points) + field_of(blocks, points), 0 * points
     if not magnet.is_vacuum:
@@ -288,3 +294,11 @@ def _reaction(
         field[here] = strength - field_of(magnet.blocks, points[here])
         error[here] = bar + (solved.iron.error(points[here]) if solved.iron is not None else 0.0)
     return field, error
+=======
+    points[outside] = check_points(magnet, points[outside], OF_LINES)
+    matrix = np.empty((len(points), 3, count))
+    for block, field in enumerate(unit_fields(magnet.blocks, points)):
+        field[number == block] += np.eye(3)  # B = mu_0 H + J
+        matrix[:, :, 3 * block:3 * block + 3] = MU_0 * field
+    return external_field(magnet, points), matrix
+>>>>>>> use44

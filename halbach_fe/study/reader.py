@@ -6,6 +6,7 @@ Every error message is one sentence that names the file, the key, and what to do
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 import types
 import typing
@@ -18,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
+from halbach_fe.core.errors import MAX_QUOTED, HalbachWarning, StudyError, must_be, printable
 from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
@@ -90,13 +91,24 @@ def read_study(path: str | Path) -> Study:
         raise StudyError(
             must_be("syntax", where, "complete TOML", f"'{error}'", "Is it a map or a table of "
                     "blocks? Commands take the study file first." if path.suffix == ".csv"
-                    else "Correct that line.")
+                    else _syntax_hint(text, str(error)))
         ) from None
     document = with_free_blocks(document, path.parent, where)
     study = _with_table(parse_study(document, where), path.parent, where)
     for doubt in _doubted_units(study):
         warnings.warn(f"{where[0].upper()}{where[1:]}: {doubt}", HalbachWarning, stacklevel=3)
     return study
+
+
+def _syntax_hint(text: str, error: str) -> str:
+    """Return what to do about a line that TOML does not allow."""
+    place = re.search(r"at line (\d+), column", error)
+    line = text.split("\n")[int(place[1]) - 1] if place else ""
+    if re.search(r"=\s*-?\d+,\d", line):
+        return f"Write decimals with a point in “{printable(line.strip(), MAX_QUOTED)}”."
+    if "twice" in error:
+        return "Join the two tables or keys into one."
+    return "Correct that line."
 
 
 def _doubted_units(study: Study) -> list[str]:

@@ -284,6 +284,7 @@ def test_a_doubted_table_is_no_prior_without_a_word(vacuum_dipole, generator, fa
     assert [each.trust[:4] for each in verdicts] == (
         ["Only", "No. ", "Not "] if factor > 1 else ["Yes.", "No. ", "Yes,"])
     assert [each.sound for each in verdicts] == [factor == 1, False, factor == 1]
+    assert verdicts[2].step.startswith("Answer" if factor > 1 else "See what sorting")
 
 
 def test_a_table_with_a_common_uncertainty_is_not_doubted(vacuum_dipole, generator):

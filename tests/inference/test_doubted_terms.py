@@ -145,6 +145,7 @@ def test_the_law_doubts_one_of_500_fits(generator):
     assert doubts([some], 2000) == ()
     assert doubts([replace(far, prior_sd=0.0)]) == ()  # not free
     said = doubts_in_words([far])
+    assert said.startswith("To agree with the readings, these")  # it may stand alone
     assert "offset of Bz by \u221220\u00a0mT, where ±\u00a01\u00a0mT was known before" in said
     assert "(20 standard deviations)" in said
     assert doubts_in_words([]) == ""

@@ -77,6 +77,9 @@ def test_all_that_is_missing_in_one_message(tmp_path):
     with pytest.raises(MeasurementError, match="a number"):
         imported(tmp_path, "id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;1;x;0;0\n",
                  fixed={"sigma": "0.1 %"})
+    with pytest.raises(MeasurementError, match="add --decimal-comma"):
+        imported(tmp_path, "id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;1;0,5;0;0\n",
+                 fixed={"sigma": "0.1 %"})
 
 
 FREE = ("Name;Shape;xc [mm];yc [mm];zc [mm];Rot x (deg);Rot y (deg);Rot z (deg);dx [mm];dy [mm];"

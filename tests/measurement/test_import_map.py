@@ -8,7 +8,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement.field_map import points_of, read_map, write_map
+from halbach_fe.measurement.field_map import (
+    check_magnitudes,
+    field_map,
+    points_of,
+    read_map,
+    write_map,
+)
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import export_map, format_of, import_map
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
@@ -430,3 +436,20 @@ def test_the_structure_tells_the_format(tmp_path):
     found = imported(tmp_path, SEEDS[4])
     export_map(found.data, "geant4", tmp_path / "map.TABLE")
     assert format_of((tmp_path / "map.TABLE").read_bytes(), DEFAULTS, "map") == "opera"
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mT", 1e3), ("G", 1e4)])
+def test_what_is_advised_for_another_unit_can_be_followed(tmp_path, unit, factor):
+    """The names of the sentence in place of those of the file, and nothing else."""
+    path = tmp_path / "map.csv"
+    write_map(field_map(POINTS, FIELD), path)
+    rows = path.read_text().split("\n")
+    head = next(number for number, row in enumerate(rows) if row.startswith("x_m"))
+    rows[head + 1:] = [
+        ",".join([*cells[:3], *(repr(factor * float(cell)) for cell in cells[3:])])
+        for cells in (row.split(",") for row in rows[head + 1:] if row)]
+    with pytest.raises(MeasurementError, match=rf"name the columns Bx_{unit}, .* and convert"):
+        path.write_text("\n".join(rows))
+        check_magnitudes(read_map(path))
+    rows[head] = rows[head].replace("_T", f"_{unit}")
+    assert same(imported(tmp_path, "\n".join(rows)))

@@ -438,3 +438,13 @@ def test_blocks_of_tons_are_asked_about(tmp_path, outer, asked):
                                           array__outer_radius_m=float(outer))))
     with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
         read_study(path)
+
+
+@pytest.mark.parametrize(("line", "said"), [
+    ("radius_m = 0,012", "Write decimals with a point in “radius_m = 0,012”"),
+    ("[array]", "Join the two tables or keys into one"), ("radius_m = ", "Correct that line")])
+def test_lines_that_toml_does_not_allow(tmp_path, line, said):
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(DIPOLE) + f"\n{line}\n")
+    with pytest.raises(StudyError, match=said):
+        read_study(path)

@@ -27,6 +27,7 @@ from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.text import (
     Line,
     cells_of,
+    comma_hint,
     delimiter_of,
     is_comment,
     lines_of,
@@ -222,7 +223,7 @@ def _number(cell: str, name: str, line: int, table: _Table) -> float:
         return number_in_cell(cell, table.decimal_comma)
     except ValueError:
         raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
-                                       f"'{cell[:40]}'")) from None
+                                       f"'{cell[:40]}'", comma_hint(cell))) from None
 
 
 def _strength(table: _Table) -> str:
