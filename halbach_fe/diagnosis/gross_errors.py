@@ -313,8 +313,8 @@ class _Search:
         """
         self.lengths = self.flux_densities = (1.0,)
         before = self.misfit(MapConvention(), measured_blocks=True)
-        good = [(misfit, each) for each in self.conventions(1)
-                if self.misfit(each).standard <= INDISTINGUISHABLE_MISFIT_RATIO * nominal.standard
+        good = [(misfit, each) for each in self.conventions(1) if each.magnet not in self.other
+                and self.misfit(each).standard <= INDISTINGUISHABLE_MISFIT_RATIO * nominal.standard
                 and self.explains(before, misfit := self.misfit(each, measured_blocks=True), each)]
         if not good:
             return None

@@ -168,14 +168,18 @@ def read_campaign(
     found = [_read(magnet, one, several, noises, blocks, (directions or {}).get(one.name))
              for one in maps]
     if magnet.dimension == 2:
-        heights = np.concatenate([each.observation.points[:, 2] for each in found])
-        _check_plane(heights, "map")
+        _check_plane(np.concatenate([each.observation.points for each in found]), "map")
     return reduce(_stacked, found)
 
 
-def _check_plane(heights: Floats, where: str) -> None:
-    """Raise a MeasurementError if the points of a 2D study are at several heights."""
-    if np.ptp(heights) > 0:
+def _check_plane(points: Floats, where: str) -> None:
+    """Raise a MeasurementError if the points (n, 3) in m of a 2D study are at several heights.
+
+    Those of a tilted mapper are, by a small part of its size: what a tilt of 0.1 rad changes of the
+    places across is 0.5 % of it, and the field of a long magnet does not depend on z.
+    """
+    heights, tilted = points[:, 2], 0.1
+    if np.ptp(heights) > tilted * np.ptp(points[:, :2], axis=0).max():
         raise MeasurementError(must_be(
             "points", where, "in one plane for a 2D study",
             f"z from {heights.min():g} to {heights.max():g} m",
@@ -247,7 +251,7 @@ def _read(
         directions, shown = None, remove_nonlinear_part(study.instrument, data)
         observation = vectors = observe(study, points_of(data), measured, where)
     if magnet.dimension == 2:
-        _check_plane(observation.points[:, 2], where)
+        _check_plane(observation.points, where)
         _doubt_field_along_z(data["B_T"].values, where)
     places = _places_in_air(magnet, observation.points, data.sizes["point"], where)
     observation, vectors = (replace(each, points=places) for each in (observation, vectors))

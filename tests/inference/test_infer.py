@@ -15,6 +15,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.readings import _check_plane
 from halbach_fe.inference.result import TOO_NEAR
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
@@ -308,6 +309,11 @@ def test_maps_that_do_not_fit_the_study(short_dipole, dipole, session):
     sloped = field_map(np.array([[0, 0, 0], [0, 0, 0.1]]), np.ones((2, 3)))
     with pytest.raises(MeasurementError, match="one plane for a 2D study"):
         infer(build_magnet(dipole(noise=NOISE)), sloped, session)
+    # but a tilted mapper stays in the plane, as far as the field of a long magnet shows it
+    tilted = np.array([[0.01, 0, 1e-4], [-0.01, 0, -1e-4], [0, 0.01, 0]])
+    _check_plane(tilted, "map")
+    with pytest.raises(MeasurementError, match="one plane for a 2D study"):
+        _check_plane(tilted * [1, 1, 20], "map")
     with pytest.raises(StudyError, match="how noisy"):
         infer(build_magnet(short_dipole()), field_map(np.zeros((1, 3)), np.ones((1, 3))), session)
 
