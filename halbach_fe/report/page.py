@@ -455,18 +455,6 @@ MOST_MEASURED = 10_000
 """Largest number of blocks whose sides are searched for their distance from the axis; of more the
 corners are drawn."""
 
-MOST_NUMBERED = 40
-"""Largest number of blocks in a cross-section whose slots are numbered."""
-
-
-OUTERMOST = 0.9
-"""Distance from the axis, relative to that of the farthest block, from which blocks are numbered:
-those of an inner layer have the same slots."""
-
-SMALL_BLOCK = 0.15
-"""Distance from a block's middle to its outer side, relative to that from the axis, below which a
-number has no place in it."""
-
 
 def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
     """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
@@ -474,12 +462,19 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
     ``colour`` is that of the blocks. Their slots have numbers and their easy axes are drawn, unless
     there are too many to read.
     """
+    # Distance from a block's middle to its outer side, relative to that from the axis, below which
+    # a number has no place in it.
+    small_block = 0.15
+    # Distance from the axis, relative to that of the farthest block, from which blocks are
+    # numbered: those of an inner layer have the same slots.
+    outermost = 0.9
+    most_numbered = 40  # largest number of blocks in a cross-section whose slots are numbered
     t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
         block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
     reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
-    numbered = reach > 0 and len(shown) <= MOST_NUMBERED
+    numbered = reach > 0 and len(shown) <= most_numbered
     outlines = []
     for block in shown:
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
@@ -496,11 +491,11 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
         distance = float(np.hypot(*middle))
-        if numbered and distance > OUTERMOST * reach:
+        if numbered and distance > outermost * reach:
             outwards = middle / distance
             edge = float((outline @ outwards).max())
             # between the arrow and the outer side of a large block, beyond that of a small one
-            beyond = edge - distance < SMALL_BLOCK * reach
+            beyond = edge - distance < small_block * reach
             if beyond:
                 axis.margins(0.12)
             axis.annotate(
