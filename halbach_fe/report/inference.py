@@ -308,7 +308,7 @@ def page(
          "Maps where they overlap": overlap_table(result),
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
-        new_study=None if result.terms is None else (STUDY_FILE, [(result.study, NOTE)]))
+        new_study=None if result.terms is None else (STUDY_FILE, lambda: [(result.study, NOTE)]))
 
 
 def _doubtful(result: InferenceResult) -> list[Text]:

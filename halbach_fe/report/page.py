@@ -140,8 +140,9 @@ class Page:
     """Figures that a notebook shows in place of tables."""
     files: Mapping[str, Callable[[Path], object] | None] = field(default_factory=dict)
     """How each further file is written, by name; None if the one before it is written with it."""
-    new_study: tuple[str, Sequence[tuple[Study, str]]] | None = None
-    """File of a changed study; the studies after each change, with a note that says it there."""
+    new_study: tuple[str, Callable[[], Iterable[tuple[Study, str]]]] | None = None
+    """File of a changed study; the studies after each change, with a note that says it there. It
+    is written last, as one that is not valid is refused."""
     folders: Mapping[str, Page] = field(default_factory=dict)
     """Pages of parts of the result, each in a folder of its own beside the page, by its name."""
     remarks: Sequence[str] = ()
@@ -209,9 +210,6 @@ def write_files(page: Page, folder: Path, file: Path | None = None) -> Path:
     for name, write in page.files.items():
         if write is not None:
             write(folder / name)
-    if page.new_study is not None:
-        name, steps = page.new_study
-        write_changed_study(folder / name, steps, file, page.study)
     if page.stored:
         write_text(folder / f"{page.name}.json",
                    json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
@@ -220,11 +218,14 @@ def write_files(page: Page, folder: Path, file: Path | None = None) -> Path:
     write_page(path, "page.html.j2", pictures, page.study, page.provenance, answer=page.answer,
                rows=page.rows or next(iter(page.tables.values()), ()), page=page,
                drawn={picture.file: picture for picture in pictures})
+    if page.new_study is not None:
+        name, steps = page.new_study
+        write_changed_study(folder / name, steps(), file, page.study)
     return path
 
 
 def write_changed_study(
-    path: Path, steps: Sequence[tuple[Study, str]], file: Path | None, whole: Study | None = None,
+    path: Path, steps: Iterable[tuple[Study, str]], file: Path | None, whole: Study | None = None,
 ) -> None:
     """Write a study after some changes, which finds the maps that it lists.
 

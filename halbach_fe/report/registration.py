@@ -550,7 +550,7 @@ def page(
             "The readings along the magnet's axis and in its cross-section, where the registration "
             "puts them"))},
         files=files, stem="registration", remarks=said,
-        new_study=None if name else (STUDY_FILE, [(best.study, NOTE)]))
+        new_study=None if name else (STUDY_FILE, lambda: [(best.study, NOTE)]))
 
 
 def pages_of_maps(
