@@ -53,9 +53,6 @@ if TYPE_CHECKING:
 GETDP_LIMIT_S = 3600.0
 """Time limit of each GetDP process, unless another is asked for."""
 
-MOST_MPI = 1024
-"""Largest number of MPI processes of a run."""
-
 MOST_NAME_BYTES, MOST_PATH_BYTES = 255, 4095
 """Longest name of a file or folder, and longest path, that Linux allows."""
 
@@ -118,10 +115,11 @@ def print_estimate(estimate: Estimate, as_json: bool) -> int:
 
 def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
     """Add the options of GetDP's runs: --jobs, --mpi, --scheduler, --cache, --getdp and so on."""
+    most_mpi = 1024  # largest number of MPI processes of a run
     parser.add_argument("--jobs", type=positive, metavar="N",
                         help="number of GetDP runs at a time (default: 2, or with --scheduler the "
                         "number of cores of its workers)")
-    parser.add_argument("--mpi", type=within(whole, 1, MOST_MPI), default=1, metavar="N",
+    parser.add_argument("--mpi", type=within(whole, 1, most_mpi), default=1, metavar="N",
                         help="number of MPI processes that share each run, for solves that are too "
                         "large for a single process (default: %(default)s)")
     parser.add_argument("--scheduler", metavar="ADDRESS",
@@ -277,11 +275,6 @@ def _if_simulated(path: Path) -> str:
     return ""
 
 
-def digests(files: Mapping[str, Path | None]) -> dict[str, str]:
-    """Return the `digest` of each file by its description; None stands for a file not given."""
-    return {name: digest(path) for name, path in files.items() if path is not None}
-
-
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """Add --json."""
     parser.add_argument("--json", action="store_true", help="print results as JSON")
@@ -416,13 +409,6 @@ def _describes_a_format(arguments: argparse.Namespace) -> bool:
     from halbach_fe.measurement.formats.declared import DeclaredFormat
 
     return bool(declared_format(arguments) != DeclaredFormat() or arguments.format)
-
-
-def map_files(arguments: argparse.Namespace, study: Study) -> dict[str, Path | None]:
-    """Return the files of the maps by their description in the provenance of a page."""
-    if not study.maps:
-        return {"measurements": arguments.measurements}
-    return {f"map {name}": file for name, file in _listed(arguments, study).items()}
 
 
 def _listed(arguments: argparse.Namespace, study: Study) -> dict[str, InputFile]:

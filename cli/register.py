@@ -28,12 +28,10 @@ if TYPE_CHECKING:
     from halbach_fe.study.model import Study
 
 
-MOST_ACROSS_M = 10.0
-"""Largest standard deviation of a map's distance from the axis: that of all lengths of a study."""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add this verb's options."""
+    # Largest standard deviation of a map's distance from the axis: that of all lengths of a study.
+    most_across_m = 10.0
     from halbach_fe.cli.format_options import add_map_format_arguments
 
     common.add_study_arguments(parser)
@@ -52,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="largest number of poses that are fitted with the blocks (default: "
                         "4, or 8 on a line, of those that the search finds)")
     parser.add_argument("--across-m", metavar="SD",
-                        type=common.within(common.positive_number, 0, MOST_ACROSS_M),
+                        type=common.within(common.positive_number, 0, most_across_m),
                         help="prior standard deviation of the map's distance from the axis, for a "
                         "map that does not determine it (default: the blocks' outer radius)")
     parser.add_argument("--turn-rad", metavar="SD",

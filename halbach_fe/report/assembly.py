@@ -115,10 +115,6 @@ def write_stl(triangles: Floats, title: str, path: Path) -> None:
         file.write(head + np.uint32(len(triangles)).astype("<u4").tobytes())
         file.write(records.tobytes())
 
-
-SHORTEST_MM = 1e-3
-"""Distance between plates below which they touch, but for rounding."""
-
 FRAME = ("x, y, z of the magnet; x is at the large notch of a plate, the pockets are open towards "
          "+z, and angles count counter-clockwise as seen from +z")
 
@@ -201,12 +197,13 @@ def spacers(assembly: Assembly) -> str:
 
     Plates that touch, or lie beside each other, have no spacer between them.
     """
+    shortest_mm = 1e-3  # distance between plates below which they touch, but for rounding
     limits = sorted((low, low + plate.thickness_m) for plate in assembly.plates
                     for low in plate.heights_m)
     if len(limits) < 2:
         return ""
     lengths = [1e3 * (low - high) for (_, high), (low, _) in itertools.pairwise(limits)]
-    if min(lengths) < SHORTEST_MM:
+    if min(lengths) < shortest_mm:
         return "Keep the distances between the lower faces, by spacers where plates do not touch."
     gaps = [f"{length:.4g}" for length in lengths]
     length = gaps[0] if len(set(gaps)) == 1 else f"from the lowest up, {', '.join(gaps)}"

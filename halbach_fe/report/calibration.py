@@ -18,9 +18,6 @@ from halbach_fe.stats.calibration import BINS
 CONTROL = "control: "
 """Beginning of the name of a posterior that is wrong on purpose."""
 
-PANELS_IN_A_ROW = 3
-"""More would be unreadable on a narrow screen."""
-
 
 def answer(results: Mapping[str, Mapping[str, Any]]) -> Answer:
     """Say whether the error bars of the posteriors hold, and whether the test can tell."""
@@ -64,7 +61,8 @@ def write_calibration(
         Rows of the page's table by kind of posterior.
     folder : Path
     """
-    columns = min(PANELS_IN_A_ROW, len(ranks))
+    panels_in_a_row = 3  # more would be unreadable on a narrow screen
+    columns = min(panels_in_a_row, len(ranks))
     rows = -(-len(ranks) // columns)
     figure = figure_of(2.8 * rows, 3.2 * columns)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()

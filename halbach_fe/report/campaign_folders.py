@@ -44,9 +44,6 @@ SAME_PLACE = 0.03
 """Distance of nominal places, as a fraction of a block's width, up to which two studies describe
 one magnet. A diagnosis moves them by fractions of a millimetre (gaps, radii, lengths)."""
 
-SAME_DIRECTION = 0.98
-"""Smallest cosine between nominal easy axes of one magnet: other orders differ by far more."""
-
 MOST_RECORD_BYTES, MOST_FIGURE_BYTES = 2**27, 2**24
 """Largest sizes of page.json (100 000 free blocks take a tenth of it) and of a figure."""
 
@@ -244,6 +241,8 @@ def is_same_magnet(one: Study, other: Study) -> bool:
 
     Properties of the material, deviations of single blocks and iron may differ.
     """
+    # Smallest cosine between nominal easy axes of one magnet: other orders differ by far more.
+    same_direction = 0.98
     if one.dimension != other.dimension:
         return False
     blocks, others = (nominal_blocks(each.array, each.dimension) for each in (one, other))
@@ -254,7 +253,7 @@ def is_same_magnet(one: Study, other: Study) -> bool:
     widths = np.sqrt([abs(block.area) for block in blocks])
     along = np.einsum("ij,ij->i", [block.easy_axis for block in blocks],
                       [block.easy_axis for block in others])
-    return bool((apart <= SAME_PLACE * widths).all() and (along >= SAME_DIRECTION).all())
+    return bool((apart <= SAME_PLACE * widths).all() and (along >= same_direction).all())
 
 
 FINDING = ("register", "diagnose")

@@ -44,12 +44,6 @@ DIAGNOSED = "study.diagnosed.toml"
 POSTERIOR = "posterior.h5"
 """The updated blocks that halbach-fe infer writes."""
 
-MOST_ROWS = 40
-"""Largest number of rows of a folded table. All of them are on its page."""
-
-SHORT_DIGEST = 16
-"""Digits of SHA-256 that the page shows."""
-
 
 @dataclass(frozen=True)
 class Campaign:
@@ -418,6 +412,7 @@ def _parts(
     campaign: Campaign, output: Path, lead: Picture | None = None
 ) -> list[dict[str, object]]:
     """Return what the template shows of every page; the picture ``lead`` stands at the top."""
+    most_rows = 40  # largest number of rows of a folded table. All of them are on its page
     pages = [(chapter, page) for chapter in campaign.chapters for page in chapter.pages]
     first = {chapter.label: number for number, (chapter, _) in reversed(list(enumerate(pages, 1)))}
     found = []
@@ -439,7 +434,7 @@ def _parts(
             "next": done and first[done.label],
             "where": "above" if earlier else "below",
             "picture": None if page.picture is lead else page.picture,
-            "rows": rows[:MOST_ROWS], "all_rows": len(rows), "page": files.get(page.path),
+            "rows": rows[:most_rows], "all_rows": len(rows), "page": files.get(page.path),
             "files": {_shown(name): address for name, address in files.items()}})
     return found
 
@@ -475,12 +470,13 @@ def _folder_rows(campaign: Campaign) -> list[dict[str, str]]:
 
 def _input_rows(campaign: Campaign) -> list[dict[str, str]]:
     """Return rows of text: which files the commands read, and which of them wrote these."""
+    short_digest = 16  # digits of SHA-256 that the page shows
     rows: dict[str, dict[str, str]] = {}
     for one in campaign.chapters:
         for path, digest in one.record.inputs.items():
             row = rows.setdefault(digest, {
                 "file": _shown(os.path.basename(path)),
-                "SHA-256": printable(digest, SHORT_DIGEST),
+                "SHA-256": printable(digest, short_digest),
                 "read by": "", "written by": ", ".join(
                     other.label for other in campaign.chapters if digest in other.digests)})
             row["read by"] += f"{', ' * bool(row['read by'])}{one.label}"

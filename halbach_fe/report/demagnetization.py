@@ -38,10 +38,6 @@ from halbach_fe.study.model import is_nonlinear
 PAST = "#D55E00"
 """Colour of the knee and of cells past it."""
 
-SWEEP_K = 40.0
-"""Margin in K by which the temperature axis extends beyond the magnet's temperature and beyond the
-limit temperature of the last of `SHARES`."""
-
 ROOM_C = 20.0
 """Temperature in °C at which a magnet is kept at least."""
 
@@ -233,14 +229,17 @@ def _map_figure(found: DemagnetizationMap) -> Figure:
 
 def _temperature_figure(found: DemagnetizationMap) -> Figure:
     """Draw the share of the volume past the knee against the temperature."""
+    # Margin in K by which the temperature axis extends beyond the magnet's temperature and beyond
+    # the limit temperature of the last of `SHARES`.
+    sweep_k = 40.0
     material = found.material
     figure = figure_of(3.4)
     axis = figure.subplots()
     limit = found.limit_temperature(SHARES[-1])
     last = [material.temperature_C, limit if math.isfinite(limit) else material.temperature_C]
-    ends = ((min(last) - SWEEP_K, max(*last, material.reference_temperature_C))
+    ends = ((min(last) - sweep_k, max(*last, material.reference_temperature_C))
             if found.worst_when_cold else
-            (min(material.temperature_C, material.reference_temperature_C), max(last) + SWEEP_K))
+            (min(material.temperature_C, material.reference_temperature_C), max(last) + sweep_k))
     temperature = np.linspace(*ends, 241)
     axis.plot(temperature, 100 * found.share_beyond(temperature), color=POSTERIOR)
     axis.axvline(material.temperature_C, color=PRIOR, ls="--",

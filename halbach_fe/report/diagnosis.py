@@ -177,8 +177,8 @@ def page(
          "The model before and after": change_table(diagnosis),
          "Rms difference of model and readings": residual_table(diagnosis)},
         rows, drawn, stem="diagnosis", remarks=[BAYES_FACTOR_IN_WORDS] if found else [],
-        new_study=(STUDY_FILE, list(changed_studies(
-            study or diagnosis.corrected_study, diagnosis))))
+        new_study=(STUDY_FILE, partial(
+            changed_studies, study or diagnosis.corrected_study, diagnosis)))
 
 
 def _what_is_missing(diagnosis: Diagnosis, rows: Sequence[Mapping[str, str]]) -> Section:

@@ -133,10 +133,6 @@ def _alternative(text: str) -> str:
     said = f"{acts_on} along {COORDINATES[along]}" if along else "a field"
     return f"{said} in map {where}" if where else said
 
-
-MANY_TO_ONE = 1000.0
-"""Odds beyond which their number says nothing more."""
-
 NOT_NAMED = {
     "odds": "Suspected with a probability of {} % (odds {} : 1), which is too little to name it: "
             "{}.",
@@ -152,6 +148,7 @@ NOT_NAMED = {
 
 def suspicion_in_words(suspicion: Suspicion, titles: dict[str, str]) -> str:
     """Say what is suspected, with its odds, and why it is not named."""
+    many_to_one = 1000.0  # odds beyond which their number says nothing more
     place = place_in_words(suspicion.hypothesis.place)
     first = titles.get(suspicion.effects[0], suspicion.effects[0]) + (f", {place}" if place else "")
     odds = suspicion.probability / max(1 - suspicion.probability, 1e-9)
@@ -159,8 +156,8 @@ def suspicion_in_words(suspicion: Suspicion, titles: dict[str, str]) -> str:
               for name, share in zip(suspicion.effects[1:], suspicion.shares[1:], strict=True)]
     together = f", or else {', '.join(others)}" if others else ""
     return NOT_NAMED[suspicion.reason].format(
-        f"{100 * suspicion.probability:.0f}", f"{odds:.1f}" if odds < MANY_TO_ONE else
-        f"over {MANY_TO_ONE:.0f}", first + together)
+        f"{100 * suspicion.probability:.0f}", f"{odds:.1f}" if odds < many_to_one else
+        f"over {many_to_one:.0f}", first + together)
 
 
 def more_readings(suspicion: Suspicion) -> str:
@@ -182,10 +179,6 @@ UNUSUAL_AMPLITUDE = 10.0
 """Amplitude in prior standard deviations above which the page warns and does not say "Yes": twice
 the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the errors of a magnet that
 is built with care."""
-
-
-LEAST_SHARE = 0.02
-"""Probability from which something that may be missing is listed."""
 
 OTHER_SOURCES = ("background", "ferromagnetic_object")
 """Effects by which a neighbouring magnet's field can be corrected."""
@@ -321,8 +314,9 @@ def _remedies(diagnosis: Diagnosis) -> list[str]:
 
 def _imitated_in_words(imitation: Imitation, titles: dict[str, str]) -> str:
     """Say what may be missing that no reading shows."""
+    least_share = 0.02  # probability from which something that may be missing is listed
     parts = [f"{title_of(name, titles)} {100 * share:.0f} %" for name, share in zip(
-        imitation.effects, imitation.shares, strict=True) if share >= LEAST_SHARE]
+        imitation.effects, imitation.shares, strict=True) if share >= least_share]
     return (f"With a probability of {100 * imitation.probability:.0f} % something is missing that "
             "no reading shows, as the blocks imitate it"
             f"{f' ({in_a_row(parts)})' if parts else ''}: the blocks of an update are then off by "

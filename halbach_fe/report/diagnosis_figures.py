@@ -38,9 +38,6 @@ from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
 NONE, UNKNOWN, OUTSIDE = "none", "unknown", "outside the catalogue"
 """Names of the probabilities that nothing is missing, and an unlisted cause, and that in words."""
 
-LONGEST_NAME = 38
-"""Number of characters in a line of an effect's name beside its bar."""
-
 BAR_IN, LINE_IN = 0.3, 0.14
 """Height in inches of a bar, and of every further line of its name."""
 
@@ -224,13 +221,14 @@ def _colours(limit: float) -> ScalarMappable:
 
 def probabilities(diagnosis: Diagnosis) -> Figure:
     """Draw the probabilities of effects, and Bayes factors of identified effects and rivals."""
+    longest_name = 38  # number of characters in a line of an effect's name beside its bar
     top = sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])[:MAX_BARS]
     titles = catalogue_titles(diagnosis)
 
     def in_words(name: str, place: str = "") -> str:
         """Return the description of an effect in short lines."""
         said = {NONE: "nothing is missing", UNKNOWN: OUTSIDE}.get(name) or title_of(name, titles)
-        return textwrap.fill(", ".join(filter(None, (said, label_in_words(place)))), LONGEST_NAME)
+        return textwrap.fill(", ".join(filter(None, (said, label_in_words(place)))), longest_name)
 
     bars = []
     for effect in diagnosis.identified:

@@ -34,9 +34,6 @@ from halbach_fe.study.types import COMPONENTS
 LISTED = 12
 """Number of the blocks on page and terminal: those with the largest forces."""
 
-MAIN = 0.9
-"""Component of a direction beyond which a direction in words has no other part."""
-
 ROUGH = 0.1
 """Error of a force, relative to it, above which the answer is not to be trusted."""
 
@@ -45,10 +42,6 @@ EQUAL = 1e-3
 
 NUMBERED_SLOTS = 48
 """Largest number of blocks of a ring that have their numbers in the figure."""
-
-WHOLE_RING = 0.01
-"""Part of the largest force on a block below which a ring as a whole feels none worth a word: a
-block's own force is not known better, as its strength is not."""
 
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""
@@ -90,12 +83,15 @@ def answer(found: Forces) -> Answer:
 
 def _on_rings(found: Forces) -> list[str]:
     """Say which force the blocks of a ring feel together: what holds the rings has to bear it."""
+    # Part of the largest force on a block below which a ring as a whole feels none worth a word: a
+    # block's own force is not known better, as its strength is not.
+    whole_ring = 0.01
     rings = np.array([block.ring for block in found.blocks])
     together = {ring: found.in_place.force_N[rings == ring].sum(axis=0)
                 for ring in np.unique(rings).tolist()}
     ring, force = max(together.items(), key=lambda each: float(np.linalg.norm(each[1])))
     size = float(np.linalg.norm(force))
-    if len(together) < 2 or size < WHOLE_RING * found.in_place.magnitude.max():
+    if len(together) < 2 or size < whole_ring * found.in_place.magnitude.max():
         return []
     return [f"Together the blocks of ring {ring} are pushed by {_newton(size)} "
             f"({_heavy(size)}) along {_numbers(force / size)}: what holds the rings has to bear "
@@ -152,6 +148,7 @@ def _ordinal(number: int) -> str:
 
 def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
     """Return the direction of a vector (3,) seen from the magnet's axis, and its unit vector."""
+    main = 0.9  # component of a direction beyond which a direction in words has no other part
     unit = vector / np.linalg.norm(vector)
     x, y, _ = block.middle
     radius = float(np.hypot(x, y))
@@ -164,7 +161,7 @@ def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
         parts = sorted(((float(unit[k]), f"along +{name}", f"along −{name}")
                         for k, name in enumerate(COMPONENTS)), key=lambda part: -abs(part[0]))
     words = [plus if size > 0 else minus for size, plus, minus in parts]
-    text = words[0] if abs(parts[0][0]) > MAIN else f"{words[0]} and {words[1]}"
+    text = words[0] if abs(parts[0][0]) > main else f"{words[0]} and {words[1]}"
     return f"{text} {_numbers(unit)}"
 
 

@@ -58,21 +58,15 @@ LISTED = 12
 LEAST_OF_SD = 5e-3
 """Part of its standard deviation below which a number is 0 in tables."""
 
-NO_DIRECTION_RAD = 0.5
-"""Standard deviation of the angle of the mean of B from which it has no direction: in a multipole
-that mean is what the errors of the blocks leave."""
-
 DRAWN = 24
 """Number of the harmonics in the figure: the largest ones, with names that can be read."""
 
 
-TOO_LARGE_FOR_A_TRAY = 1e4
-"""Deviation in ppm rms from which a tray of small magnets is not advised: 64 cubes of 4 mm in a
-magnet of 80 cubes of 12 mm took 6600 ppm away, of 77000."""
-
-
 def answer(found: HomogeneityResult) -> Answer:
     """Say how homogeneous the field of the best known magnet is, and what to do next."""
+    # Deviation in ppm rms from which a tray of small magnets is not advised: 64 cubes of 4 mm in a
+    # magnet of 80 cubes of 12 mm took 6600 ppm away, of 77000.
+    too_large_for_a_tray = 1e4
     name, best = list(found.by_name.items())[-1]
     question = f"How homogeneous is the field in {found.model.region.text}?"
     low, middle, high = map(ppm, best.rms_range_ppm)
@@ -92,7 +86,7 @@ def answer(found: HomogeneityResult) -> Answer:
     if name != "prior" and found.disagreement:
         return of_a_conflict(question, f"{text}.", found.disagreement)
     better: tuple[str, str] | None = None
-    if best.rms_ppm > TOO_LARGE_FOR_A_TRAY:
+    if best.rms_ppm > too_large_for_a_tray:
         better = _better_design(found.magnet.study, best.rms_ppm)
     if name != "prior" and better:
         return Answer(question, f"{text}.", f"{agreement(found.disagreement)} {trust}", *better,
@@ -183,7 +177,10 @@ def direction_in_words(unit: Floats, sd_rad: float) -> str:
 
 def _cancels(known: Homogeneity) -> bool:
     """Whether the mean of B has no direction, as in a multipole."""
-    return known.direction_sd_rad > NO_DIRECTION_RAD
+    # Standard deviation of the angle of the mean of B from which it has no direction: in a
+    # multipole that mean is what the errors of the blocks leave.
+    no_direction_rad = 0.5
+    return known.direction_sd_rad > no_direction_rad
 
 
 def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]:

@@ -16,7 +16,7 @@ from halbach_fe.inference.storage import inference_summary, write_inference
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.multipoles import MultipoleTable, middle_table, write_multipole_csv
+from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -166,12 +166,6 @@ NOTHING = "–"
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 """Largest numbers of slots and rings for which the contraction figure prints its values."""
 
-RANKED = 8
-"""Number of the blocks that a page lists: those that deviate most."""
-
-MOST_TURNED = 5
-"""Largest number of rows of a table that has a column for each."""
-
 ALIKE = 0.03
 """Range of the contractions of all blocks up to which they are said instead of drawn."""
 
@@ -235,6 +229,7 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
     That is by the change of the magnetization along and across the easy axis, each in standard
     deviations of its prior.
     """
+    ranked = 8  # number of the blocks that a page lists: those that deviate most
     nominal = result.by_block(result.response.nominal)
     size = np.linalg.norm(nominal, axis=1)
     there = np.flatnonzero(size)  # without the places of missing blocks
@@ -245,7 +240,7 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
     prior_sd = result.by_block(result.prior.sd)[there]
     distance = np.linalg.norm(change / np.where(prior_sd > 0, prior_sd, np.inf), axis=1)
     rows = []
-    for one in np.argsort(-distance, kind="stable")[:RANKED].tolist():
+    for one in np.argsort(-distance, kind="stable")[:ranked].tolist():
         row = np.zeros((1, len(result.posterior.mean)))
         result.by_block(row[0])[there[one]] = axes[one]
         sd, of = result.posterior.sd_of(row)[0], 100 / size[there[one]]
@@ -298,7 +293,13 @@ def page(
                 Table(axis)], "Magnetic centre, axis and roll"),
             *(Section([*doubtful, *section.parts], section.title)
               for section in sections_of_stray(stray)),
-            *_sections_of_circles(result, multipoles, doubtful),
+            *sections_of_circles(
+                multipoles, result.study, "They are those of the readings on the circle about the "
+                "axis of the magnet, where the study says that the map lies. With m readings, "
+                "order n would contain order m − n too; that part is subtracted, as the updated "
+                "blocks make it in vacuum. Their error bars take the solver's error of every "
+                "reading in full: `halbach-fe multipoles` takes as many points as are needed, and "
+                "has smaller bars.", " ± is the standard deviation.", doubtful),
             Section([*map(Drawn, [*figures][1:])], "Pictures"),
             Section([Table(_model_table(result))], "Model")],
         {"Differences of readings and predictions": rows,
@@ -307,7 +308,7 @@ def page(
          "Maps where they overlap": overlap_table(result),
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
-        new_study=None if result.terms is None else (STUDY_FILE, [(result.study, NOTE)]))
+        new_study=None if result.terms is None else (STUDY_FILE, lambda: [(result.study, NOTE)]))
 
 
 def _doubtful(result: InferenceResult) -> list[Text]:
@@ -369,11 +370,12 @@ def _pictures(result: InferenceResult) -> Figures:
 
 def _before_and_after(rows: Sequence[Mapping[str, str]], published: bool) -> Section:
     """Return the section of the table of scores, and what its columns are."""
+    most_turned = 5  # largest number of rows of a table that has a column for each
     medians = ", and medians of relative errors as they are published" if published else ""
     return Section([
         f"Before and after the update: rms differences of readings and their predictions{medians}. "
         "Held-out readings did not update the magnet.",
-        Table(rows, "turned" if len(rows) <= MOST_TURNED else ""), Text(
+        Table(rows, "turned" if len(rows) <= most_turned else ""), Text(
             "**of the largest reading**: the rms difference after the update, relative to the "
             "largest reading of all. **95 % band holds**: the share of the readings within the 95 "
             "% band of their prediction. **rms residual/sd**: each reading's difference from its "
@@ -410,27 +412,6 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
         Section([] if not poses else ["In the magnet's axes, as the update found it.",
                                       Table(poses)], "Where the maps lie"),
         Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]
-
-
-def _sections_of_circles(
-    result: InferenceResult, tables: Sequence[MultipoleTable], doubtful: Sequence[Text]
-) -> list[Section]:
-    """Return what the page says of the multipoles of full circles; nothing without any."""
-    if not tables:
-        return []
-    said = middle_table(tables, result.study)
-    nearest = " and the z nearest to 0" if result.study.dimension == 3 else ""
-    others = "" if len(tables) == 1 else (
-        f" multipoles.csv has all {len(tables)} circles, each in units of the main multipole at "
-        f"its radius{nearest}.")
-    return [Section([
-        *doubtful, f"{said['reference']} ± is the standard deviation. Main multipole: "
-        f"{said['mains']}. They are those of the readings on the circle about the axis of the "
-        "magnet, where the study says that the map lies. With m readings, order n would contain "
-        "order m − n too; that part is subtracted, as the updated blocks make it in vacuum. Their "
-        "error bars take the solver's error of every reading in full: `halbach-fe multipoles` "
-        f"takes as many points as are needed, and has smaller bars.{others}",
-        Table(said["rows"], "numbers")], "Multipoles")]
 
 
 def _model_table(result: InferenceResult) -> list[dict[str, str]]:

@@ -22,10 +22,6 @@ from halbach_fe.report.words import (
 from halbach_fe.solver.formulation_choice import finer_in_words
 from halbach_fe.study.types import COMPONENTS
 
-ALONG_AN_AXIS = 1e-6
-"""Angle in rad up to which the direction of a sensor counts as an axis: of 1 T across it shows
-1 µT."""
-
 LOOK = ("Look for what the study lacks. (Before that, halbach-fe check tests the map by itself, "
         "and register finds where it lies.)", "halbach-fe diagnose STUDY --measurements MAP -o DIR")
 """The next step, and its command, if model and measurement disagree, or a block and its prior."""
@@ -145,13 +141,16 @@ def _of_the_sign(result: InferenceResult) -> str:
 
 def _largest_field(result: InferenceResult) -> str:
     """Say how strong the updated field is where it is strongest; empty if no reading has one."""
+    # Angle in rad up to which the direction of a sensor counts as an axis: of 1 T across it shows 1
+    # µT.
+    along_an_axis = 1e-6
     field = result.field
     most = field.strongest
     if most is None:
         return ""
     place, along = 1e3 * field.places[most], field.along[most]
     main = int(np.argmax(np.abs(along)))
-    component = f"B{COMPONENTS[main]}" if np.linalg.norm(np.delete(along, main)) < ALONG_AN_AXIS \
+    component = f"B{COMPONENTS[main]}" if np.linalg.norm(np.delete(along, main)) < along_an_axis \
         else f"B along ({_numbers(along, '.4f')})"
     moved = np.abs(place - 1e3 * result.observation.positions[most]).max() > 1e-3
     sd = 1e3 * _sd_of_place(result, most)

@@ -39,19 +39,16 @@ def in_one_line(magnet: Magnet) -> str:
             f"{_range((abs(block.remanence) for block in magnet.blocks), 3)} T, {iron}")
 
 
-MOST_SIZES = 3
-"""Largest number of different rings whose numbers of blocks are listed."""
-
-
 def layout(magnet: Magnet) -> str:
     """Return the number of rings and blocks in words, for example "3 rings of 16 sectors"."""
+    most_sizes = 3  # largest number of different rings whose numbers of blocks are listed
     array = magnet.array
     count = len(array.blocks_by_ring) if array.free_blocks is None else array.rings
     texts = []
     if count:
         sizes = sorted(set(array.blocks_by_ring[:count]))
         shapes = dict.fromkeys((ring.block or array.block).shape for ring in array.ring)
-        blocks = (' or '.join(map(str, sizes)) if len(sizes) <= MOST_SIZES
+        blocks = (' or '.join(map(str, sizes)) if len(sizes) <= most_sizes
                   else f"{sizes[0]} to {sizes[-1]}")
         texts.append(f"{count} ring{'s' * (count > 1)} of {blocks} "
                      f"{', '.join(f'{shape}s' for shape in shapes or [array.block.shape])}")

@@ -36,20 +36,15 @@ AROUND = 1.5
 LONGEST = 0.3
 """Length of the longest arrow of a residual relative to the radius of the bore."""
 
-NEAR_BLOCKS = 0.9
-"""Part of the plane that the colours span: beside the blocks |B| is many times larger."""
-
 MOST_SUMMED = 20_000
 """Largest number of blocks whose field is drawn in the plane: it takes 0.2 ms per block."""
-
-MOST_ARROWS = 5000
-"""Largest number of arrows that are drawn: those of the largest residuals."""
 
 
 def residuals_trace(positions: Floats, residual: Floats, bore_radius: float) -> go.Scatter3d:
     """Return arrows of what the model lacks, B (n, 3) in T at points (n, 3) in m."""
+    most_arrows = 5000  # largest number of arrows that are drawn: those of the largest residuals
     size = np.linalg.norm(residual, axis=1)
-    kept = np.sort(np.argsort(-size)[:MOST_ARROWS])
+    kept = np.sort(np.argsort(-size)[:most_arrows])
     longest = float(size.max()) or 1.0
     ends = positions[kept] + LONGEST * bore_radius / longest * residual[kept]
     gap = np.full_like(ends, np.nan)
@@ -66,6 +61,8 @@ def cut_trace(magnet: Magnet) -> go.Surface | None:
     Without a bore it is the plane through and around the magnet. It is None if nothing of the plane
     is in air, or of more than `MOST_SUMMED` blocks.
     """
+    # Part of the plane that the colours span: beside the blocks |B| is many times larger.
+    near_blocks = 0.9
     if len(magnet.blocks) > MOST_SUMMED:
         return None
     reach = 0.9 * magnet.bore_radius if magnet.has_bore else AROUND * magnet.radius
@@ -80,7 +77,7 @@ def cut_trace(magnet: Magnet) -> go.Surface | None:
         hidden |= np.hypot(*points[:, :2].T) > reach
     if hidden.all():
         return None
-    low, high = np.quantile(size[~hidden], (0.0, NEAR_BLOCKS))
+    low, high = np.quantile(size[~hidden], (0.0, near_blocks))
     return go.Surface(
         x=x, y=y, z=z, surfacecolor=np.where(hidden, np.nan, size).reshape(x.shape), opacity=0.9,
         colorscale=UNSIGNED, cmin=low, cmax=high, visible="legendonly", showlegend=True,
@@ -125,9 +122,6 @@ CAMERA_2D, CAMERA_3D = {"x": 0.3, "y": 0.3, "z": 2.5}, {"x": 1.4, "y": 1.0, "z":
 
 DIAGONAL_2D, DIAGONAL_3D = 2.4, 1.5
 """Diagonals of the drawn box, in plotly's own length, that these cameras see as a whole."""
-
-MOST_CONES = 2000
-"""Largest number of blocks whose arrows have heads; more would make the page slow."""
 
 SCRIPT = """
 var view = document.getElementById('{plot_id}');
@@ -561,6 +555,8 @@ def _arrow_traces(
     blocks: Sequence[MagnetBlock], values: BlockValues, corners: Sequence[Floats]
 ) -> list[go.Scatter3d | go.Cone]:
     """Return arrows of the magnetization on the upper faces of the blocks with these corners."""
+    # Largest number of blocks whose arrows have heads; more would make the page slow.
+    most_cones = 2000
     middles = np.array([[*(block.middle + block.displacement_m)[:2], own[:, 2].max()]
                         for block, own in zip(blocks, corners, strict=True)])
     vectors = np.zeros((len(blocks), 3))
@@ -571,7 +567,7 @@ def _arrow_traces(
     x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
     shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
                           name="magnetization", legendgroup="arrows", hoverinfo="skip")
-    if len(blocks) > MOST_CONES:
+    if len(blocks) > most_cones:
         return [shafts]
     (x, y, z), (u, v, w) = (middles + vectors / 2).T, (HEAD * vectors).T
     heads = go.Cone(

@@ -35,15 +35,6 @@ TITLE = "Check of a field map"
 REMAINS = 0.3
 """Correlation of neighbouring residuals from which they are no noise."""
 
-ZERO = 1e-6
-"""Part of the largest reading below which a column holds nothing, and is not drawn."""
-
-ROWS_NAMED = 10
-"""Number of broken rows that are listed by number."""
-
-TERMS_NAMED = 5
-"""Number of the instrument's parameters that are named beside the table, the most certain ones."""
-
 
 def answer(check: MapCheck) -> Answer:
     """Say whether the map obeys Maxwell's equations, and what to do next."""
@@ -221,6 +212,8 @@ def _range(low: float, high: float) -> str:
 
 def sentences(check: MapCheck) -> list[str]:
     """Return what else the check found."""
+    # Number of the instrument's parameters that are named beside the table, the most certain ones.
+    terms_named = 5
     found = []
     if check.is_reoriented:
         found.append(f"The map obeys with other axes than it names: {_axes(check)} (or all of them "
@@ -242,8 +235,8 @@ def sentences(check: MapCheck) -> list[str]:
                    key=lambda term: -abs(term.value) / term.sd)
     if terms:
         said = [f"{term.name} {with_error(term.value, term.sd)}\u00a0{term.unit}"
-                for term in terms[:TERMS_NAMED]]
-        others = len(terms) - TERMS_NAMED
+                for term in terms[:terms_named]]
+        others = len(terms) - terms_named
         found.append(f"The instrument is not what the map assumes: {'; '.join(said)}"
                      + (f"; and {others} more of the parameters in the table" if others > 0
                         else "")
@@ -261,8 +254,9 @@ OPEN_SIGN = (
 
 def _numbers(rows: Sequence[int]) -> str:
     """Return the numbers of some rows, the first ones of many."""
-    more = f" and {len(rows) - ROWS_NAMED} more" if len(rows) > ROWS_NAMED else ""
-    return f"{', '.join(map(str, rows[:ROWS_NAMED]))}{more}"
+    rows_named = 10  # number of broken rows that are listed by number
+    more = f" and {len(rows) - rows_named} more" if len(rows) > rows_named else ""
+    return f"{', '.join(map(str, rows[:rows_named]))}{more}"
 
 
 BROKEN = {"zero": "all components are zero",
@@ -457,11 +451,12 @@ def corrected(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
 
 def _maps(points: Floats, field: Floats, check: MapCheck) -> Figure:
     """Draw every column as it was measured, and its residual, over the points of the map."""
+    zero = 1e-6  # part of the largest reading below which a column holds nothing, and is not drawn
     panel = panels(points)[0]
     out = np.flatnonzero(check.excluded[panel.points])
     largest = float(np.nanmax(np.abs(field)))
     shown = [number for number in range(3)
-             if np.nanmax(np.abs(field[:, number]), initial=0.0) > ZERO * largest]
+             if np.nanmax(np.abs(field[:, number]), initial=0.0) > zero * largest]
     figure = figure_of(0.6 + 2.4 * len(shown))
     # axes that are drawn to scale move their labels outwards
     figure.set_layout_engine("constrained", rect=(0.03, 0.0, 0.95, 1.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -24,6 +23,7 @@ from halbach_fe.report.page import (
     Page,
     Section,
     Table,
+    Text,
     figure_of,
     legend_above,
     linearized,
@@ -49,10 +49,6 @@ COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
 SHIFT = 0.18
 """Horizontal distance between the markers of different magnets at the same order."""
-
-MAIN_FROM_SD = 3.0
-"""Size of the main multipole, in its standard deviations, up to which there is none."""
-
 
 
 def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, object]:
@@ -157,14 +153,25 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     return f"{where} the {name} is {size}\u00a0{unit}{by}."
 
 
-def middle_table(tables: Sequence[MultipoleTable], study: Study) -> dict[str, Any]:
-    """Return the template variables of the table of `middle_circle`; empty without circles."""
+def sections_of_circles(
+    tables: Sequence[MultipoleTable], study: Study, origin: str, error: str = "",
+    warning: Sequence[Text] = (),
+) -> list[Section]:
+    """Return what a page says of the multipoles of full circles; nothing without any.
+
+    ``origin`` says of what circle they are, and ``error`` what their error bars are.
+    """
     if not tables:
-        return {}
+        return []
     model, magnets = middle_circle(tables)
     mains = "; ".join(f"{name} {main_in_words(model, known)}" for name, known in magnets.items())
-    return {"reference": reference_text(model, study), "mains": mains,
-            "rows": text_table(**magnets), "circles": len(tables)}
+    nearest = " and the z nearest to 0" if study.dimension == 3 else ""
+    others = "" if len(tables) == 1 else (
+        f" multipoles.csv has all {len(tables)} circles, each in units of the main multipole at "
+        f"its radius{nearest}.")
+    return [Section([
+        *warning, f"{reference_text(model, study)}{error} Main multipole: {mains}. {origin}"
+        f"{others}", Table(text_table(**magnets), "numbers")], "Multipoles")]
 
 
 def _summary(
@@ -258,7 +265,9 @@ def lacks_main(known: Multipoles) -> bool:
 
     Units of 1e-4 of it mean nothing then.
     """
-    return known.main <= MAIN_FROM_SD * known.main_sd
+    # Size of the main multipole, in its standard deviations, up to which there is none.
+    main_from_sd = 3.0
+    return known.main <= main_from_sd * known.main_sd
 
 
 def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:

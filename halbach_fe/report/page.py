@@ -140,8 +140,9 @@ class Page:
     """Figures that a notebook shows in place of tables."""
     files: Mapping[str, Callable[[Path], object] | None] = field(default_factory=dict)
     """How each further file is written, by name; None if the one before it is written with it."""
-    new_study: tuple[str, Sequence[tuple[Study, str]]] | None = None
-    """File of a changed study; the studies after each change, with a note that says it there."""
+    new_study: tuple[str, Callable[[], Iterable[tuple[Study, str]]]] | None = None
+    """File of a changed study; the studies after each change, with a note that says it there. It
+    is written last, as one that is not valid is refused."""
     folders: Mapping[str, Page] = field(default_factory=dict)
     """Pages of parts of the result, each in a folder of its own beside the page, by its name."""
     remarks: Sequence[str] = ()
@@ -209,9 +210,6 @@ def write_files(page: Page, folder: Path, file: Path | None = None) -> Path:
     for name, write in page.files.items():
         if write is not None:
             write(folder / name)
-    if page.new_study is not None:
-        name, steps = page.new_study
-        write_changed_study(folder / name, steps, file, page.study)
     if page.stored:
         write_text(folder / f"{page.name}.json",
                    json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
@@ -220,11 +218,14 @@ def write_files(page: Page, folder: Path, file: Path | None = None) -> Path:
     write_page(path, "page.html.j2", pictures, page.study, page.provenance, answer=page.answer,
                rows=page.rows or next(iter(page.tables.values()), ()), page=page,
                drawn={picture.file: picture for picture in pictures})
+    if page.new_study is not None:
+        name, steps = page.new_study
+        write_changed_study(folder / name, steps(), file, page.study)
     return path
 
 
 def write_changed_study(
-    path: Path, steps: Sequence[tuple[Study, str]], file: Path | None, whole: Study | None = None,
+    path: Path, steps: Iterable[tuple[Study, str]], file: Path | None, whole: Study | None = None,
 ) -> None:
     """Write a study after some changes, which finds the maps that it lists.
 
@@ -455,18 +456,6 @@ MOST_MEASURED = 10_000
 """Largest number of blocks whose sides are searched for their distance from the axis; of more the
 corners are drawn."""
 
-MOST_NUMBERED = 40
-"""Largest number of blocks in a cross-section whose slots are numbered."""
-
-
-OUTERMOST = 0.9
-"""Distance from the axis, relative to that of the farthest block, from which blocks are numbered:
-those of an inner layer have the same slots."""
-
-SMALL_BLOCK = 0.15
-"""Distance from a block's middle to its outer side, relative to that from the axis, below which a
-number has no place in it."""
-
 
 def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> None:
     """Draw the blocks at the first ring's height, with their easy axes, and the iron, in mm.
@@ -474,12 +463,19 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
     ``colour`` is that of the blocks. Their slots have numbers and their easy axes are drawn, unless
     there are too many to read.
     """
+    # Distance from a block's middle to its outer side, relative to that from the axis, below which
+    # a number has no place in it.
+    small_block = 0.15
+    # Distance from the axis, relative to that of the farthest block, from which blocks are
+    # numbered: those of an inner layer have the same slots.
+    outermost = 0.9
+    most_numbered = 40  # largest number of blocks in a cross-section whose slots are numbered
     t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
         block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
     reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
-    numbered = reach > 0 and len(shown) <= MOST_NUMBERED
+    numbered = reach > 0 and len(shown) <= most_numbered
     outlines = []
     for block in shown:
         edges = np.vstack([edge.at(t)[0] for edge in block.outline])
@@ -496,11 +492,11 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
                       middle - length * np.array(block.easy_axis[:2]),
                       arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
         distance = float(np.hypot(*middle))
-        if numbered and distance > OUTERMOST * reach:
+        if numbered and distance > outermost * reach:
             outwards = middle / distance
             edge = float((outline @ outwards).max())
             # between the arrow and the outer side of a large block, beyond that of a small one
-            beyond = edge - distance < SMALL_BLOCK * reach
+            beyond = edge - distance < small_block * reach
             if beyond:
                 axis.margins(0.12)
             axis.annotate(

@@ -35,9 +35,6 @@ being made smaller, so that its texts keep their size on paper, and on a screen 
 LEGIBLE_PX, POINTS_PER_INCH = 9, 72
 """Size in px at which a text can still be read on a screen."""
 
-LONGEST_TEXT = 10_000
-"""Largest number of characters of a text. The longest answers have some thousand."""
-
 
 class Picture(NamedTuple):
     """A figure in a page.
@@ -73,7 +70,9 @@ class Picture(NamedTuple):
 
 def _cleaned(text: str) -> str:
     """Return a text without control characters."""
-    return printable(text, LONGEST_TEXT)
+    # Largest number of characters of a text. The longest answers have some thousand.
+    longest_text = 10_000
+    return printable(text, longest_text)
 
 
 def _cleaned_answer(answer: Answer) -> Answer:

@@ -38,9 +38,6 @@ LITTLE = 0.97
 """Uncertainty relative to that of as many of the study's positions from which on a plan is hardly
 better."""
 
-VAGUE = 0.7
-"""Uncertainty relative to the prior's from which on the readings tell little of single blocks."""
-
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
 
@@ -87,6 +84,8 @@ def _of_study(plan: MeasurementPlan) -> float:
 
 def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
+    # Uncertainty relative to the prior's from which on the readings tell little of single blocks.
+    vague = 0.7
     points, same = len(plan.points), plan.same_information
     everything = points == len(plan.candidates)
     nearly = _nearly(plan)
@@ -111,7 +110,7 @@ def answer(plan: MeasurementPlan) -> Answer:
                  f"{better if left < blocks else 'The'} uncertainty of "
                  f"{'such a pattern' if left < blocks else 'patterns of blocks'}, by which the "
                  f"positions are chosen, falls to {fraction(left)} (geometric mean){beside}. ")
-        if left > VAGUE:
+        if left > vague:
             said += ("So such a map tells little of the single blocks, at whatever positions of "
                      "these it is measured. Measure the blocks before assembly, or the field "
                      "nearer to them. ")

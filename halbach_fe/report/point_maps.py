@@ -20,12 +20,6 @@ from halbach_fe.report.page import figure_of
 SAME = 1e-3
 """Part of the size of a map within which lengths count as equal."""
 
-FEW_RADII = 3
-"""Largest number of radii for which points count as circles about the axis."""
-
-MOST_ASPECT = 4.0
-"""Largest ratio of the sides of a slice that is drawn to scale. A longer one would be a line."""
-
 FEWEST = 12
 """Fewest points in a slice; with fewer all points are drawn by angle and z."""
 
@@ -82,6 +76,7 @@ def curve(points: Floats) -> tuple[Floats, str] | None:
 
 def panels(points: Floats) -> list[Panel]:
     """Return the planes in which points (n, 3) in m are drawn, which lie on no `curve`."""
+    few_radii = 3  # largest number of radii for which points count as circles about the axis
     every, z = np.arange(len(points)), 1e3 * points[:, 2]
     size = float(np.ptp(points, axis=0).max())
     radii = np.hypot(points[:, 0], points[:, 1])
@@ -96,7 +91,7 @@ def panels(points: Floats) -> list[Panel]:
     if np.ptp(from_middle) <= 10 * SAME * from_middle.max():
         return [unrolled(f"on the sphere of {2e3 * from_middle.mean():.4g} mm diameter", every)]
     different, number = _different(radii, SAME * size)
-    if len(different) <= FEW_RADII and np.abs(radii - different[number]).max() <= SAME * size:
+    if len(different) <= few_radii and np.abs(radii - different[number]).max() <= SAME * size:
         return [unrolled(f"at the radius of {1e3 * radius:.4g} mm", np.flatnonzero(number == one))
                 for one, radius in reversed(list(enumerate(different))) if radius > SAME * size]
     spacing = point_spacing(points)
@@ -147,6 +142,8 @@ def _slice(points: Floats, chosen: Ints, across: int) -> Panel:
 
 def draw(axis: Axes, panel: Panel, values: Floats, **colours: Any) -> ScalarMappable:
     """Draw values (n,) at the points of a panel: as cells if they fill a grid, else as squares."""
+    # Largest ratio of the sides of a slice that is drawn to scale. A longer one would be a line.
+    most_aspect = 4.0
     columns, column = _different(panel.first, SAME * float(np.ptp(panel.first)))
     rows, row = _different(panel.second, SAME * float(np.ptp(panel.second)))
     if len(columns) * len(rows) == len(values) and min(len(columns), len(rows)) > 1:
@@ -160,7 +157,7 @@ def draw(axis: Axes, panel: Panel, values: Floats, **colours: Any) -> ScalarMapp
     axis.set(xlabel=panel.labels[0], ylabel=panel.labels[1])
     if panel.lengths:
         sides = sorted(float(np.ptp(side)) for side in (panel.first, panel.second))
-        axis.set_aspect("equal" if sides[1] <= MOST_ASPECT * sides[0] else "auto")
+        axis.set_aspect("equal" if sides[1] <= most_aspect * sides[0] else "auto")
     else:
         axis.set_yticks(range(0, 361, 90))
     axis.set_facecolor("#eeeeee")

@@ -44,12 +44,6 @@ FAR = 12.0
 FEWEST_ON_A_LINE = 5
 """Fewest readings of a profile."""
 
-CROWD = 3000
-"""Number of readings from which smaller, transparent markers are used."""
-
-DRAWN_QUANTILES = 2000
-"""Largest number of quantiles that are drawn."""
-
 
 @dataclass(frozen=True)
 class PublishedErrors:
@@ -246,22 +240,23 @@ def relative_error_figure(result: InferenceResult, published: PublishedErrors | 
 
 def standardized_residuals_figure(result: InferenceResult) -> Figure:
     """Draw the standardized residuals of all readings for prior and posterior."""
+    crowd = 3000  # number of readings from which smaller, transparent markers are used
     place, label = axis_of_readings(result)
     figure, axes = stacked_axes(2)
     for axis, (name, prediction, colour) in zip(axes, _predictions(result), strict=True):
         scores = result.standardized(prediction)
         for part, mask in _parts(result, np.arange(len(scores))):
-            style = {"marker": ".", "ms": 1.5} if len(scores) > CROWD else MARKERS[part]
+            style = {"marker": ".", "ms": 1.5} if len(scores) > crowd else MARKERS[part]
             axis.plot(place[mask], scores[mask], ls="none", label=part, **style,
                       color=MEASURED if part == TRAINING else colour,
-                      alpha=0.5 if part == TRAINING or len(scores) > CROWD else 1)
+                      alpha=0.5 if part == TRAINING or len(scores) > crowd else 1)
         axis.axhspan(-COVERAGE_Z, COVERAGE_Z, color=PUBLISHED, alpha=0.2, lw=0)
         axis.set_ylabel(f"standardized\nresidual, {name}")
         _scale(axis, scores)
     legend = figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False,
-        markerscale=5 if len(result.readings) > CROWD else 1)
-    if len(result.readings) <= CROWD:  # the markers tell the parts apart, in two colours
+        markerscale=5 if len(result.readings) > crowd else 1)
+    if len(result.readings) <= crowd:  # the markers tell the parts apart, in two colours
         for handle in filter(None, legend.legend_handles):
             handle.set(color=MEASURED, alpha=1.0)
     axes[1].set_xlabel(label)
@@ -274,12 +269,13 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     The residuals are those of the held-out readings for prior and posterior. If nothing is held
     out, they are those of the training readings for the prior, which does not depend on them.
     """
+    drawn_quantiles = 2000  # largest number of quantiles that are drawn
     figure = figure_of(5.4, 5.2)
     axis = figure.subplots()
     unseen = result.held_out.any()
     chosen = result.held_out if unseen else ~result.held_out
     count = int(chosen.sum())
-    rank = np.unique(np.linspace(1, count, min(count, DRAWN_QUANTILES)).round().astype(int))
+    rank = np.unique(np.linspace(1, count, min(count, drawn_quantiles)).round().astype(int))
     normal = special.ndtri((rank - 0.5) / count)
     axis.fill_between(normal, *special.ndtri(
         [special.betaincinv(rank, count - rank + 1, p) for p in (0.025, 0.975)]),

@@ -29,8 +29,6 @@ ALONG_Z = 1e-9
 """Part of a magnetization in the plane of the ring below which it is along z."""
 
 NOTHING = "–"
-SIMULATIONS = 1000
-"""Number of simulated normal samples from which the band of the figure is taken."""
 
 
 def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
@@ -287,6 +285,8 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
 
     The simulated samples of the band are standardized in the same way.
     """
+    # Number of simulated normal samples from which the band of the figure is taken.
+    simulations = 1000
     groups = [samples.deviations for samples in prior.types if len(samples.deviations) > 2]
     figure = figure_of(3.9)
     axes = figure.subplots(1, prior.types[0].deviations.shape[1], sharey=True, squeeze=False)[0]
@@ -294,7 +294,7 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
     expected = special.ndtri((np.arange(count) + 0.5) / count)
     generator = np.random.default_rng(1)
     simulated = np.sort(np.concatenate([
-        _standardized(generator.standard_normal((len(group), SIMULATIONS))) for group in groups
+        _standardized(generator.standard_normal((len(group), simulations))) for group in groups
     ]), axis=0)
     band = np.quantile(simulated, [0.025, 0.5, 0.975], axis=1)
     found = np.sort(np.concatenate([_standardized(group) for group in groups]), axis=0)

@@ -66,11 +66,6 @@ NOTE = "of halbach-fe register"
 EQUALLY_GOOD = 0.05
 """Odds from which a second pose is reported as a possible one."""
 
-
-SAME_FIT = 0.01
-"""Difference of residuals, relative to them, up to which two poses are equally far from the
-readings. The fits of a symmetric magnet's two poses ended within 1e-5 of each other."""
-
 SAME_PLACE = 4.0
 """Distance in standard deviations up to which two poses are the same place but for a symmetry."""
 
@@ -90,10 +85,6 @@ USE_ANY = (
     "may be used. Only the names of blocks are exchanged, which matters if you look for one block "
     "or give measured blocks (--blocks): then find out by a mark on the magnet which pose is the "
     "real one.")
-
-CERTAIN_SD = 3.0
-"""Standard deviations up to which a pose or an error of a probe counts as zero: of some 25 such
-numbers that are zero, one is farther away in one of 15 maps."""
 
 NEAR_M, NEAR_RAD = 1e-3, 1e-2
 """Shift and turn up to which `diagnose` finds a map's pose from that of the study."""
@@ -262,12 +253,15 @@ def _is_as_assumed(best: Registration, assumed: Instrument) -> bool:
     """Tell whether the registration found, within its errors, the instrument that the study
     states; without [instrument] that is a probe without errors in the axes of the magnet.
     """
+    # Standard deviations up to which a pose or an error of a probe counts as zero: of some 25 such
+    # numbers that are zero, one is farther away in one of 15 maps.
+    certain_sd = 3.0
     probe = best.probe
     sizes = [best.translation_sd_m, best.rotation_sd_rad, probe.gain, probe.offset_T,
              probe.crosstalk, probe.sensor_m]
     return not best.open_keys and (best.instrument.position_axes, best.instrument.field_axes) == (
         assumed.position_axes, assumed.field_axes) and all(
-        np.all(np.abs(new - old) <= CERTAIN_SD * np.asarray(sd)) for new, old, sd in zip(
+        np.all(np.abs(new - old) <= certain_sd * np.asarray(sd)) for new, old, sd in zip(
             _numbers(best.instrument), _numbers(assumed), sizes, strict=True))
 
 
@@ -342,8 +336,11 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
 
 def _fit_alike(one: Registration, other: Registration) -> bool:
     """Tell whether two poses are equally probable, and equally far from the readings."""
+    # Difference of residuals, relative to them, up to which two poses are equally far from the
+    # readings. The fits of a symmetric magnet's two poses ended within 1e-5 of each other.
+    same_fit = 0.01
     return abs(one.log_evidence - other.log_evidence) < EQUAL_LOG_EVIDENCE and all(
-        np.isclose(np.nanmean(first**2), np.nanmean(second**2), rtol=2 * SAME_FIT)
+        np.isclose(np.nanmean(first**2), np.nanmean(second**2), rtol=2 * same_fit)
         for first, second in ((one.rms_T, other.rms_T), (one.nominal_rms_T, other.nominal_rms_T)))
 
 
@@ -553,7 +550,7 @@ def page(
             "The readings along the magnet's axis and in its cross-section, where the registration "
             "puts them"))},
         files=files, stem="registration", remarks=said,
-        new_study=None if name else (STUDY_FILE, [(best.study, NOTE)]))
+        new_study=None if name else (STUDY_FILE, lambda: [(best.study, NOTE)]))
 
 
 def pages_of_maps(

@@ -224,4 +224,4 @@ def page(found: Designed) -> Page:
             "front.png": (
                 partial(front_figure, found), "What more field costs: designs of larger fields")},
         files={"rings.csv": csv_file(_columns(found), {"study": found.study.name})},
-        new_study=(STUDY_FILE, [(found.study, "found by halbach-fe design")]))
+        new_study=(STUDY_FILE, lambda: [(found.study, "found by halbach-fe design")]))

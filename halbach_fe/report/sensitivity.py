@@ -34,9 +34,6 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.words import flux_density, fraction
 
-SMALLEST_SHOWN = 1e-4
-"""Smallest change that has a colour of its own, relative to the largest."""
-
 
 @dataclass(frozen=True)
 class Sensitivity:
@@ -146,13 +143,14 @@ def plan_rows(plans: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
 
 def _derivative_figure(magnet: Magnet, found: Sensitivity) -> Figure:
     """Draw by how much 1 % more magnetization of the block changes B, with all blocks."""
+    smallest_shown = 1e-4  # smallest change that has a colour of its own, relative to the largest
     figure = figure_of(6)
     axis = figure.subplots()
     block = next(each for each in magnet.blocks if each.slot == found.block)
     change_mT = 1e3 * 0.01 * float(np.linalg.norm(block.magnetization)) * found.size
     largest = float(np.nanmax(change_mT))
     shown = axis.pcolormesh(1e3 * found.x, 1e3 * found.y, change_mT, shading="nearest",
-                            norm=LogNorm(largest * SMALLEST_SHOWN, largest), cmap="cividis",
+                            norm=LogNorm(largest * smallest_shown, largest), cmap="cividis",
                             rasterized=True)
     draw_cross_section(axis, magnet, "black")
     outline = np.vstack([edge.at(np.linspace(0, 1, 9))[0] for edge in block.outline])

@@ -333,10 +333,10 @@ def page(shim: Shim) -> Page:
             "shim_gain.png": (
                 partial(_gain_figure, shim), f"Root mean square of {_values_text(shim)} after each "
                 "move, including the uncertainty")}
+    shimmed, note = shim.shimmed_study, f"shimmed: {len(shim.steps)} moves"
     return Page("shim", "how to shim it", shim.study, answer(shim), _summary(shim), sections,
                 {move_title: moves, title: rows}, rows, figures, new_study=(
-        None if shim.shimmed_study is None else
-        (STUDY_FILE, [(shim.shimmed_study, f"shimmed: {len(shim.steps)} moves")])))
+        None if shimmed is None else (STUDY_FILE, lambda: [(shimmed, note)])))
 
 
 def _of_the_moves(shim: Shim) -> str:

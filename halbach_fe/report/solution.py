@@ -16,7 +16,7 @@ from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magne
 from halbach_fe.report.multipoles import (
     MultipoleTable,
     main_field_in_words,
-    middle_table,
+    sections_of_circles,
     write_multipole_csv,
 )
 from halbach_fe.report.page import (
@@ -142,7 +142,11 @@ def page(solution: Solution) -> Page:
     return Page(
         "solve", "the nominal magnet", study, answer(solution, multipoles), solution.summary(), [
             Section([view]), Section([Table(rows)], "The field at the study's positions"),
-            *sections_of_stray(solution.stray_field), *_sections_of_circles(solution, multipoles),
+            *sections_of_stray(solution.stray_field), *sections_of_circles(
+                multipoles, study, "They are those of the circle's own points. With m points, "
+                "order n would contain order m − n too; that part is subtracted, as the blocks "
+                "make it in vacuum.", "" if not solution.errors.any() else
+                " ± is the standard deviation that the solver's error allows."),
             Section([*map(Drawn, [*figures][1:])], "Pictures"),
             Section([Table([{"quantity": name, "value": value}
                             for name, value in magnet_rows(magnet)])], "Model")],
@@ -151,27 +155,6 @@ def page(solution: Solution) -> Page:
         figures=figures, shown=("field.png",), files=files, stored=False, stem="report",
         provenance={"GetDP": solution.getdp, "method": study.solver.method,
                     "points, readings": f"{len(solution.points)}, {len(solution.readings)}"})
-
-
-def _sections_of_circles(
-    solution: Solution, tables: Sequence[MultipoleTable]
-) -> list[Section]:
-    """Return what the page says of the multipoles of full circles; nothing without any."""
-    if not tables:
-        return []
-    study = solution.magnet.study
-    said = middle_table(tables, study)
-    error = "" if not solution.errors.any() else (
-        " ± is the standard deviation that the solver's error allows.")
-    nearest = " and the z nearest to 0" if study.dimension == 3 else ""
-    others = "" if len(tables) == 1 else (
-        f" multipoles.csv has all {len(tables)} circles, each in units of the main multipole at "
-        f"its radius{nearest}.")
-    return [Section([
-        f"{said['reference']}{error} Main multipole: {said['mains']}. They are those of the "
-        "circle's own points. With m points, order n would contain order m − n too; that part is "
-        f"subtracted, as the blocks make it in vacuum.{others}",
-        Table(said["rows"], "numbers")], "Multipoles")]
 
 
 def field_table(solution: Solution) -> list[dict[str, str]]:
