@@ -61,6 +61,14 @@ def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
         for each in result.overlaps]
 
 
+def left_out_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: how maps, or ends of the only one, are predicted that were left out."""
+    return [{
+        "left out": each.name or "ends of the map", "readings": str(each.readings),
+        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "over noise": decimals(each.over_noise),
+        "chi²/reading": decimals(each.chi2)} for each in result.regions_left_out]
+
+
 def maps_figure(result: InferenceResult) -> Figure:
     """Draw where the maps lie in the magnet."""
     figure = figure_of(3.6)

@@ -12,7 +12,13 @@ from matplotlib.patches import Rectangle
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.campaign_inference import maps_figure, overlap_table, pose_table, term_table
+from halbach_fe.report.campaign_inference import (
+    left_out_table,
+    maps_figure,
+    overlap_table,
+    pose_table,
+    term_table,
+)
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
@@ -196,6 +202,7 @@ def write_inference_report(
         answer=said, blocks=block_table(result),
         contraction=_contraction_in_words(result, contraction),
         terms=term_table(result), poses=pose_table(result), overlaps=overlap_table(result),
+        left_out=left_out_table(result),
         noise=[flux_density(float(end), 2)
                for end in (result.noise.sd.min(), result.noise.sd.max())],
         position_sd=[f"{1e3 * sd:.3g}" for sd in (
