@@ -403,7 +403,7 @@ def multipoles(
         for model in models], disagreement_of(posterior), left_out)
 
 
-@typed
+@alone
 def field(
     magnet: Magnet, lines: Lines, session: Session = NOT_KEPT,
     posterior: Mapping[str, Gaussian] | InferenceResult | None = None, inside: bool = False,

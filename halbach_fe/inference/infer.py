@@ -23,7 +23,7 @@ from halbach_fe.inference.instrument_fit import (
     of_the_first,
     readings_of_field,
 )
-from halbach_fe.inference.overlap import overlaps
+from halbach_fe.inference.overlap import left_out, overlaps
 from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
 from halbach_fe.inference.result import (
     Amplitudes,
@@ -280,6 +280,7 @@ def infer(
         if len(open_terms) else None,
         amplitudes=_amplitudes(magnet.study, whole, len(model.parameters)),
         overlaps=overlaps(matrix, residual, errors, whole_prior, readings),
+        regions_left_out=left_out(matrix, residual, errors, whole_prior, readings),
         noise_blocks=estimated)
 
 

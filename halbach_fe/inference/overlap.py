@@ -1,7 +1,9 @@
-"""Maps of one magnet test each other where they overlap.
+"""Readings that an update has not seen as a whole: those of another map, or the ends of the map.
 
-The readings of one map are compared with what an update by another map alone predicts there, by the
-covariance of prediction, noise, and what is not known about the instruments.
+Where two maps overlap, the readings of one are compared with what an update by the other alone
+predicts there, by the covariance of prediction, noise, and what is not known about the instruments.
+A magnet is judged where nobody measured: by a map, or ends of the only one, that are left out.
+Lines that are held out between others say nothing of that.
 """
 
 from __future__ import annotations
@@ -9,11 +11,12 @@ from __future__ import annotations
 from itertools import permutations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.readings import Readings
-from halbach_fe.inference.result import HELD_OUT, Overlap
+from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, LeftOut, Overlap
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
@@ -23,6 +26,15 @@ from halbach_fe.stats.noise import NoiseCovariance
 NEAR = 0.87
 """Distance from the nearest point of another map, in units of that map's spacing, up to which maps
 overlap: half the diagonal of a cell of its grid."""
+
+END = 0.15
+"""Part of the length of a single map that is left out at each end."""
+
+ENOUGH = 20
+"""Fewest readings that are left out, and that are left: chi-squared of 20 has a sd of a third."""
+
+MOST = 4000
+"""Largest number of readings that are compared: chi-squared of 4 000 is known to 2 %."""
 
 
 def overlaps(
@@ -71,3 +83,46 @@ def overlaps(
             found.append(Overlap(name, by, len(index), bool(held_out[index].all()),
                                  float(np.sqrt(np.mean(off**2))), float(np.mean(white**2))))
     return tuple(found)
+
+
+def left_out(
+    matrix: Rows, residual: Floats, errors: NoiseCovariance, prior: Gaussian, readings: Readings
+) -> tuple[LeftOut, ...]:
+    """Return how an update by the others predicts each map, or that by its middle the ends of one.
+
+    The arguments are those of `overlaps`. The response is the one of the update by all readings.
+    Where a map lies and what only its probe does, no other map tells: the rms, not chi-squared, is
+    that with these terms fitted to the map itself.
+    """
+    found = []
+    for name, chosen in _regions(readings).items():
+        rows, index = np.flatnonzero(readings.training & ~chosen), np.flatnonzero(chosen)
+        if min(len(rows), len(index)) < ENOUGH:
+            continue
+        index = index[::-(-len(index) // MOST)]
+        updated = linear_gaussian.update(
+            matrix, residual[rows], errors.subset(rows), prior, rows).distribution
+        response, noise = matrix[index], errors.subset(index)
+        off, root = residual[index] - response @ updated.mean, response @ updated.root
+        white = linear_gaussian.whitened(off, noise, root.__getitem__, root.shape[1])
+        own = ~np.any([matrix[rows[each]].any(axis=0) for each in linear_gaussian.row_slices(
+            len(rows), response.shape[1])], axis=0)
+        fitted = linear_gaussian.update(response, residual[index], noise, updated).distribution
+        off = off - response[:, own] @ (fitted.mean - updated.mean)[own]
+        found.append(LeftOut(name, len(index), float(np.sqrt(np.mean(off**2))),
+                             float(np.sqrt(np.mean(noise.sd**2))), float(np.mean(white**2))))
+    return tuple(found)
+
+
+def _regions(readings: Readings) -> dict[str, NDArray[np.bool_]]:
+    """Return the masks (readings,) of what is left out, by the name of a map; of one map, its ends
+    along the longest axis.
+    """
+    maps, own = np.array(readings.maps), np.array(readings.parts) != HELD_OUT_MAP
+    names = list(dict.fromkeys(maps[own].tolist()))
+    if len(names) > 1:
+        return {name: own & (maps == name) for name in names}
+    places = readings.observation.places
+    along = places[:, int(np.argmax(np.ptp(places[own], axis=0)))]
+    low, high = along[own].min(), along[own].max()
+    return {"": own & (np.abs(along - (low + high) / 2) > (0.5 - END) * (high - low))}

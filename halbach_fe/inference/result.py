@@ -252,6 +252,55 @@ class Overlap:
         return ""
 
 
+WELL = 2.0
+"""rms of a map that was left out, in units of its noise, up to which its magnet is known there."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """How an update that has not seen a whole map, or the ends of the only one, predicts it.
+
+    Attributes
+    ----------
+    name : str
+        The map; empty if it is the ends of the only one.
+    readings : int
+    rms_T : float
+        Rms difference from the prediction, with the pose and the probe that only this map has.
+    noise_T : float
+        Rms of noise and solver error of these readings.
+    chi2 : float
+        Chi-squared per reading, by the covariance of prediction, noise and instruments.
+    """
+
+    name: str
+    readings: int
+    rms_T: float
+    noise_T: float
+    chi2: float
+
+    @property
+    def over_noise(self) -> float:
+        """The rms difference in units of the noise."""
+        return self.rms_T / self.noise_T
+
+    @property
+    def in_words(self) -> str:
+        """What was left out, and how well it is predicted."""
+        what = (f"Map {self.name}, left out, is predicted by the others" if self.name else
+                "The ends of the map, left out, are predicted by its middle")
+        return (f"{what} to {decimals(self.over_noise, 2)} times its noise (chi² per reading "
+                f"{decimals(self.chi2, 2)})")
+
+    @property
+    def disagreement(self) -> str:
+        """A sentence if the prediction is farther off than its error bars allow, else nothing."""
+        limit = max(TOO_FAR, 1 + 5 * float(np.sqrt(2 / self.readings)))
+        return "" if self.chi2 <= limit else (
+            f"{self.in_words}, where at most {limit:.2g} is expected: where nobody "
+            "measured, the magnet is not what the update says, and its error bars are too small.")
+
+
 @dataclass(frozen=True)
 class RegionScore:
     """Scores of the predictions of prior and posterior for the readings of a region and a part.
@@ -354,6 +403,8 @@ class InferenceResult(ShownInNotebook):
         are none.
     overlaps : tuple of Overlap
         How maps agree where they overlap.
+    regions_left_out : tuple of LeftOut
+        How each map is predicted by the others, or the ends of a single one by its middle.
     noise_blocks : tuple of MagnetBlock or None
         Blocks in whose gradient uncertain positions make the noise, as a first update estimated
         them; None if they are the nominal ones.
@@ -397,6 +448,7 @@ class InferenceResult(ShownInNotebook):
     terms: InstrumentTerms | None = None
     amplitudes: Amplitudes | None = None
     overlaps: tuple[Overlap, ...] = ()
+    regions_left_out: tuple[LeftOut, ...] = ()
     noise_blocks: tuple[MagnetBlock, ...] | None = None
     stray_field: StrayField | None = None
     magnetic_axis: MagneticAxis | None = None
@@ -536,7 +588,8 @@ class InferenceResult(ShownInNotebook):
     def disagreement(self) -> str:
         """Sentences if prior, model and maps cannot all be right, else an empty string."""
         found = [self._conflict or self.too_near, self.held_out_conflict, self._doubted,
-                 *(each.disagreement for each in self.overlaps)]
+                 *(each.disagreement for each in self.overlaps),
+                 *(each.disagreement for each in self.regions_left_out)]
         if any(found) and not self.too_near:
             found += self.table_doubts
         return " ".join(sentence for sentence in found if sentence)
@@ -586,6 +639,10 @@ class InferenceResult(ShownInNotebook):
         if self.held_back:
             measured = self.measured_blocks is not None
             return Reservation(f"Only in part. {held_back_in_words(self.held_back, measured)}")
+        wide = [one for one in self.regions_left_out if one.name and one.over_noise > WELL]
+        if wide:
+            return Reservation(f"Only in part. {wide[0].in_words}: where no map lies, the magnet "
+                               "is known no better than its error bars say.")
         said = shared_in_words(self.shared_doubts, self.magnet.dimension == 2) or " ".join(
             self.table_doubts)
         return Reservation(f"Only with care. {said}" if said else "")

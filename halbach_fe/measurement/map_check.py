@@ -66,8 +66,10 @@ from halbach_fe.measurement.scan_lines import (
     scan_lines,
 )
 from halbach_fe.measurement.suspect_rows import (
+    at_border,
     broken_rows,
     contradicted_rows,
+    neighbours,
     quadratic_residual,
     rough_rows,
     scatter_around,
@@ -651,10 +653,15 @@ def _without_spikes(
 ) -> tuple[_Fitted, _Fitted, _Rows]:
     """Return the fits of all chosen rows and of those that are not held out, and the rows.
 
-    Spikes among the rows are added to ``broken`` and left out.
+    Spikes among the rows are added to ``broken`` and left out. Lines at the border of a large map
+    that are not fitted are extrapolated, whole edges by 1 mT in a map near a magnet: what is far
+    off there is no spike.
     """
     whole = fitted.by(rows.chosen)
-    spike = spikes(whole.model.points, whole.left / whole.model.scatter[:, None], rows.usable)
+    points, known = whole.model.points, rows.chosen.copy()
+    inside = points[rows.usable]
+    known[rows.usable] |= ~at_border(inside, neighbours(inside))
+    spike = known & spikes(points, whole.left / whole.model.scatter[:, None], rows.usable)
     if not spike.any():
         return whole, fitted, rows
     broken["spike"] = sorted([*broken.get("spike", ()), *(1 + np.flatnonzero(spike)).tolist()])

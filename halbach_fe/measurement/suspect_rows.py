@@ -108,7 +108,7 @@ def rough_rows(
         size = np.linalg.norm(residual[rows], axis=1)
         worst = spikes(points, residual, usable & ~found, 1.0)
         around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
-        limit = np.where(_at_border(points[rows], near), 1.0, OF_RANGE)
+        limit = np.where(at_border(points[rows], near), 1.0, OF_RANGE)
         worst[rows] &= (size > ROUGH * size[near].max(axis=1)) & (size > limit * around)
         if not worst.any():
             break
@@ -116,7 +116,7 @@ def rough_rows(
     return found
 
 
-def _at_border(points: Floats, near: Ints) -> NDArray[np.bool_]:
+def at_border(points: Floats, near: Ints) -> NDArray[np.bool_]:
     """Tell which points (n, 3) have all their neighbours (n, k) on one side, along any axis."""
     away = (points[near] - points[:, None]) / point_spacing(points)
     low, high = away.min(axis=1), away.max(axis=1)

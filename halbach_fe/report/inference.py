@@ -98,6 +98,14 @@ def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
         for each in result.overlaps]
 
 
+def left_out_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: how maps, or ends of the only one, are predicted that were left out."""
+    return [{
+        "left out": each.name or "ends of the map", "readings": str(each.readings),
+        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "over noise": decimals(each.over_noise),
+        "chi²/reading": decimals(each.chi2)} for each in result.regions_left_out]
+
+
 def maps_figure(result: InferenceResult) -> Figure:
     """Draw where the maps lie in the magnet."""
     figure = figure_of(3.6)
@@ -306,6 +314,7 @@ def page(
          "The instruments, estimated with the blocks": term_table(result),
          "Where the maps lie in the magnet": pose_table(result),
          "Maps where they overlap": overlap_table(result),
+         "Where nobody measured": left_out_table(result),
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
         new_study=None if result.terms is None else (STUDY_FILE, lambda: [(result.study, NOTE)]))
@@ -392,6 +401,7 @@ def _before_and_after(rows: Sequence[Mapping[str, str]], published: bool) -> Sec
 def _sections_of_maps(result: InferenceResult) -> list[Section]:
     """Return what the page says of several maps, of where they lie and of their instruments."""
     overlaps, poses, terms = overlap_table(result), pose_table(result), term_table(result)
+    left_out = left_out_table(result)
     found = ["Estimated together with the magnetizations, whose error bars include what remains "
              "uncertain here."]
     if result.terms:
@@ -409,6 +419,13 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
             "other alone predicts there. chi² is 1 on average if they are of the same magnet, and "
             "pose, probe and noise are as stated or uncertain.", Table(overlaps)],
             "Do the maps agree?"),
+        Section([] if not left_out else [
+            "Readings that were left out as a whole, each map in turn or the ends of the only one, "
+            "predicted by an update with all others. Held-out lines between other lines say "
+            "nothing of that. The rms difference is that with the pose and the probe that only "
+            "this map has fitted to it; chi² is 1 on average if the error bars hold.",
+            Table(left_out)],
+            "Where nobody measured"),
         Section([] if not poses else ["In the magnet's axes, as the update found it.",
                                       Table(poses)], "Where the maps lie"),
         Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]

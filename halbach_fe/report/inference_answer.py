@@ -59,13 +59,15 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
     single, shared = result.held_back, result.shared_doubts
-    verdict = (f"{result.reservation} {'Model' if single else 'But model'}"
+    verdict = (f"{result.reservation} {'But model' if shared else 'Model'}"
                if result.reservation else "Yes. Model")
+    worst = max(result.regions_left_out, key=lambda one: one.over_noise, default=None)
+    unseen = "" if worst is None or worst.in_words in verdict else f" {worst.in_words}."
     return Answer(
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         f"{verdict} and readings agree: chi² per reading before the update is "
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
-        f"{result.conflict_limit:.2g} is rare.{tested}{at_rest}{_of_the_probe(result)}"
+        f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}{_of_the_probe(result)}"
         f"{_of_the_sign(result)}{solver}",
         *(LOOK if single or (shared and "update again" not in result.reservation) else
           AGAIN if shared else OF_THE_TABLE if result.table_doubts else _after_agreement(result)),

@@ -240,8 +240,7 @@ def _through_blocks(
             "another magnet", "Leave the points out, or the key that says so of the magnet."))
     outside = number < 0
     points = points.copy()
-<<<<<<< HEAD
-    points[outside] = check_points(magnet, points[outside])
+    points[outside] = check_points(magnet, points[outside], OF_LINES)
     strength, error = external_field(magnet, points) + field_of(blocks, points), 0 * points
     if not magnet.is_vacuum:
         reaction, error = _reaction(magnet, points, number, session)
@@ -294,11 +293,3 @@ def _reaction(
         field[here] = strength - field_of(magnet.blocks, points[here])
         error[here] = bar + (solved.iron.error(points[here]) if solved.iron is not None else 0.0)
     return field, error
-=======
-    points[outside] = check_points(magnet, points[outside], OF_LINES)
-    matrix = np.empty((len(points), 3, count))
-    for block, field in enumerate(unit_fields(magnet.blocks, points)):
-        field[number == block] += np.eye(3)  # B = mu_0 H + J
-        matrix[:, :, 3 * block:3 * block + 3] = MU_0 * field
-    return external_field(magnet, points), matrix
->>>>>>> use44

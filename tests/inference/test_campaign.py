@@ -19,6 +19,7 @@ from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import infer as infer_module
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.storage import inference_summary
 from halbach_fe.measurement.campaign import maps_of, read_maps
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import concatenate, observe
@@ -29,7 +30,16 @@ from halbach_fe.stats.gaussian import root_matrix
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
-from tests.support.short_dipole import BODY, FRINGE, NOISE_T, TEXT, campaign_study, reading, truth
+from tests.support.short_dipole import (
+    BODY,
+    FRINGE,
+    NOISE_T,
+    TEXT,
+    campaign_study,
+    measured,
+    reading,
+    truth,
+)
 
 POSES = {"body": (Rotation.from_rotvec([0.004, -0.003, 0.006]), np.array([3e-4, -2e-4, 5e-4])),
          "fringe": (Rotation.from_rotvec([-0.005, 0.004, 0.002]), np.array([-4e-4, 3e-4, 0.0503]))}
@@ -74,6 +84,11 @@ def test_two_maps_find_their_poses_and_agree(generator, tmp_path):
         assert each.held_out
         assert each.readings > 40
         assert each.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / each.readings))
+    assert [each.name for each in result.regions_left_out] == ["body", "fringe"]
+    for left in result.regions_left_out:
+        assert left.readings > 500
+        assert left.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / left.readings))
+        assert not left.disagreement
     assert {score.region for score in result.scores} == {"body", "fringe"}
     for score in result.scores:
         if score.part == "held out":
@@ -211,6 +226,28 @@ def test_a_map_of_another_magnet_is_told(generator, tmp_path):
         assert each.chi2 > 10 * each.limit
         assert "not of the same magnet" in each.disagreement
     assert "not of the same magnet" in result.disagreement
+    assert all("left out, is predicted by the others" in each.disagreement
+               for each in result.regions_left_out)
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.03])
+def test_the_ends_of_a_single_map_are_left_out(generator, tmp_path, stretch):
+    """Control: rings are 3 % longer than the study says, which the middle does not show."""
+    turn, shift = Rotation.identity(), np.array([0.0, 0.0, -0.045])
+    data = measured(truth(generator, stretch=stretch), generator, turn, shift)
+    study = parse_study(tomllib.loads(TEXT + "[instrument]\ntranslation_m = [0, 0, -0.045]"))
+    result = infer(build_magnet(study), data, Session.open(tmp_path))
+    (left,) = result.regions_left_out
+    assert left.name == ""
+    assert left.readings == 25 * 6 * 3  # of 16 places along z, three at each end
+    right = stretch == 1.0
+    assert (left.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / left.readings))) == right
+    assert (not left.disagreement) == right
+    assert answer(result).sound == right
+    assert (left.in_words in answer(result).trust) == right or left.disagreement in (
+        result.disagreement)
+    summary = inference_summary(result)["regions_left_out"]
+    assert summary[0]["over_noise"] == pytest.approx(left.rms_T / left.noise_T)
 
 
 def test_a_sensor_out_of_place_in_one_map_only(generator):

@@ -147,6 +147,17 @@ def test_contradictions_are_refused_or_named(monkeypatch):
         joined_of(maps | {"part1": torn})
 
 
+def test_positions_that_lines_have_in_common_widen_the_bars(monkeypatch):
+    """A stage is off by 0.1 mm along z. Control: without the scatter of halves, by 5 bars."""
+    maps, poses, _ = campaign(0, maps=2)
+    points = points_of(maps["part1"])
+    off = points + 1e-4 * np.sin(2 * np.pi * points[:, 2:] / 0.035) * [0, 0, 1]
+    torn = maps | {"part1": field_map(off, maps["part1"]["B_T"].values)}
+    assert np.abs(over_bars(joined_of(torn), poses)).max() < 4
+    monkeypatch.setattr(map_join._Joined, "_beyond", lambda _, places: np.zeros(len(places)))
+    assert np.abs(over_bars(joined_of(torn), poses)).max() > 4
+
+
 def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     """The command, from files to the page; a map that fails its own check is refused."""
     maps, _, _ = campaign(1, maps=2)

@@ -105,9 +105,9 @@ def test_permeability_inside_a_block():
                 **{f"{axis}_m": [0.0] for axis in "xyz"}, "remanence_y_T": [1.3],
                 "remanence_x_T": [0.0], "remanence_z_T": [0.0]}})))
     nominal = magnet.nominal_magnetization
-    found = [field_on_lines(magnet, Lines(point, point * 1.001, (np.zeros(1),) * 2, 3),
-                            Gaussian(nominal, 0 * nominal[:, None]), NOT_KEPT, inside=True)
-             for point in points]
+    known, session = Gaussian(nominal, 0 * nominal[:, None]), Session.temporary()
+    found = [field_on_lines(magnet, Lines(point, point * 1.001, (np.zeros(1),) * 2, 3), known,
+                            session, inside=True) for point in points]
     field = np.array([one.mean[0, 0] for one in found])
     bar = np.array([one.sd[0, 0] for one in found])
     error = np.abs(field - expected)
@@ -178,7 +178,7 @@ def test_what_is_refused():
     known = Gaussian(flat.nominal_magnetization, np.zeros((32, 1)))
     with pytest.raises(StudyError, match="of a 3D magnet"):
         field_on_lines(flat, Lines(np.array([0.14, 0, 0]), np.array([0.15, 0, 0]), (
-            np.zeros(1), np.zeros(1)), 3), known, NOT_KEPT, inside=True)
+            np.zeros(1), np.zeros(1)), 3), known, Session.temporary(), inside=True)
     edge = Lines(np.array([0.01, 0.04, -0.02]), np.array([0.01, 0.04, 0.02]),
                  (np.zeros(1), np.zeros(1)), 5)
     with pytest.raises(StudyError, match=r"`--from-m and --to-m` of .* on an edge"):
