@@ -98,13 +98,19 @@ class Magnet(ShownInNotebook):
     @property
     def iron_permeability(self) -> float:
         """Constant relative permeability of the iron; 1 without iron or with a curve."""
-        iron = iron_of(self.study)
-        return 1.0 if iron is None else iron.relative_permeability or 1.0
+        law = self.iron[0].law if self.iron else 1.0
+        return law if isinstance(law, float) else 1.0
 
     @property
     def iron_is_axisymmetric(self) -> bool:
         """Whether all bodies of iron are coaxial tubes or discs."""
-        return all(body.outline is None for body in self.iron)
+        return all(body.is_coaxial for body in self.iron)
+
+    @property
+    def iron_is_along_z(self) -> bool:
+        """Whether the iron is of one material, and of prisms along z and coaxial tubes or discs."""
+        laws = {body.law if isinstance(body.law, float) else id(body.law) for body in self.iron}
+        return len(laws) < 2 and all(body.in_place and not body.sphere for body in self.iron)
 
     @property
     def external(self) -> External:
@@ -263,7 +269,7 @@ class Magnet(ShownInNotebook):
         """Largest |z| in m of the iron, or of the array without iron; infinite in 2D."""
         if self.dimension == 2 or not self.iron:
             return self.array_half_length
-        return max(max(-body.z_min, body.z_max) for body in self.iron)
+        return max(body.half_length for body in self.iron)
 
     @cached_property
     def radius(self) -> float:

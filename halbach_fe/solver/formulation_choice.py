@@ -39,6 +39,7 @@ from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.reciprocal_columns import reciprocal_gradients, saves_solves
 from halbach_fe.solver.separate_blocks import (
     applies,
+    external_acts,
     field_in_vacuum,
     iron_alone,
     separate_columns,
@@ -319,7 +320,8 @@ def _moments_part(
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column, error)
     block = separate_columns(magnet, points, solved.iron, session.progress)
     along = nominal
-    if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
+    # the columns are derivatives there, and do not hold what answers to external fields
+    if magnet.is_nonlinear or magnet.has_losses or external_acts(magnet):
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
     # the same tolerance for the route ``moments``. The columns have a single cell per block, and
@@ -435,20 +437,26 @@ def choose_route(magnet: Magnet, points: Floats) -> Route:
     if asked == "moments" and not applies(magnet):
         raise StudyError(
             f"Input `solver.route` of study {magnet.name} must be another route; instead received "
-            "moments, which needs the method reaction and iron of coaxial tubes or discs. Leave "
-            "the key out.")
+            "moments, which needs the method reaction. Leave the key out.")
     if asked == "auto":
         if magnet.study.solver.method == "direct":
             asked = "edge_elements"
         elif symmetric:
             asked = "azimuthal_modes"
         else:
-            asked = "moments" if applies(magnet) else "scalar_potential"
+            extruded = magnet.array.is_uniform and magnet.iron_is_along_z
+            asked = "scalar_potential" if extruded and not magnet.iron_is_axisymmetric else (
+                "moments")
     if asked in ("edge_elements", "scalar_potential") and not magnet.array.is_uniform:
         raise StudyError(
             f"Input `array` of study {magnet.name} must consist of equal rings for the route "
             f"{asked.replace('_', ' ')}; instead it has rings of their own or free blocks. Use the "
-            "method reaction, and iron of coaxial tubes or discs.")
+            "method reaction.")
+    if asked in ("edge_elements", "scalar_potential") and not magnet.iron_is_along_z:
+        raise StudyError(
+            f"Input `iron` of study {magnet.name} must be of one material, of prisms along z and "
+            f"coaxial tubes, for the route {asked.replace('_', ' ')}; instead a body has another "
+            "shape, place or material. Leave solver.route and solver.method out.")
     return Route(asked)
 
 
