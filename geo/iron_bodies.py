@@ -46,7 +46,7 @@ class Sizes:
     @classmethod
     def of(cls, size: float, coarseness: float = 1.0) -> Sizes:
         """Return those for elements of a size in m; a larger ``coarseness`` is for error bars."""
-        return cls(coarseness * size, 1.2 * coarseness, 0.35, 0.3 * coarseness**0.6)
+        return cls(coarseness * size, 2.0 * coarseness, 0.4, 0.35 * coarseness**0.6)
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
             gmsh.model.getBoundingBox(2, tag)).reshape(2, 3), axis=0).max() > 2 * shell.inner]
         gmsh.model.addPhysicalGroup(2, far, tags.OUTER_BOUNDARY_TAG)
         _set_sizes(pieces[:-2], sizes, shell)
+        gmsh.option.setNumber("Mesh.Algorithm3D", 10)
         gmsh.model.mesh.generate(3)
         gmsh.model.mesh.setOrder(2)
         gmsh.model.mesh.optimize("HighOrder")

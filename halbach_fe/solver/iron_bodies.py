@@ -51,6 +51,9 @@ from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_t
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element
 
+ROUGHLY = (*CONJUGATE_GRADIENTS, "-ksp_rtol", "1e-5")
+"""PETSc options for GetDP's solution, which only verifies the matrix."""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -129,8 +132,17 @@ class Problem:
         excess, _ = self.law(field[..., 0])
         return self.stiffness(total - source) + self.integrate(excess[..., None, None] * field)
 
+    @cached_property
+    def _linear(self) -> Tangent:
+        return self._tangent(np.zeros((self.stiffness_of_vacuum.shape[0], 1)))
+
     def tangent(self, total: Floats) -> Tangent:
         """Return the derivative of the residual at a total potential (n, 1)."""
+        if all(isinstance(body.law, float | int) for body in self.bodies):
+            return self._linear
+        return self._tangent(total)
+
+    def _tangent(self, total: Floats) -> Tangent:
         field = self.field(total)[..., 0]
         excess, slope = self.law(field)
         differential = (excess[..., None, None] * np.eye(3)
@@ -356,7 +368,7 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
         return Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
                    solutions=SOLUTIONS_FILE, unknowns=count, time_limit_s=session.time_limit_s,
                    numbers={"R_INNER": shell.inner, "R_OUTER": shell.outer, "CX": x, "CY": y,
-                            "CZ": z, "BODIES": len(magnet.iron)}, options=CONJUGATE_GRADIENTS)
+                            "CZ": z, "BODIES": len(magnet.iron)}, options=ROUGHLY, linear_residual=1e-3)
 
     def read(folder: Path) -> Floats:
         found.append((read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", mesh.cell_type),
@@ -372,7 +384,8 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
     along_z[..., 2, 0] = 1.0
     right = problem.integrate(along_z)
     difference = np.abs(matrix @ solution.T - right).max() / np.abs(right).max()
-    if not difference <= 1e-6:
+    # the solution is no more exact than that; another numbering makes a difference of order 1
+    if not difference <= 1e-3:
         raise GetDPError(
             f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
             "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
