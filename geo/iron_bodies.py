@@ -13,7 +13,6 @@ from pathlib import Path
 import gmsh
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
@@ -32,6 +31,8 @@ class Sizes:
     thickness : float
         Largest size relative to the ratio of a body's volume and surface, half the thickness of a
         plate.
+    curvature : float
+        Largest size relative to the radius of a round body.
     edge : float
         Size along the edges, where the field is singular, relative to that in the body.
     growth : float
@@ -40,13 +41,36 @@ class Sizes:
 
     iron: float
     thickness: float
+    curvature: float
     edge: float
     growth: float
 
     @classmethod
     def of(cls, size: float, coarseness: float = 1.0) -> Sizes:
         """Return those for elements of a size in m; a larger ``coarseness`` is for error bars."""
-        return cls(coarseness * size, 2.0 * coarseness, 0.4, 0.35 * coarseness**0.6)
+        return cls(coarseness * size, 1.2 * coarseness, 0.25 * coarseness, 0.4,
+                   0.35 * coarseness**0.6)
+
+    def of_body(self, body: IronSolid) -> float:
+        """Return the size in m in a body."""
+        volume, surface, _ = body.measures
+        round_body = np.inf if body.outline else self.curvature * body.outer_radius
+        return min(self.iron, self.thickness * volume / surface, round_body)
+
+    def count(self, bodies: Sequence[IronSolid]) -> tuple[int, int]:
+        """Estimate the numbers of elements and of unknowns of the mesh, right to a third or so.
+
+        They are integrals of 1 / size^3 over the bodies, their edges and the air near them.
+        """
+        growth, unknowns = self.growth, 700 + 150 * self.growth**-3  # some, and those far away
+        for body in bodies:
+            volume, surface, edges = body.measures
+            size = self.of_body(body)
+            small, reach = self.edge * size, (1 - self.edge) * size / growth
+            inside = volume / size**3 + edges * np.pi / 4 * reach**2 / (small * size**2)
+            unknowns += 5.0 * inside + 2.0 * surface / (growth * size**2) + (
+                5.5 * 0.75 * np.pi * edges / (growth**2 * small))
+        return round(0.77 * unknowns), round(unknowns)
 
 
 @dataclass(frozen=True)
@@ -94,8 +118,7 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         far = [tag for tag in rim if np.ptp(np.array(
             gmsh.model.getBoundingBox(2, tag)).reshape(2, 3), axis=0).max() > 2 * shell.inner]
         gmsh.model.addPhysicalGroup(2, far, tags.OUTER_BOUNDARY_TAG)
-        _set_sizes(pieces[:-2], sizes, shell)
-        gmsh.option.setNumber("Mesh.Algorithm3D", 10)
+        _set_sizes(bodies, pieces[:-2], sizes, shell)
         gmsh.model.mesh.generate(3)
         gmsh.model.mesh.setOrder(2)
         gmsh.model.mesh.optimize("HighOrder")
@@ -121,12 +144,13 @@ def _shell(volumes: Sequence[tuple[int, int]]) -> Shell:
     return Shell((x, y, z), radius, 1.3 * radius)
 
 
-def _set_sizes(iron: Sequence[Sequence[int]], sizes: Sizes, shell: Shell) -> None:
+def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes: Sizes,
+               shell: Shell) -> None:
     """Set the sizes of elements: small at the edges of iron, growing away from it.
 
     ``iron`` has the volumes of every body.
     """
-    field, occ = gmsh.model.mesh.field, gmsh.model.occ
+    field = gmsh.model.mesh.field
     for option in ("ExtendFromBoundary", "FromPoints", "FromCurvature"):
         gmsh.option.setNumber(f"Mesh.MeshSize{option}", 0)
     used = []
@@ -138,12 +162,10 @@ def _set_sizes(iron: Sequence[Sequence[int]], sizes: Sizes, shell: Shell) -> Non
         used.append(field.add("MathEval"))
         field.setString(used[-1], "F", f"{size:.9g}+{sizes.growth:.9g}*F{distance}")
 
-    for volumes in iron:
+    for body, volumes in zip(bodies, iron, strict=True):
         solid = [(3, tag) for tag in volumes]
         faces = gmsh.model.getBoundary(solid, oriented=False)
-        thickness = sum(occ.getMass(*one) for one in solid) / sum(
-            occ.getMass(*one) for one in faces)
-        size = min(sizes.iron, sizes.thickness * thickness)
+        size = sizes.of_body(body)
         limit("SurfacesList", faces, size)
         edges = [one for one in gmsh.model.getBoundary(faces, combined=False, oriented=False)
                  if _is_sharp(one)]

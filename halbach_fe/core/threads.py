@@ -1,4 +1,4 @@
-"""Threads for compiled work that releases Python's lock."""
+"""Threads for compiled work that releases Python's lock, and the memory that is left."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -24,3 +25,21 @@ def share_out(count: int, parts: int = 16) -> list[tuple[int, int]]:
     """Return ranges of about the same size."""
     limits = np.unique(np.linspace(0, count, parts + 1).astype(int)).tolist()
     return list(pairwise(limits))
+
+
+def available_memory() -> float | None:
+    """Return the available memory in GiB of the machine, or of the container if that is less.
+
+    It is None if the operating system does not tell.
+    """
+    limits = []
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        limits.append(int(lines["MemAvailable"].split()[0]) / 2**20)
+        group = Path("/sys/fs/cgroup")
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            limits.append((int(limit) - int((group / "memory.current").read_text())) / 2**30)
+    except (OSError, KeyError, ValueError):
+        pass
+    return min(limits, default=None)

@@ -98,6 +98,21 @@ class IronSolid:
         return x, y, z
 
     @property
+    def measures(self) -> tuple[float, float, float]:
+        """Volume in m^3, surface in m^2, and length of the sharp edges in m."""
+        if self.sphere:
+            return 4 / 3 * np.pi * self.outer_radius**3, 4 * np.pi * self.outer_radius**2, 0.0
+        if self.outline is None:
+            rim = 2 * np.pi * (self.inner_radius + self.outer_radius)
+            area, corners = np.pi * (self.outer_radius**2 - self.inner_radius**2), 0
+        else:
+            x, y = np.array([edge.start for edge in self.outline]).T
+            area = float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+            rim, corners = sum(edge.length for edge in self.outline), len(self.outline)
+        length = self.z_max - self.z_min
+        return area * length, 2 * area + rim * length, 2 * rim + corners * length
+
+    @property
     def radius(self) -> float:
         """Radius in m of the cylinder about the z axis around the body."""
         return self.outer_radius if self.in_place else float(np.hypot(*self.surface[:2]).max())

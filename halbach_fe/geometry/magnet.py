@@ -28,7 +28,7 @@ from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
 from halbach_fe.study.magnet import External, Neighbour
 from halbach_fe.study.materials import Curve
-from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, iron_of, is_nonlinear
+from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
 SOLVED_BY = "halbach_fe.solver.formulation_choice"
@@ -382,6 +382,11 @@ def build_magnet(study: Study) -> Magnet:
             f"{len(magnet.blocks)} blocks that are missing" if not strongest
             else f"{len(magnet.blocks)} blocks of at most {strongest:g} T",
             "Correct remanence_T, or magnetization_factor of the exceptions."))
+    if study.dimension == 2 and not magnet.iron_is_along_z:
+        raise StudyError(must_be(
+            "`iron.bodies`", f"study {study.name}", "tubes and prisms along z, of one material, "
+            "since it is 2D", "a body of another shape, place or material",
+            "Set dimension = 3, or leave that body out."))
     if study.iron_ring is not None:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)

@@ -92,8 +92,8 @@ def block_in_iron(
     if not (blocks and iron):
         return None
     for number, body in enumerate(iron):
-        if body.sphere and (found := _in_sphere(blocks, body, tolerance)) is not None:
-            return found[0], number, found[1]
+        if body.sphere and (first := _in_sphere(blocks, body, tolerance)) is not None:
+            return first[0], number, first[1]
     numbers = [number for number, body in enumerate(iron) if not body.sphere]
     iron = [iron[number] for number in numbers]
     if not iron:

@@ -117,8 +117,7 @@ def contact_of_sphere(radius: float, points: Floats) -> Contact:
 
 
 def distance_from_prism(outline: Outline, z_min: float, z_max: float, points: Floats) -> Floats:
-    """Return the distances (n,) in m of points (n, 3) from a prism in its frame; negative inside.
-    """
+    """Return distances (n,) in m of points (n, 3) from a prism in its frame; negative inside."""
     across = _section(outline, points[:, :2]).distance
     beyond = np.maximum(points[:, 2] - z_max, z_min - points[:, 2])
     outside = np.hypot(np.maximum(across, 0.0), np.maximum(beyond, 0.0))

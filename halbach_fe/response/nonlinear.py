@@ -112,6 +112,11 @@ def nonlinear_model(
     if magnet.curve is None:
         raise StudyError(f"Input `curve` of the iron of study {magnet.name} must be given for a "
                          "non-linear model; instead it is missing. Use the response matrix.")
+    if not magnet.iron_is_along_z:
+        raise StudyError(must_be(
+            "`iron.bodies`", f"study {magnet.name}", "prisms along z and coaxial tubes, of one "
+            "material, for samples with non-linear iron", "a body of another shape, place or "
+            "material", "Linearize it about the nominal magnet: infer without --samples."))
     observation = replace(observation, points=check_points(magnet, observation.points))
     route = choose_route(magnet, observation.points).meshed
     base = _replace_iron_by_vacuum(magnet, route)

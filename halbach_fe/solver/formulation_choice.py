@@ -43,6 +43,7 @@ from halbach_fe.solver.separate_blocks import (
     field_in_vacuum,
     iron_alone,
     separate_columns,
+    sizes_of_iron,
     solve_separate,
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
@@ -311,6 +312,8 @@ def _moments_part(
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
         return _join_parts(magnet, points, parts)
     if session.counter is not None:
+        if not magnet.iron_is_axisymmetric:
+            session.counter.batches.append((session.purpose, sizes_of_iron(magnet, estimate)))
         zero = np.zeros((len(points), 3))
         return ElementFields(np.nan, zero, zero, magnet.blocks, _refuse_column, zero)
     solved = solve_separate(magnet, session, estimate)

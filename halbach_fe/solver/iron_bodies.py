@@ -13,8 +13,8 @@ solved by conjugate gradients, with two levels as the preconditioner: the corner
 which are factorized, and all nodes, which a Gauss-Seidel sweep smooths.
 
 The field outside is that of the polarization J = (mu_r - 1) mu_0 H of the iron, integrated over its
-elements. Its error falls faster than that of the gradient of the potential in the air, because it is
-a mean over all of the iron.
+elements. Its error falls faster than that of the gradient of the potential in the air, because it
+is a mean over all of the iron.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from scipy.sparse.csgraph import connected_components
 
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import GetDPError, OutputError
+from halbach_fe.core.errors import GetDPError, OutputError, StudyError, must_be
 from halbach_fe.core.files import make_folder
-from halbach_fe.core.threads import in_threads, share_out
+from halbach_fe.core.threads import available_memory, in_threads, share_out
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
@@ -348,6 +348,7 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
     """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
     from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
 
+    _check_memory(magnet, size_of(magnet, coarseness).unknowns)
     files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
     make_folder(session.folder)
     try:
@@ -368,7 +369,8 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
         return Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
                    solutions=SOLUTIONS_FILE, unknowns=count, time_limit_s=session.time_limit_s,
                    numbers={"R_INNER": shell.inner, "R_OUTER": shell.outer, "CX": x, "CY": y,
-                            "CZ": z, "BODIES": len(magnet.iron)}, options=ROUGHLY, linear_residual=1e-3)
+                            "CZ": z, "BODIES": len(magnet.iron)},
+                   options=ROUGHLY, linear_residual=1e-3)
 
     def read(folder: Path) -> Floats:
         found.append((read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", mesh.cell_type),
@@ -390,6 +392,31 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
             f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
             "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
     return problem
+
+
+def size_of(magnet: Magnet, coarseness: float) -> RunSize:
+    """Estimate the size of the run for a magnet's iron, without meshing it."""
+    from halbach_fe.geo.iron_bodies import Sizes
+
+    elements, unknowns = Sizes.of(magnet.study.mesh.block_size_m, coarseness).count(magnet.iron)
+    return RunSize("scalar_potential", elements, unknowns, 1)
+
+
+def _check_memory(magnet: Magnet, unknowns: int) -> None:
+    """Refuse iron whose mesh would not fit into memory.
+
+    Raises
+    ------
+    StudyError
+    """
+    bytes_each = 16_000  # memory in bytes per unknown
+    needed, available = bytes_each * unknowns / 2**30, available_memory()
+    if available is not None and needed > available:
+        raise StudyError(must_be(
+            "`mesh.block_size_m`", f"study {magnet.name}",
+            f"so large that the mesh of the iron fits into the {available:.2g} GiB of memory that "
+            "are left", f"{magnet.study.mesh.block_size_m:g}, for some {unknowns:.2g} unknowns "
+            f"and {needed:.2g} GiB", "Enlarge it, or leave out thin bodies of iron."))
 
 
 def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,

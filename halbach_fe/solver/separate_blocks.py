@@ -31,7 +31,7 @@ from halbach_fe.solver.axisymmetric_iron import (
 )
 from halbach_fe.solver.exact_block_field import external_field, field_on_circles, unit_fields
 from halbach_fe.solver.iron_modes import IronRectangle, Resolution
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.magnet import External
 
 if TYPE_CHECKING:
@@ -180,6 +180,14 @@ def _solve_iron(
     from halbach_fe.solver.iron_bodies import COARSER, solve_bodies  # imports numba
 
     return solve_bodies(magnet, source, session, estimate, start, COARSER if rough else 1.0)
+
+
+def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
+    """Return the expected sizes of the runs for iron that is not rotationally symmetric."""
+    from halbach_fe.solver.iron_bodies import COARSER, size_of
+
+    rough = estimate or _permeable(magnet.blocks)
+    return [size_of(magnet, coarseness) for coarseness in (1.0, *(COARSER,) * rough)]
 
 
 def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
@@ -339,7 +347,8 @@ class _Blocks:
         """Return the reaction of blocks in the field of the iron, with another if there are two
         systems for its error bar.
 
-        ``others`` is an external field that they answer to. ``known`` is the polarization of the first system, if it has been solved.
+        ``others`` is an external field that they answer to. ``known`` is the polarization of the
+        first system, if it has been solved.
         """
         applied = None if iron is None else _sum_of_fields(iron.field, others)
         first = known or [self.polarized(system, applied) for system in systems[:1]]

@@ -164,8 +164,9 @@ class PlacedIron(StudyModel):
 class IronTube(PlacedIron):
     """A tube or, if it is short, a disc with or without a hole (an end plate, a shield).
 
-    It is coaxial unless ``centre_m`` or ``rotation_deg`` place it elsewhere. ``inner_radius_m = 0`` makes a full disc. ``length_m`` is along z, centred at ``z_m`` (default:
-    as long as the array). Tubes that touch make a stepped bore.
+    It is coaxial unless ``centre_m`` or ``rotation_deg`` place it elsewhere. ``inner_radius_m = 0``
+    makes a full disc. ``length_m`` is along its axis, centred at ``z_m`` (default: as long as the
+    array). Tubes that touch make a stepped bore.
     """
 
     kind: Literal["tube"]
