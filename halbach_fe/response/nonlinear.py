@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import GetDPError, StudyError
+from halbach_fe.core.errors import GetDPError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors

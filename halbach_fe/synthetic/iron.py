@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
-from halbach_fe.study.iron import Iron, IronMaterial
+from halbach_fe.study.iron import Iron, IronBox, IronMaterial, IronSphere
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.shapes import PolygonBody, shoelace
@@ -123,7 +123,7 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
         return None
     bodies: list[Tube | Pole] = []
     for number, body in enumerate(iron.bodies):
-        if body.kind in ("box", "sphere") or any(body.centre_m) or any(body.rotation_deg) or (
+        if isinstance(body, IronBox | IronSphere) or any(body.centre_m + body.rotation_deg) or (
                 body.own_material is not None):
             raise StudyError(must_be(
                 f"`iron.bodies[{number}]`", f"study {study.name}", "a coaxial tube or a prism "
