@@ -15,8 +15,8 @@ CELLS_PER_SIDE = 2
 class MeshSettings(StudyModel):
     """Sizes of the finite elements.
 
-    ``block_size_m`` holds in the blocks and iron; on the route ``moments`` it is the largest size in
-    iron that is not rotationally symmetric. ``bore_size_m`` holds in the bore (default: the same).
+    ``block_size_m`` holds in the blocks and iron; on the route ``moments`` it is the largest size
+    in iron that is not rotationally symmetric. ``bore_size_m`` holds in the bore (default: the same).
     Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` - 1 per
     unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the cross-section
     is extruded along z, in ``layers_per_ring`` layers per ring.
