@@ -43,6 +43,7 @@ from halbach_fe.solver.separate_blocks import (
     field_in_vacuum,
     iron_alone,
     separate_columns,
+    sizes_in_iron,
     sizes_of_iron,
     solve_separate,
 )
@@ -400,8 +401,8 @@ def finer_in_words(magnet: Magnet, points: Floats) -> str:
 
     They follow from the route: ``cells_per_side`` divides permeable blocks on the route
     ``moments``, ``meridian_size_m`` is of the half-plane of azimuthal modes, and ``block_size_m``
-    of the rest. There is none where only iron is left to the route ``moments``, whose grid of the
-    iron is fixed.
+    of the rest, also of iron of any shape. There is none where only rotationally symmetric iron is
+    left to the route ``moments``, whose grid of the iron is fixed.
     """
     mesh, route = magnet.study.mesh, choose_route(magnet, points)
     if route not in (Route.MOMENTS, Route.AZIMUTHAL_MODES):
@@ -410,6 +411,9 @@ def finer_in_words(magnet: Magnet, points: Floats) -> str:
     if route is Route.MOMENTS and (magnet.has_losses or any(
             block.recoil_permeability != 1.0 or not block.isotropic for block in magnet.blocks)):
         keys.append(f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})")
+    if not magnet.iron_is_axisymmetric:
+        size = min(sizes_in_iron(magnet))
+        keys.append(f"a smaller mesh.block_size_m (elements of iron now have {1e3 * size:.3g} mm)")
     if route is Route.AZIMUTHAL_MODES or (
             magnet.study.solver.route == "auto" and not magnet.has_losses
             and bool(few_modes_suffice(magnet, points).any())):

@@ -190,6 +190,14 @@ def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
     return [size_of(magnet, coarseness) for coarseness in (1.0, *(COARSER,) * rough)]
 
 
+def sizes_in_iron(magnet: Magnet) -> list[float]:
+    """Return the sizes in m of the elements in bodies of iron of any shape."""
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+
+    sizes = Sizes.of(magnet.study.mesh.block_size_m)
+    return [sizes.of_body(body) for body in magnet.iron]
+
+
 def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
     """Return the reaction (n, 3) in T of the iron to the blocks in vacuum, at points (n, 3) in m.
 

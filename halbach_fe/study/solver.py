@@ -16,10 +16,10 @@ class MeshSettings(StudyModel):
     """Sizes of the finite elements.
 
     ``block_size_m`` holds in the blocks and iron; on the route ``moments`` it is the largest size
-    in iron that is not rotationally symmetric. ``bore_size_m`` holds in the bore (default: the same).
-    Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` - 1 per
-    unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the cross-section
-    is extruded along z, in ``layers_per_ring`` layers per ring.
+    in iron that is not rotationally symmetric. ``bore_size_m`` holds in the bore (default: the
+    same). Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` -
+    1 per unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the
+    cross-section is extruded along z, in ``layers_per_ring`` layers per ring.
 
     ``cells_per_side`` divides separate blocks for the method of moments: the number of cells along
     the sides of a cube (default: 2).

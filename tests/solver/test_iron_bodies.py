@@ -14,6 +14,7 @@ from halbach_fe.solver import iron_bodies
 from halbach_fe.solver.formulation_choice import (
     Route,
     choose_route,
+    finer_in_words,
     finite_element_part,
     solve_nominal,
 )
@@ -115,6 +116,15 @@ def test_external_field_acts_on_the_iron(session, coarse_mesh):
         np.array(background), 1000.0, 0.02, POINTS - [0.0, 0.0, 0.05])
     assert np.abs(change - exact).max() < 5e-3  # as of the sphere above
     assert np.abs(exact - background).max() > 0.05
+
+
+def test_the_key_of_finer_iron_is_named():
+    """Elements of a sphere are a quarter of its radius, or of the study's size if that is less."""
+    magnet = build_magnet(study_with(SPHERE))
+    assert finer_in_words(magnet, POINTS) == (
+        "a smaller mesh.block_size_m (elements of iron now have 5 mm)")
+    finer = build_magnet(study_with(SPHERE, mesh={"block_size_m": 0.003}))
+    assert "now have 3 mm" in finer_in_words(finer, POINTS)
 
 
 def test_columns_add_up(session, coarse_mesh):
