@@ -96,6 +96,10 @@ def cross_section(axis: Axes, magnet: Magnet) -> None:
     Of equal rings the first one is drawn.
     """
     for body in magnet.iron:
+        if body.sphere or not body.in_place:
+            hull = np.column_stack([part.ravel() for part in body.surface[:2]])
+            axis.add_patch(Polygon(MM * hull[ConvexHull(hull).vertices], color=IRON))
+            continue
         if body.z_min > 0 or body.z_max < 0:
             continue
         if body.outline is None:
@@ -139,9 +143,13 @@ def middle_blocks(magnet: Magnet) -> list[MagnetBlock]:
 def side_view(axis: Axes, magnet: Magnet) -> None:
     """Draw the rings, or free blocks, and the iron by z and distance from the axis, in mm."""
     for body in magnet.iron:
-        axis.add_patch(Rectangle(
-            (MM * body.z_min, MM * body.inner_radius), MM * (body.z_max - body.z_min),
-            MM * (body.outer_radius - body.inner_radius), color=IRON))
+        if body.sphere or not body.in_place:
+            x, y, z = body.surface
+            (low, high), (start, end) = ((part.min(), part.max()) for part in (np.hypot(x, y), z))
+        else:
+            low, high, start, end = body.inner_radius, body.outer_radius, body.z_min, body.z_max
+        axis.add_patch(Rectangle((MM * start, MM * low), MM * (end - start), MM * (high - low),
+                                 color=IRON))
     sections = list(magnet.ring_sections[:magnet.array.rings])
     for block in magnet.blocks:
         if block.ring > magnet.array.rings:  # a free block

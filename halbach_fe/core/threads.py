@@ -34,3 +34,21 @@ def machine_memory() -> float:
     with suppress(OSError, ValueError):  # no container, or one without a limit ("max")
         there = min(there, float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
     return there
+
+
+def available_memory() -> float | None:
+    """Return the available memory in GiB of the machine, or of the container if that is less.
+
+    It is None if the operating system does not tell.
+    """
+    limits = []
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        limits.append(int(lines["MemAvailable"].split()[0]) / 2**20)
+        group = Path("/sys/fs/cgroup")
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            limits.append((int(limit) - int((group / "memory.current").read_text())) / 2**30)
+    except (OSError, KeyError, ValueError):
+        pass
+    return min(limits, default=None)

@@ -263,6 +263,10 @@ def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
     if magnet.dimension == 2:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}", "3 for solids", "2",
                                  "Use dimension = 3, and give array.ring_length_m."))
+    if any(body.sphere or not body.in_place for body in magnet.iron):
+        raise StudyError(must_be(
+            "`iron.bodies`", f"study {magnet.name}", "tubes and prisms along z, for solids",
+            "a sphere, or a body with centre_m or rotation_deg", "Leave it out."))
     there = [number for number, block in enumerate(magnet.blocks) if block.remanence]
     most_blocks = 20_000  # largest number of blocks: their STEP file has 15 MB
     if len(there) > most_blocks:

@@ -170,7 +170,7 @@ def forces(
     if not magnet.iron_is_axisymmetric:
         raise StudyError(must_be(
             "`iron`", f"study {magnet.name}", "coaxial tubes or discs, for the forces on blocks",
-            "a prism", "Leave the prism out: the forces of the blocks on each other remain."))
+            "another body", "Leave it out: the forces of the blocks on each other remain."))
     if density_kg_per_m3 is not None:
         check_number("density_kg_per_m3", "forces", density_kg_per_m3, *DENSITY)
     if price_per_kg is not None:

@@ -17,6 +17,7 @@ from halbach_fe.geometry.magnet import Magnet
 
 AIR_TAG = 1
 IRON_TAG = 2
+SHELL_TAG = 3
 OUTER_BOUNDARY_TAG = 10
 AXIS_TAG = 11
 FIRST_BLOCK_TAG = 1001
@@ -46,13 +47,14 @@ class Regions(BaseModel):
     iron: Tag | None
     outer_boundary: Tag
     axis: Tag | None = None
+    shell: Tag | None = None
     blocks: tuple[BlockRegion, ...]
 
     @property
     def volume_tags(self) -> tuple[int, ...]:
         """Tags of all regions with elements of the mesh's dimension (surfaces in 2D)."""
-        iron = () if self.iron is None else (self.iron,)
-        return (self.air, *iron, *(block.tag for block in self.blocks))
+        some = (tag for tag in (self.iron, self.shell) if tag is not None)
+        return (self.air, *some, *(block.tag for block in self.blocks))
 
     @property
     def names(self) -> dict[int, str]:
@@ -60,6 +62,8 @@ class Regions(BaseModel):
         names = {self.air: "air", self.outer_boundary: "outer boundary"}
         if self.iron is not None:
             names[self.iron] = "iron ring"
+        if self.shell is not None:
+            names[self.shell] = "shell to infinity"
         return names | {block.tag: f"block {block.name}" for block in self.blocks}
 
     def write(self, path: Path) -> None:

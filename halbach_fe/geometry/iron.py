@@ -1,19 +1,27 @@
-"""The bodies of iron that a study describes: coaxial tubes and discs, and prisms along z."""
+"""The bodies of iron that a study describes: tubes, prisms, boxes and spheres, in any place."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geometry.blocks import rotation_about_z
+from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.free_blocks import counter_clockwise
 from halbach_fe.geometry.outline import Outline, closed_outline
-from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
-from halbach_fe.study.iron import Iron, IronRing
+from halbach_fe.geometry.surface import (
+    Contact,
+    contact_of_prism,
+    contact_of_sphere,
+    contact_of_tube,
+)
+from halbach_fe.study.iron import Iron, IronBody, IronCurve, IronMaterial, IronRing
+from halbach_fe.study.materials import Curve
+from halbach_fe.study.model import curve_from
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,14 @@ class IronSolid:
     z_min, z_max : float, in m
         Infinite in 2D.
     outline : Outline, optional
-        Outline of a prism in the (x, y) plane; None for a tube.
+        Outline of a prism in the (x, y) plane; None for a tube or sphere.
+    law : float or Curve
+        Relative permeability, or magnetization curve.
+    origin_m, turn_rad : tuple of float
+        Place of the origin of the body's own axes, in which all of the above is, and the rotation
+        vector that turns the magnet's axes into them.
+    sphere : bool
+        Whether it is a sphere of ``outer_radius``.
     """
 
     inner_radius: float
@@ -36,6 +51,21 @@ class IronSolid:
     z_min: float
     z_max: float
     outline: Outline | None = None
+    law: float | Curve = field(default=1.0, compare=False)
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sphere: bool = False
+
+    @property
+    def in_place(self) -> bool:
+        """Whether its own axes are those of the magnet."""
+        return not any(self.origin_m) and not any(self.turn_rad)
+
+    @property
+    def is_coaxial(self) -> bool:
+        """Whether it is a tube or disc about the z axis of the magnet."""
+        return self.outline is None and not self.sphere and not any(self.turn_rad) and not any(
+            self.origin_m[:2])
 
     @property
     def name(self) -> str:
@@ -43,9 +73,56 @@ class IronSolid:
         return "the iron"
 
     @property
+    def surface(self) -> tuple[Floats, Floats, Floats]:
+        """Coordinates x, y and z of a grid of points on its surface, each (m, n) in m."""
+        angle = np.linspace(0, 2 * np.pi, 97)
+        if self.sphere:
+            polar = np.linspace(0, np.pi, 25)[:, None]
+            rings = self.outer_radius * np.sin(polar), self.outer_radius * np.cos(polar)
+        else:
+            low, high = self.z_min, self.z_max
+            rings = (np.array([self.inner_radius, self.outer_radius, self.outer_radius,
+                               self.inner_radius, self.inner_radius])[:, None],
+                     np.array([low, low, high, high, low])[:, None])
+        x, y, z = (rings[0] * np.cos(angle), rings[0] * np.sin(angle), rings[1] + 0 * angle)
+        if self.outline is not None:
+            corners = np.array([edge.start for edge in (*self.outline, self.outline[0])])
+            middle = corners.mean(axis=0)
+            x, y = (np.array([middle[i] + 0 * corners[:, i], corners[:, i], corners[:, i],
+                              middle[i] + 0 * corners[:, i]]) for i in range(2))
+            z = np.array([low, low, high, high])[:, None] + 0 * corners[:, 0]
+        if self.in_place:
+            return x, y, z
+        places = np.stack([x, y, z], axis=2) @ rotation_matrix(self.turn_rad).T + self.origin_m
+        x, y, z = np.moveaxis(places, 2, 0)
+        return x, y, z
+
+    @property
+    def measures(self) -> tuple[float, float, float]:
+        """Volume in m^3, surface in m^2, and length of the sharp edges in m."""
+        if self.sphere:
+            return 4 / 3 * np.pi * self.outer_radius**3, 4 * np.pi * self.outer_radius**2, 0.0
+        if self.outline is None:
+            rim = 2 * np.pi * (self.inner_radius + self.outer_radius)
+            area, corners = np.pi * (self.outer_radius**2 - self.inner_radius**2), 0
+        else:
+            x, y = np.array([edge.start for edge in self.outline]).T
+            area = float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+            rim, corners = sum(edge.length for edge in self.outline), len(self.outline)
+        length = self.z_max - self.z_min
+        return area * length, 2 * area + rim * length, 2 * rim + corners * length
+
+    @property
     def radius(self) -> float:
         """Radius in m of the cylinder about the z axis around the body."""
-        return self.outer_radius
+        return self.outer_radius if self.in_place else float(np.hypot(*self.surface[:2]).max())
+
+    @property
+    def half_length(self) -> float:
+        """Largest |z| in m of the body."""
+        if self.in_place:
+            return max(-self.z_min, self.z_max)
+        return float(np.abs(self.surface[2]).max())
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m lie inside the body, and not on its surface."""
@@ -53,6 +130,16 @@ class IronSolid:
 
     def contact(self, points: Floats) -> Contact:
         """Return where points (n, 3) in m lie relative to the body's surface."""
+        if self.in_place:
+            return self._own_contact(points)
+        axes = rotation_matrix(self.turn_rad)
+        found = self._own_contact((points - self.origin_m) @ axes)
+        return replace(found, outward=found.outward @ axes.T)
+
+    def _own_contact(self, points: Floats) -> Contact:
+        """Return the contact of points in the body's own axes."""
+        if self.sphere:
+            return contact_of_sphere(self.outer_radius, points)
         if self.outline is not None:
             return contact_of_prism(self.outline, self.z_min, self.z_max, points)
         return contact_of_tube(self.inner_radius, self.outer_radius, self.z_min, self.z_max,
@@ -70,21 +157,57 @@ def iron_solids(
         return z - half, z + half
 
     if ring is not None:
-        return (IronSolid(ring.inner_radius_m, ring.outer_radius_m, *limits(ring.length_m)),)
+        return (IronSolid(ring.inner_radius_m, ring.outer_radius_m, *limits(ring.length_m),
+                          law=law_of(ring)),)
     solids: list[IronSolid] = []
     for body in iron.bodies if iron else ():
-        ends = limits(body.length_m, body.z_m)
+        found: list[IronSolid] = []
         if body.kind == "tube":
-            solids.append(IronSolid(body.inner_radius_m, body.outer_radius_m, *ends))
-            continue
-        corners = counter_clockwise(np.array(body.outline_m))
-        for number in range(body.copies):
-            outline = closed_outline(
-                corners @ rotation_about_z(2 * np.pi * number / body.copies)[:2, :2].T)
-            t = np.linspace(0.0, 1.0, 17)
-            radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
-            solids.append(IronSolid(float(radii.min()), float(radii.max()), *ends, outline))
+            found = [IronSolid(body.inner_radius_m, body.outer_radius_m,
+                               *limits(body.length_m, body.z_m))]
+        elif body.kind == "sphere":
+            found = [IronSolid(0.0, body.radius_m, -body.radius_m, body.radius_m, sphere=True)]
+        elif body.kind == "box":
+            x, y, z = np.array(body.size_m) / 2
+            found = [_prism(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), (-z, z))]
+        else:
+            corners = counter_clockwise(np.array(body.outline_m))
+            found = [_prism(corners @ rotation_about_z(2 * np.pi * n / body.copies)[:2, :2].T,
+                            limits(body.length_m, body.z_m)) for n in range(body.copies)]
+        law = law_of(body.own_material or iron)
+        solids += [_placed(one, body, law) for one in found]
     return tuple(solids)
+
+
+def _prism(corners: Floats, ends: tuple[float, float]) -> IronSolid:
+    """Return a prism on a polygon (n, 2) in m."""
+    outline = closed_outline(corners)
+    t = np.linspace(0.0, 1.0, 17)
+    radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
+    return IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
+
+
+def _placed(solid: IronSolid, body: IronBody, law: float | Curve) -> IronSolid:
+    """Return a body of iron in its place; a coaxial tube is described in the magnet's own axes."""
+    x, y, z = body.centre_m
+    turn = tuple(np.radians(body.rotation_deg).tolist())
+    if solid.sphere:
+        turn = (0.0, 0.0, 0.0)
+    elif solid.outline is None and not (x or y or any(turn)):
+        return replace(solid, z_min=solid.z_min + z, z_max=solid.z_max + z, law=law)
+    return replace(solid, law=law, origin_m=(x, y, z), turn_rad=turn)
+
+
+def law_of(material: IronMaterial | Iron | None) -> float | Curve:
+    """Return the relative permeability or the magnetization curve of iron."""
+    if material is None or material.curve is None:
+        return (material and material.relative_permeability) or 1.0
+    return _curve(material.curve)
+
+
+@lru_cache(maxsize=32)
+def _curve(curve: IronCurve) -> Curve:
+    return curve_from(curve)
 
 
 def check_iron_ring(ring: IronRing, array_outer_radius: float) -> None:

@@ -28,7 +28,7 @@ from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
 from halbach_fe.study.magnet import External, Neighbour
 from halbach_fe.study.materials import Curve
-from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, iron_of, is_nonlinear
+from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
 
 SOLVED_BY = "halbach_fe.solver.formulation_choice"
@@ -98,13 +98,19 @@ class Magnet(ShownInNotebook):
     @property
     def iron_permeability(self) -> float:
         """Constant relative permeability of the iron; 1 without iron or with a curve."""
-        iron = iron_of(self.study)
-        return 1.0 if iron is None else iron.relative_permeability or 1.0
+        law = self.iron[0].law if self.iron else 1.0
+        return law if isinstance(law, float) else 1.0
 
     @property
     def iron_is_axisymmetric(self) -> bool:
         """Whether all bodies of iron are coaxial tubes or discs."""
-        return all(body.outline is None for body in self.iron)
+        return all(body.is_coaxial for body in self.iron)
+
+    @property
+    def iron_is_along_z(self) -> bool:
+        """Whether the iron is of one material, and of prisms along z and coaxial tubes or discs."""
+        laws = {body.law if isinstance(body.law, float) else id(body.law) for body in self.iron}
+        return len(laws) < 2 and all(body.in_place and not body.sphere for body in self.iron)
 
     @property
     def external(self) -> External:
@@ -263,7 +269,7 @@ class Magnet(ShownInNotebook):
         """Largest |z| in m of the iron, or of the array without iron; infinite in 2D."""
         if self.dimension == 2 or not self.iron:
             return self.array_half_length
-        return max(max(-body.z_min, body.z_max) for body in self.iron)
+        return max(body.half_length for body in self.iron)
 
     @cached_property
     def radius(self) -> float:
@@ -376,6 +382,11 @@ def build_magnet(study: Study) -> Magnet:
             f"{len(magnet.blocks)} blocks that are missing" if not strongest
             else f"{len(magnet.blocks)} blocks of at most {strongest:g} T",
             "Correct remanence_T, or magnetization_factor of the exceptions."))
+    if study.dimension == 2 and not magnet.iron_is_along_z:
+        raise StudyError(must_be(
+            "`iron.bodies`", f"study {study.name}", "tubes and prisms along z, of one material, "
+            "since it is 2D", "a body of another shape, place or material",
+            "Set dimension = 3, or leave that body out."))
     if study.iron_ring is not None:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)

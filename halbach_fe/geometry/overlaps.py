@@ -18,10 +18,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
 from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.surface import distance_from_prism
 
 ALLOWED_PENETRATION = 1e-6
 """Allowed penetration, as a fraction of the smaller body's size. Positions with nine significant
@@ -90,12 +91,34 @@ def block_in_iron(
     """
     if not (blocks and iron):
         return None
+    for number, body in enumerate(iron):
+        if body.sphere and (first := _in_sphere(blocks, body, tolerance)) is not None:
+            return first[0], number, first[1]
+    numbers = [number for number, body in enumerate(iron) if not body.sphere]
+    iron = [iron[number] for number in numbers]
+    if not iron:
+        return None
     shapes = [annulus(body.inner_radius, body.outer_radius) if body.outline is None
               else Shape(body.outline) for body in iron]
     bodies = _Bodies(shapes, np.arange(len(iron)),
                      np.array([[body.z_min, body.z_max] for body in iron]),
-                     np.broadcast_to(np.eye(3), (len(iron), 3, 3)), np.zeros((len(iron), 3)))
-    return _first_overlap(_block_bodies(blocks), bodies, tolerance)
+                     np.array([rotation_matrix(body.turn_rad) for body in iron]),
+                     np.array([body.origin_m for body in iron]))
+    found = _first_overlap(_block_bodies(blocks), bodies, tolerance)
+    return None if found is None else (found[0], numbers[found[1]], found[2])
+
+
+def _in_sphere(
+    blocks: Sequence[MagnetBlock], ball: IronSolid, tolerance: float
+) -> tuple[int, float] | None:
+    """Return the first block that a ball penetrates, and how far in m."""
+    for number, block in enumerate(blocks):
+        centre = block.to_frame(np.array([ball.origin_m]))
+        distance = float(distance_from_prism(block.outline, block.z_min, block.z_max, centre)[0])
+        size = min(ball.outer_radius, (block.z_max - block.z_min) / 2)
+        if ball.outer_radius - distance > tolerance * size:
+            return number, ball.outer_radius - distance
+    return None
 
 
 @dataclass(frozen=True)

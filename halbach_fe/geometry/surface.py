@@ -105,6 +105,25 @@ def contact_of_tube(inner: float, outer: float, z_min: float, z_max: float,
     return _contact(section, z_min, z_max, size, points, near)
 
 
+def contact_of_sphere(radius: float, points: Floats) -> Contact:
+    """Return where points (n, 3) in m lie relative to a sphere about the origin."""
+    distance = np.linalg.norm(points, axis=1)
+    found = Contact.nowhere(len(points))
+    found.on_face[:] = np.abs(distance - radius) <= 2 * ON_SURFACE * radius
+    found.inside[:] = (distance < radius) & ~found.on_face
+    beside = np.where(found.on_face, radius * (1 + ON_SURFACE) - distance, 0.0)
+    found.outward[:] = (beside / np.maximum(distance, 1e-300))[:, None] * points
+    return found
+
+
+def distance_from_prism(outline: Outline, z_min: float, z_max: float, points: Floats) -> Floats:
+    """Return distances (n,) in m of points (n, 3) from a prism in its frame; negative inside."""
+    across = _section(outline, points[:, :2]).distance
+    beyond = np.maximum(points[:, 2] - z_max, z_min - points[:, 2])
+    outside = np.hypot(np.maximum(across, 0.0), np.maximum(beyond, 0.0))
+    return np.where(outside > 0, outside, np.maximum(across, beyond))
+
+
 def _in_box(points: Floats, low: Sequence[float], high: Sequence[float],
             margin: float) -> NDArray[np.bool_]:
     """Tell which points (n, 3) lie in a box that is widened by a margin in m."""

@@ -65,13 +65,20 @@ def iron_description(magnet: Magnet) -> str:
         return "none"
     bodies = []
     for body in magnet.iron:
+        if body.sphere or not body.in_place:
+            size = "x".join(f"{1e3 * float(np.ptp(part)):.4g}" for part in body.surface)
+            bodies.append(f"{'sphere' if body.sphere else 'body'} within {size} mm about "
+                          f"({', '.join(f'{1e3 * part:g}' for part in body.origin_m)}) mm")
+            continue
         kind = "tube" if body.outline is None else "prism"
         length = "" if np.isinf(body.z_max) else (
             f", z {1e3 * body.z_min:g} to {1e3 * body.z_max:g} mm")
         bodies.append(f"{kind}, r {1e3 * body.inner_radius:g} to "
                       f"{1e3 * body.outer_radius:g} mm{length}")
     more = f" and {len(bodies) - 4} more" if len(bodies) > 4 else ""
-    if iron.curve is None:
+    if any(body.own_material for body in getattr(iron, "bodies", ())):
+        material = "iron of several materials"
+    elif iron.curve is None:
         material = f"relative permeability {iron.relative_permeability:g}"
     else:
         material = f"magnetization curve ({iron.curve.kind.replace('_', '–').title()})"

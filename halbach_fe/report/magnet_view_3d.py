@@ -578,19 +578,9 @@ def _arrow_traces(
 
 def _iron_trace(body: IronSolid, height: float) -> go.Surface:
     """Return the surface of a body of iron; ``height`` in m is drawn if it is infinitely long."""
-    low, high = (body.z_min, body.z_max) if np.isfinite(body.z_max) else (-height / 2, height / 2)
-    if body.outline is None:
-        angle = np.linspace(0, 2 * np.pi, 97)
-        radius = np.array([body.inner_radius, body.outer_radius, body.outer_radius,
-                           body.inner_radius, body.inner_radius])[:, None]
-        z = np.array([low, low, high, high, low])[:, None] + 0 * angle
-        x, y = radius * np.cos(angle), radius * np.sin(angle)
-    else:
-        corners = np.array([edge.start for edge in (*body.outline, body.outline[0])])
-        middle = corners.mean(axis=0)
-        x, y = (np.array([middle[i] + 0 * corners[:, i], corners[:, i], corners[:, i],
-                          middle[i] + 0 * corners[:, i]]) for i in range(2))
-        z = np.array([low, low, high, high])[:, None] + 0 * corners[:, 0]
+    if np.isinf(body.z_max):
+        body = replace(body, z_min=-height / 2, z_max=height / 2)
+    x, y, z = body.surface
     return go.Surface(
         x=x, y=y, z=z, opacity=0.25, showscale=False, colorscale=[[0, IRON], [1, IRON]],
         name="iron", legendgroup="iron", showlegend=True, hoverinfo="name")

@@ -25,6 +25,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter
+from scipy.spatial import ConvexHull
 from tomlkit.items import Array, Trivia, Whitespace
 
 from halbach_fe.core.arrays import Floats
@@ -504,6 +505,11 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
                 outwards * (SMALL if beyond else 0), textcoords="offset points",
                 ha="center", va="center", fontsize=SMALL, color=colour)
     for body in magnet.iron:
+        if body.sphere or not body.in_place:  # its shadow
+            shadow = np.column_stack([part.ravel() for part in body.surface[:2]])
+            axis.add_patch(Polygon(1e3 * shadow[ConvexHull(shadow).vertices], fill=False,
+                                   color=IRON, lw=0.8))
+            continue
         if body.outline is not None:
             axis.add_patch(Polygon([(1e3 * edge.start[0], 1e3 * edge.start[1])
                                     for edge in body.outline], fill=False, color=IRON, lw=0.8))

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import GetDPError, StudyError
+from halbach_fe.core.errors import GetDPError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
@@ -112,6 +112,11 @@ def nonlinear_model(
     if magnet.curve is None:
         raise StudyError(f"Input `curve` of the iron of study {magnet.name} must be given for a "
                          "non-linear model; instead it is missing. Use the response matrix.")
+    if not magnet.iron_is_along_z:
+        raise StudyError(must_be(
+            "`iron.bodies`", f"study {magnet.name}", "prisms along z and coaxial tubes, of one "
+            "material, for samples with non-linear iron", "a body of another shape, place or "
+            "material", "Linearize it about the nominal magnet: infer without --samples."))
     observation = replace(observation, points=check_points(magnet, observation.points))
     route = choose_route(magnet, observation.points).meshed
     base = _replace_iron_by_vacuum(magnet, route)

@@ -17,7 +17,6 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from scipy.sparse.linalg import splu
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
+from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -421,7 +421,7 @@ def _cost_of_moments(
                                   magnet.study.mesh.cells_per_side or CELLS_PER_SIDE))
              for magnet in there]
     cells = [len(each.cells) for each in found]
-    iron = [magnet for magnet in there if magnet.iron]
+    iron = [magnet for magnet in there if magnet.iron and magnet.iron_is_axisymmetric]
     # memory in bytes of the method of moments per cell, per cell if H is computed too, and per pair
     # of near cells. Slender and flat cells have many times the pairs of cubes. Without H the sum is
     # within 20 % of that of lattices of 108 to 500 hexagonal prisms of 20 and 60 mm, aligned and
@@ -443,7 +443,7 @@ def _cost_of_moments(
 
 def _route(magnet: Magnet, points: Floats, problems: Sequence[Problem]) -> str:
     """Return the route of most points: that of the first run of GetDP, if there is any."""
-    if problems:
+    if problems and magnet.iron_is_axisymmetric:
         return problems[0].route
     return EXACT_FIELD_ONLY if magnet.is_vacuum else choose_route(magnet, points)
 
@@ -466,21 +466,3 @@ def machine_speed() -> float:
         return time.perf_counter() - started
 
     return usual_seconds / min(factorize() for _ in range(3))
-
-
-def available_memory() -> float | None:
-    """Return the available memory in GiB of the machine, or of the container if that is less.
-
-    It is None if the operating system does not tell.
-    """
-    limits = []
-    try:
-        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        limits.append(int(lines["MemAvailable"].split()[0]) / 2**20)
-        group = Path("/sys/fs/cgroup")
-        limit = (group / "memory.max").read_text().strip()
-        if limit != "max":
-            limits.append((int(limit) - int((group / "memory.current").read_text())) / GIB)
-    except (OSError, KeyError, ValueError):
-        pass
-    return min(limits, default=None)

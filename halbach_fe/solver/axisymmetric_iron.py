@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -486,6 +487,10 @@ class Problem:
         excess, _ = self.law(field[..., 0])
         return self.stiffness(total - source) + self.integrate(excess[:, None, :, None] * field)
 
+    def tangent(self, total: Complexes) -> Tangent:
+        """Return the derivative of the residual at a total potential (modes, iron, 1)."""
+        return Tangent.of(self, self.differential(self.field(total)[..., 0]))
+
     def differential(self, field: Floats) -> Floats:
         """Return d mu_0 M / d mu_0 H (angles, 3, 3, k) for grad psi (angles, 3, k)."""
         excess, slope = self.law(field)
@@ -540,42 +545,52 @@ class Tangent:
         return result
 
     def solve(self, right: Complexes, tolerance: float) -> Complexes:
-        """Solve for steps (modes, iron, c) by conjugate gradients.
+        """Solve for steps (modes, iron, c), see `conjugate_gradients`."""
+        return conjugate_gradients(self.apply, self.precondition, self.problem.dot, right,
+                                   tolerance)
 
-        ``tolerance`` is relative, in the norm of the preconditioner.
 
-        Raises
-        ------
-        NotConvergedError
-            If the residual does not fall to the tolerance.
-        """
-        dot = self.problem.dot
-        solution, residual = np.zeros_like(right), right.copy()
-        direction = better = self.precondition(residual)
-        size = first = dot(residual, better)
-        most_steps = 400
-        for _ in range(most_steps):
-            if (size <= tolerance**2 * first).all():
-                return solution
-            applied = self.apply(direction)
-            curvature = dot(direction, applied)
-            length = np.divide(size, curvature, out=np.zeros_like(size), where=curvature > 0)
-            solution = solution + length * direction
-            residual = residual - length * applied
-            better = self.precondition(residual)
-            before, size = size, np.maximum(dot(residual, better), 0.0)
-            direction = better + np.divide(size, before, out=np.zeros_like(size),
-                                           where=before > 0) * direction
-        worst = float(np.sqrt(np.max(size / np.maximum(first, 1e-300))))
-        raise NotConvergedError(
-            f"Conjugate gradients on the iron left a residual of {worst:.1e} after {most_steps} "
-            "steps. Smooth the H(B) curve.", (worst,))
+def conjugate_gradients(
+    apply: Callable[[Any], Any], precondition: Callable[[Any], Any],
+    dot: Callable[[Any, Any], Floats], right: Any, tolerance: float,
+) -> Any:
+    """Solve for columns (..., c) of right-hand sides by conjugate gradients.
+
+    ``tolerance`` is relative, in the norm of the preconditioner.
+
+    Raises
+    ------
+    NotConvergedError
+        If the residual does not fall to the tolerance.
+    """
+    solution, residual = np.zeros_like(right), right.copy()
+    direction = better = precondition(residual)
+    size = first = dot(residual, better)
+    most_steps = 400
+    for _ in range(most_steps):
+        if (size <= tolerance**2 * first).all():
+            return solution
+        applied = apply(direction)
+        curvature = dot(direction, applied)
+        length = np.divide(size, curvature, out=np.zeros_like(size), where=curvature > 0)
+        solution = solution + length * direction
+        residual = residual - length * applied
+        better = precondition(residual)
+        before, size = size, np.maximum(dot(residual, better), 0.0)
+        direction = better + np.divide(size, before, out=np.zeros_like(size),
+                                       where=before > 0) * direction
+    worst = float(np.sqrt(np.max(size / np.maximum(first, 1e-300))))
+    raise NotConvergedError(
+        f"Conjugate gradients on the iron left a residual of {worst:.1e} after {most_steps} "
+        "steps. Smooth the H(B) curve.", (worst,))
 
 
 def newton(
-    problem: Problem, source: Complexes, start: Complexes | None = None
-) -> tuple[Complexes, tuple[float, ...]]:
-    """Solve for the total potential (modes, iron, 1) in T m by Newton's method.
+    problem: Any, source: Any, start: Any = None
+) -> tuple[Any, tuple[float, ...]]:
+    """Solve for the total potential (..., 1) in T m by Newton's method.
+
+    ``problem`` is a `Problem`, or that of `halbach_fe.solver.iron_bodies`.
 
     A step is halved until the energy no longer rises steeply at its end; the energy is convex.
 
@@ -600,7 +615,7 @@ def newton(
     # step length, relative to the full Newton step, at which the line search gives up
     smallest_step = 2.0**-20
     while True:
-        tangent = Tangent.of(problem, problem.differential(problem.field(total)[..., 0]))
+        tangent = problem.tangent(total)
         scale, size = (float(problem.dot(vector, tangent.precondition(vector))[0])
                        for vector in (right, residual))
         norms.append(float(np.sqrt(max(size, 0.0) / scale)) if scale > 0 else 0.0)

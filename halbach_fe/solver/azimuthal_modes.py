@@ -95,7 +95,8 @@ def is_axisymmetric(magnet: Magnet) -> bool:
     """
     if magnet.dimension != 3 or magnet.is_nonlinear or magnet.array.free_blocks is not None:
         return False
-    if not magnet.iron_is_axisymmetric or not all(block.isotropic for block in magnet.blocks):
+    if not (magnet.iron_is_axisymmetric and magnet.iron_is_along_z) or not all(
+            block.isotropic for block in magnet.blocks):
         return False
     shapes = [ring.block or magnet.array.block for ring in magnet.array.ring] or [
         magnet.array.block]

@@ -23,7 +23,8 @@ quadrature on panels that are no longer than their distance from the point, to a
 the field. `halbach_fe.solver.prism_kernel` has them in compiled form.
 
 Fields of external sources (background, neighbouring magnets, magnetized objects) are added in
-vacuum: the magnet's permeability and iron do not react to them.
+vacuum: the magnet's permeability and iron do not react to them, but for iron of any shape, see
+`halbach_fe.solver.separate_blocks`.
 """
 
 from __future__ import annotations

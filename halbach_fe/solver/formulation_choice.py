@@ -39,9 +39,12 @@ from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.reciprocal_columns import reciprocal_gradients, saves_solves
 from halbach_fe.solver.separate_blocks import (
     applies,
+    external_acts,
     field_in_vacuum,
     iron_alone,
     separate_columns,
+    sizes_in_iron,
+    sizes_of_iron,
     solve_separate,
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
@@ -310,6 +313,8 @@ def _moments_part(
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
         return _join_parts(magnet, points, parts)
     if session.counter is not None:
+        if not magnet.iron_is_axisymmetric:
+            session.counter.batches.append((session.purpose, sizes_of_iron(magnet, estimate)))
         zero = np.zeros((len(points), 3))
         return ElementFields(np.nan, zero, zero, magnet.blocks, _refuse_column, zero)
     solved = solve_separate(magnet, session, estimate)
@@ -319,7 +324,8 @@ def _moments_part(
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column, error)
     block = separate_columns(magnet, points, solved.iron, session.progress)
     along = nominal
-    if magnet.is_nonlinear or magnet.has_losses:  # the columns are derivatives there
+    # the columns are derivatives there, and do not hold what answers to external fields
+    if magnet.is_nonlinear or magnet.has_losses or external_acts(magnet):
         along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
     # the same tolerance for the route ``moments``. The columns have a single cell per block, and
@@ -395,8 +401,8 @@ def finer_in_words(magnet: Magnet, points: Floats) -> str:
 
     They follow from the route: ``cells_per_side`` divides permeable blocks on the route
     ``moments``, ``meridian_size_m`` is of the half-plane of azimuthal modes, and ``block_size_m``
-    of the rest. There is none where only iron is left to the route ``moments``, whose grid of the
-    iron is fixed.
+    of the rest, also of iron of any shape. There is none where only rotationally symmetric iron is
+    left to the route ``moments``, whose grid of the iron is fixed.
     """
     mesh, route = magnet.study.mesh, choose_route(magnet, points)
     if route not in (Route.MOMENTS, Route.AZIMUTHAL_MODES):
@@ -405,6 +411,9 @@ def finer_in_words(magnet: Magnet, points: Floats) -> str:
     if route is Route.MOMENTS and (magnet.has_losses or any(
             block.recoil_permeability != 1.0 or not block.isotropic for block in magnet.blocks)):
         keys.append(f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})")
+    if not magnet.iron_is_axisymmetric:
+        size = min(sizes_in_iron(magnet))
+        keys.append(f"a smaller mesh.block_size_m (elements of iron now have {1e3 * size:.3g} mm)")
     if route is Route.AZIMUTHAL_MODES or (
             magnet.study.solver.route == "auto" and not magnet.has_losses
             and bool(few_modes_suffice(magnet, points).any())):
@@ -435,20 +444,26 @@ def choose_route(magnet: Magnet, points: Floats) -> Route:
     if asked == "moments" and not applies(magnet):
         raise StudyError(
             f"Input `solver.route` of study {magnet.name} must be another route; instead received "
-            "moments, which needs the method reaction and iron of coaxial tubes or discs. Leave "
-            "the key out.")
+            "moments, which needs the method reaction. Leave the key out.")
     if asked == "auto":
         if magnet.study.solver.method == "direct":
             asked = "edge_elements"
         elif symmetric:
             asked = "azimuthal_modes"
         else:
-            asked = "moments" if applies(magnet) else "scalar_potential"
+            extruded = magnet.array.is_uniform and magnet.iron_is_along_z
+            asked = "scalar_potential" if extruded and not magnet.iron_is_axisymmetric else (
+                "moments")
     if asked in ("edge_elements", "scalar_potential") and not magnet.array.is_uniform:
         raise StudyError(
             f"Input `array` of study {magnet.name} must consist of equal rings for the route "
             f"{asked.replace('_', ' ')}; instead it has rings of their own or free blocks. Use the "
-            "method reaction, and iron of coaxial tubes or discs.")
+            "method reaction.")
+    if asked in ("edge_elements", "scalar_potential") and not magnet.iron_is_along_z:
+        raise StudyError(
+            f"Input `iron` of study {magnet.name} must be of one material, of prisms along z and "
+            f"coaxial tubes, for the route {asked.replace('_', ' ')}; instead a body has another "
+            "shape, place or material. Leave solver.route and solver.method out.")
     return Route(asked)
 
 

@@ -90,6 +90,8 @@ class VerifiedMesh:
     cell_type : str
         meshio's name of this type: ``triangle6``, ``quad`` or ``tetra10``.
     in_air, in_iron : ndarray of bool, shape (elements,)
+    tags : ndarray of int, shape (elements,)
+        Region of every element.
     inner : Entities
         Numbers of entities off the outer boundary, from which the number of unknowns follows.
     axis : Entities
@@ -105,6 +107,7 @@ class VerifiedMesh:
     cell_type: str
     in_air: NDArray[np.bool_]
     in_iron: NDArray[np.bool_]
+    tags: Ints
     inner: Entities
     axis: Entities
     radius: float
@@ -279,7 +282,7 @@ def verify_mesh(files: MeshFiles) -> VerifiedMesh:
     return VerifiedMesh(
         path=files.mesh, regions=regions, points=mesh.points[:, :regions.dimension], cells=cells,
         cell_type=kind, in_air=material == regions.air,
-        in_iron=material == regions.iron,
+        in_iron=material == regions.iron, tags=material,
         inner=_less(_count(cells, kind), _count(boundary, edge)),
         axis=_less(_count(np.vstack([axis, boundary]), edge), _count(boundary, edge)),
         radius=radius, half_length=half_length)

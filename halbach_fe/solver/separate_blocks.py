@@ -14,7 +14,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,11 +29,13 @@ from halbach_fe.solver.axisymmetric_iron import (
     highest_mode_at,
     solve_iron,
 )
-from halbach_fe.solver.exact_block_field import field_on_circles, unit_fields
+from halbach_fe.solver.exact_block_field import external_field, field_on_circles, unit_fields
 from halbach_fe.solver.iron_modes import IronRectangle, Resolution
-from halbach_fe.solver.session import Session
+from halbach_fe.solver.session import RunSize, Session
+from halbach_fe.study.magnet import External
 
 if TYPE_CHECKING:
+    from halbach_fe.solver.iron_bodies import BodiesReaction
     from halbach_fe.solver.moments.irreversible import KneeLaw
     from halbach_fe.solver.moments.solve import Moments, System
 
@@ -56,14 +58,14 @@ class SeparateReaction:
         size; none if all permeabilities are 1 and nothing is lost. Of blocks with losses the other
         one has those of the mean field in every cell. It is left out if the study infers variations
         inside the blocks, which make up for errors of the losses.
-    iron : IronReaction or None
+    iron : IronReaction, BodiesReaction or None
     without_losses : tuple of Moments
         If there are losses, polarization of blocks that have lost nothing, in cells of two sizes:
         for the error bar of what permeability induces.
     """
 
     blocks: tuple[Moments, ...]
-    iron: IronReaction | None
+    iron: IronReaction | BodiesReaction | None
     without_losses: tuple[Moments, ...] = ()
 
     def field(self, points: Floats) -> Floats:
@@ -106,8 +108,7 @@ class SeparateReaction:
 
 def applies(magnet: Magnet) -> bool:
     """Tell whether the reaction of a magnet can be computed without a mesh of its blocks."""
-    return (magnet.dimension == 3 and magnet.iron_is_axisymmetric
-            and magnet.study.solver.method == "reaction")
+    return magnet.dimension == 3 and magnet.study.solver.method == "reaction"
 
 
 def solve_separate(
@@ -128,13 +129,11 @@ def solve_separate(
     if not magnet.iron:
         return _reaction_without_iron(own)
     blocks, systems = own.blocks, own.systems()
-    bodies = iron_rectangles(magnet)
-    remanent = _cached_field(field_in_vacuum(blocks))
+    others = partial(external_field, magnet) if external_acts(magnet) else None
+    remanent = _cached_field(_sum_of_fields(field_in_vacuum(blocks), others))
     if not systems:
-        return SeparateReaction((), solve_iron(
-            bodies, remanent, session, magnet.name, estimate=estimate))
-    rough = replace(Resolution().coarser(1), modes=None)
-    iron = solve_iron(bodies, remanent, session.within("turns"), magnet.name, rough, False)
+        return SeparateReaction((), _solve_iron(magnet, remanent, session, estimate))
+    iron = _solve_iron(magnet, remanent, session.within("turns"), rough=True)
     middles = np.array([block.middle + block.displacement_m for block in blocks])
     scale = max(abs(block.remanence) for block in blocks)
     before = iron.field(middles)
@@ -147,19 +146,56 @@ def solve_separate(
     # cubes of 12.7 mm, 4 mm from a tube); that field is some 5 % of the source.
     iron_degree = 8
     for _ in range(most_turns):
-        polarized = own.polarized(systems[0], iron.field)
+        polarized = own.polarized(systems[0], _sum_of_fields(iron.field, others))
         source = _sum_of_fields(remanent, partial(polarized.reaction, degree=iron_degree))
-        iron = solve_iron(
-            bodies, source, session.within("turns"), magnet.name, rough, False, start=iron)
+        iron = _solve_iron(magnet, source, session.within("turns"), rough=True, start=iron)
         now = iron.field(middles)
         if np.abs(now - before).max() <= tolerance * scale:
-            return own.reaction(systems, solve_iron(
-                bodies, source, session, magnet.name, estimate=estimate))
+            return own.reaction(
+                systems, _solve_iron(magnet, source, session, estimate), others)
         before = now
     raise HalbachError(
         f"Blocks and iron of study {magnet.name} do not come to rest in {most_turns} turns: the "
         f"last changed the iron's field by {np.abs(now - before).max():.1e} T. Please report this "
         "with the study.")
+
+
+def external_acts(magnet: Magnet) -> bool:
+    """Tell whether iron and blocks answer to the external field: beside iron of any shape."""
+    return not magnet.iron_is_axisymmetric and magnet.external != External()
+
+
+def _solve_iron(
+    magnet: Magnet, source: Field, session: Session, estimate: bool = False, rough: bool = False,
+    start: Any = None,
+) -> IronReaction | BodiesReaction:
+    """Solve for the reaction of a magnet's iron, on a coarse mesh if ``rough``.
+
+    ``start`` is a solution of the same iron on the same mesh with a similar source.
+    """
+    if magnet.iron_is_axisymmetric:
+        resolution = replace(Resolution().coarser(1), modes=None) if rough else None
+        return solve_iron(iron_rectangles(magnet), source, session, magnet.name, resolution,
+                          estimate, start)
+    from halbach_fe.solver.iron_bodies import COARSER, solve_bodies  # imports numba
+
+    return solve_bodies(magnet, source, session, estimate, start, COARSER if rough else 1.0)
+
+
+def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
+    """Return the expected sizes of the runs for iron that is not rotationally symmetric."""
+    from halbach_fe.solver.iron_bodies import COARSER, size_of
+
+    rough = estimate or _permeable(magnet.blocks)
+    return [size_of(magnet, coarseness) for coarseness in (1.0, *(COARSER,) * rough)]
+
+
+def sizes_in_iron(magnet: Magnet) -> list[float]:
+    """Return the sizes in m of the elements in bodies of iron of any shape."""
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+
+    sizes = Sizes.of(magnet.study.mesh.block_size_m)
+    return [sizes.of_body(body) for body in magnet.iron]
 
 
 def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
@@ -168,15 +204,19 @@ def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
     That is a few per cent off the change of field that the iron makes if the blocks are permeable,
     in a small part of the time. In linear iron only the modes are solved for that reach the points.
     """
+    source = field_in_vacuum(present_blocks(magnet.blocks))
+    if not magnet.iron_is_axisymmetric:
+        return _solve_iron(magnet, source, session).field(points)
     bodies = iron_rectangles(magnet)
     most = None if magnet.is_nonlinear else highest_mode_at(bodies, points)
     resolution = Resolution(modes=None if most is None else min(most, MOST_MODES))
-    return solve_iron(bodies, field_in_vacuum(present_blocks(magnet.blocks)), session, magnet.name,
-                      resolution, estimate=False).field(points)
+    return solve_iron(bodies, source, session, magnet.name, resolution,
+                      estimate=False).field(points)
 
 
 def separate_columns(
-    magnet: Magnet, points: Floats, iron: IronReaction | None, progress: Progress | None = None
+    magnet: Magnet, points: Floats, iron: IronReaction | BodiesReaction | None,
+    progress: Progress | None = None
 ) -> Callable[[int, Ints | slice], Floats]:
     """Compute the reaction to every single block at points (n, 3) in m.
 
@@ -218,9 +258,8 @@ def separate_columns(
 
 def iron_rectangles(magnet: Magnet) -> tuple[IronRectangle, ...]:
     """Return the iron of a magnet as rectangles of the (r, z) half-plane."""
-    law = magnet.curve or magnet.iron_permeability
-    return tuple(IronRectangle(body.inner_radius, body.outer_radius, body.z_min, body.z_max, law)
-                 for body in magnet.iron)
+    return tuple(IronRectangle(body.inner_radius, body.outer_radius, body.z_min, body.z_max,
+                               body.law) for body in magnet.iron)
 
 
 def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
@@ -256,9 +295,9 @@ def _cached_field(function: Field) -> Field:
     return field
 
 
-def _sum_of_fields(first: Field, second: Field) -> Field:
+def _sum_of_fields(first: Field, second: Field | None) -> Field:
     """Return the sum of two fields."""
-    return lambda points: first(points) + second(points)
+    return first if second is None else lambda points: first(points) + second(points)
 
 
 def _permeable(blocks: Sequence[MagnetBlock]) -> bool:
@@ -310,15 +349,16 @@ class _Blocks:
         return refinement(self.blocks, self.cells_per_side)[:self.sizes]
 
     def reaction(
-        self, systems: Sequence[System], iron: IronReaction | None = None,
-        known: Sequence[Moments] = (),
+        self, systems: Sequence[System], iron: IronReaction | BodiesReaction | None = None,
+        others: Field | None = None, known: Sequence[Moments] = (),
     ) -> SeparateReaction:
         """Return the reaction of blocks in the field of the iron, with another if there are two
         systems for its error bar.
 
-        ``known`` is the polarization of the first system, if it has been solved.
+        ``others`` is an external field that they answer to. ``known`` is the polarization of the
+        first system, if it has been solved.
         """
-        applied = None if iron is None else iron.field
+        applied = None if iron is None else _sum_of_fields(iron.field, others)
         first = known or [self.polarized(system, applied) for system in systems[:1]]
         if self.law is None or len(systems) < 2:
             return SeparateReaction(

@@ -9,7 +9,16 @@ from pydantic import Field, model_validator
 
 from halbach_fe.study import materials
 from halbach_fe.study.polygons import crossing
-from halbach_fe.study.types import MAX_LENGTH_M, Coordinate, Gap, Length, Line, StudyModel
+from halbach_fe.study.types import (
+    MAX_LENGTH_M,
+    Coordinate,
+    Gap,
+    Length,
+    Line,
+    Point,
+    Rotation,
+    StudyModel,
+)
 
 
 class TableCurve(StudyModel):
@@ -88,10 +97,13 @@ IronCurve = Annotated[TableCurve | SteelCurve | FroehlichKennellyCurve | BrauerC
                       Field(discriminator="kind")]
 
 
+RelativePermeability = Annotated[float, Field(ge=1.0, le=1e6)]
+
+
 class IronMaterial(StudyModel):
     """Iron with either a constant ``relative_permeability`` or a magnetization ``curve``."""
 
-    relative_permeability: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
+    relative_permeability: RelativePermeability | None = None
     curve: IronCurve | None = None
 
     @model_validator(mode="after")
@@ -122,11 +134,39 @@ class IronRing(IronMaterial):
         return self
 
 
-class IronTube(StudyModel):
-    """A coaxial tube or, if it is short, a disc with or without a hole (an end plate, a shield).
+class PlacedIron(StudyModel):
+    """What any body of iron may have: a place, a rotation, and a material of its own.
 
-    ``inner_radius_m = 0`` makes a full disc. ``length_m`` is along z, centred at ``z_m`` (default:
-    as long as the array). Tubes that touch make a stepped bore.
+    ``centre_m`` is where the origin of the body's own axes lies in the magnet, and the rotation
+    vector ``rotation_deg`` turns the magnet's axes into them. Without them, the axes are those of
+    the magnet. Either ``relative_permeability`` or ``curve`` replaces the material of all bodies.
+    """
+
+    centre_m: Point = (0.0, 0.0, 0.0)
+    rotation_deg: Rotation = (0.0, 0.0, 0.0)
+    relative_permeability: RelativePermeability | None = None
+    curve: IronCurve | None = None
+
+    @model_validator(mode="after")
+    def _of_one_material(self) -> Self:
+        if self.relative_permeability is not None and self.curve is not None:
+            raise ValueError("give at most one of relative_permeability and curve")
+        return self
+
+    @property
+    def own_material(self) -> IronMaterial | None:
+        """Its own material, None if it is that of all bodies."""
+        if self.relative_permeability is None and self.curve is None:
+            return None
+        return IronMaterial(relative_permeability=self.relative_permeability, curve=self.curve)
+
+
+class IronTube(PlacedIron):
+    """A tube or, if it is short, a disc with or without a hole (an end plate, a shield).
+
+    It is coaxial unless ``centre_m`` or ``rotation_deg`` place it elsewhere. ``inner_radius_m = 0``
+    makes a full disc. ``length_m`` is along its axis, centred at ``z_m`` (default: as long as the
+    array). Tubes that touch make a stepped bore.
     """
 
     kind: Literal["tube"]
@@ -143,10 +183,10 @@ class IronTube(StudyModel):
         return self
 
 
-class IronPrism(StudyModel):
-    """A prism along z with the polygonal section ``outline_m``, for poles and yokes.
+class IronPrism(PlacedIron):
+    """A prism along its own z axis with the polygonal section ``outline_m``, for poles and yokes.
 
-    ``copies`` of it stand at equal angles about the z axis. ``length_m`` is along z, centred at
+    ``copies`` of it stand at equal angles about that axis. ``length_m`` is along z, centred at
     ``z_m`` (default: as long as the array; without meaning in 2D).
     """
 
@@ -167,10 +207,38 @@ class IronPrism(StudyModel):
         return self
 
 
-IronBody = Annotated[IronTube | IronPrism, Field(discriminator="kind")]
+class IronBox(PlacedIron):
+    """A box, ``size_m`` wide along its own three axes, with its middle at ``centre_m``."""
+
+    kind: Literal["box"]
+    size_m: tuple[Length, Length, Length]
 
 
-class Iron(IronMaterial):
-    """Iron of any number of bodies, all of one material."""
+class IronSphere(PlacedIron):
+    """A sphere of ``radius_m`` with its middle at ``centre_m``."""
 
+    kind: Literal["sphere"]
+    radius_m: Length
+
+
+IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere, Field(discriminator="kind")]
+
+
+class Iron(StudyModel):
+    """Iron of any number of bodies.
+
+    Either ``relative_permeability`` or a magnetization ``curve`` is the material of all bodies that
+    do not state their own.
+    """
+
+    relative_permeability: RelativePermeability | None = None
+    curve: IronCurve | None = None
     bodies: Annotated[tuple[IronBody, ...], Field(min_length=1, max_length=1000)]
+
+    @model_validator(mode="after")
+    def _of_some_material(self) -> Self:
+        given = (self.relative_permeability is not None) + (self.curve is not None)
+        if given > 1 or (not given and any(body.own_material is None for body in self.bodies)):
+            raise ValueError("give exactly one of relative_permeability and curve, for all bodies "
+                             "or for each")
+        return self

@@ -57,7 +57,8 @@ class PointDipole(StudyModel):
 class External(StudyModel):
     """Fields of sources outside the magnet, added to its field.
 
-    ``background_T`` is uniform. The reaction of iron and blocks to external fields is neglected.
+    ``background_T`` is uniform. Iron that is no coaxial tube or disc, nor a prism with equal rings,
+    and the blocks beside it answer to external fields. In all other magnets that is neglected.
     """
 
     background_T: FluxDensityVector = (0.0, 0.0, 0.0)

@@ -23,7 +23,7 @@ from halbach_fe.study.array import Array
 from halbach_fe.study.design import Design, Holder, HomogeneityRegion, ShimTray
 from halbach_fe.study.grades import STRENGTHS, grade_of
 from halbach_fe.study.inference import Inference, Plan, Prior
-from halbach_fe.study.iron import Iron, IronMaterial, IronRing
+from halbach_fe.study.iron import Iron, IronCurve, IronRing
 from halbach_fe.study.magnet import Demagnetization, External
 from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS, InstrumentSd, MapSettings
 from halbach_fe.study.materials import Curve
@@ -189,11 +189,12 @@ class Study(StudyModel):
 def is_nonlinear(study: Study) -> bool:
     """Tell whether the field is a non-linear function of the magnetizations (iron with a curve)."""
     iron = iron_of(study)
-    return iron is not None and iron.curve is not None
+    return iron is not None and (iron.curve is not None or any(
+        body.curve for body in getattr(iron, "bodies", ())))
 
 
-def iron_of(study: Study) -> IronMaterial | None:
-    """Return the material of the study's iron, or None if it has no iron."""
+def iron_of(study: Study) -> IronRing | Iron | None:
+    """Return the study's iron with its material, or None if it has no iron."""
     return study.iron_ring or study.iron
 
 
@@ -223,9 +224,17 @@ def curve_of(study: Study) -> Curve | None:
         If the curve is in a file that has not been read (`read_study` reads it).
     """
     iron = iron_of(study)
-    curve = iron and iron.curve
-    if not curve:
-        return None
+    return None if iron is None or iron.curve is None else curve_from(iron.curve, study.name)
+
+
+def curve_from(curve: IronCurve, name: str = "") -> Curve:
+    """Return the magnetization curve that keys of a study describe.
+
+    Raises
+    ------
+    StudyError
+        As of `curve_of`.
+    """
     if curve.kind == "brauer":
         return materials.brauer(curve.k1_m_per_H, curve.k2_per_T2, curve.k3_m_per_H)
     if curve.kind == "froehlich_kennelly":
@@ -236,7 +245,7 @@ def curve_of(study: Study) -> Curve | None:
     elif curve.file is None:
         table = curve.H_A_per_m, curve.B_T
     else:  # the folder that the path is relative to is not known here
-        raise StudyError(must_be("`curve.file` of the iron", f"study {study.name}",
+        raise StudyError(must_be("`curve.file` of the iron", f"study {name}".rstrip(),
                                  "read together with the study's own file", f"'{curve.file}'",
                                  "Use read_study, or give H_A_per_m and B_T."))
     return materials.table_curve(np.array(table[0]), np.array(table[1]))

@@ -24,7 +24,7 @@ from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
-from halbach_fe.study.iron import TableCurve
+from halbach_fe.study.iron import Iron, IronCurve, TableCurve
 from halbach_fe.study.model import Study, iron_of
 
 LARGE_TURN_RAD, OFF_STEP = 0.3, 0.05
@@ -152,17 +152,29 @@ def with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dict
 
 
 def _with_table(study: Study, folder: Path, where: str) -> Study:
-    """Return the study with the numbers of its H(B) file in place of the file's name."""
+    """Return the study with the numbers of its H(B) files in place of the files' names."""
     key = "iron_ring" if study.iron_ring is not None else "iron"
     iron = iron_of(study)
-    if iron is None or iron.curve is None or iron.curve.kind != "table" or not iron.curve.file:
+    if iron is None:
         return study
-    path = folder / iron.curve.file
+    found = iron.with_(curve=_read_curve(iron.curve, key, folder, where))
+    if isinstance(found, Iron):
+        found = found.with_(bodies=tuple(
+            body.with_(curve=_read_curve(body.curve, f"{key}.bodies[{number}]", folder, where))
+            for number, body in enumerate(found.bodies)))
+    return study if found == iron else study.with_(**{key: found})
+
+
+def _read_curve(curve: IronCurve | None, key: str, folder: Path, where: str) -> IronCurve | None:
+    """Return a curve with the numbers of its file, if it has one."""
+    if curve is None or curve.kind != "table" or not curve.file:
+        return curve
+    path = folder / curve.file
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise ValueError("it must be a file")  # reading a device might never end
         field, flux_density = materials.read_table(path)
-        table = TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
+        return TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
     except OSError as error:
         raise StudyError(must_be(f"`{key}.curve.file`", where, "a readable file",
                                  f"{str(path)!r} ({error.strerror})",
@@ -171,7 +183,6 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
         wrong = sentences.reason(error) if isinstance(error, ValidationError) else error
         raise StudyError(must_be(f"`{key}.curve.file`", where, "a table of H(B)",
                                  f"{str(path)!r}, which cannot be used: {wrong}")) from None
-    return study.with_(**{key: iron.with_(curve=table)})
 
 
 def _sentence(error: ValidationError, where: str) -> str:

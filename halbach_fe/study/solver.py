@@ -15,10 +15,11 @@ CELLS_PER_SIDE = 2
 class MeshSettings(StudyModel):
     """Sizes of the finite elements.
 
-    ``block_size_m`` holds in the blocks and iron, ``bore_size_m`` in the bore (default: the same).
-    Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` - 1 per
-    unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the cross-section
-    is extruded along z, in ``layers_per_ring`` layers per ring.
+    ``block_size_m`` holds in the blocks and iron; on the route ``moments`` it is the largest size
+    in iron that is not rotationally symmetric. ``bore_size_m`` holds in the bore (default: the
+    same). Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` -
+    1 per unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the
+    cross-section is extruded along z, in ``layers_per_ring`` layers per ring.
 
     ``cells_per_side`` divides separate blocks for the method of moments: the number of cells along
     the sides of a cube (default: 2).
@@ -58,10 +59,11 @@ class SolverSettings(StudyModel):
     ``edge_order`` is the order of its elements. ``scalar_potential`` solves the dual problem with
     nodal elements of second order, for any geometry too. These two take the rings to be equal.
     ``moments`` divides the blocks into cells instead of meshing space (method of moments), and
-    solves rotationally symmetric iron by azimuthal modes; it is the most accurate for separate
-    blocks, and takes each where it is mounted. ``auto`` takes azimuthal modes where possible and
-    moments elsewhere, reading by reading, the scalar potential if the iron is not rotationally
-    symmetric, and edge elements for ``method = "direct"``.
+    solves rotationally symmetric iron by azimuthal modes, and iron of any other shape by the scalar
+    potential in the iron and the air near it; it is the most accurate for separate blocks, and
+    takes each where it is mounted. ``auto`` takes azimuthal modes where possible and
+    moments elsewhere, reading by reading, the scalar potential for equal rings with prisms of
+    iron, and edge elements for ``method = "direct"``.
 
     With ``symmetry`` the field of only one block is computed of all those that a rotation or
     reflection of the magnet maps onto one another.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
-from halbach_fe.study.iron import IronMaterial
+from halbach_fe.study.iron import Iron, IronBox, IronMaterial, IronSphere
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
 from halbach_fe.synthetic.shapes import PolygonBody, shoelace
@@ -122,7 +122,13 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
     if iron is None:
         return None
     bodies: list[Tube | Pole] = []
-    for body in iron.bodies:
+    for number, body in enumerate(iron.bodies):
+        if isinstance(body, IronBox | IronSphere) or any(body.centre_m + body.rotation_deg) or (
+                body.own_material is not None):
+            raise StudyError(must_be(
+                f"`iron.bodies[{number}]`", f"study {study.name}", "a coaxial tube or a prism "
+                "along z, of the material of all bodies, to simulate a campaign", "another one",
+                "Leave it out; the field of the magnet can be computed with it."))
         middle = 0.0 if study.dimension == 2 else body.z_m
         if body.kind == "tube":
             bodies.append(Tube(body.inner_radius_m, body.outer_radius_m, half(body.length_m),
@@ -136,7 +142,7 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
     return TrueIron(tuple(bodies), law_of(iron))
 
 
-def law_of(iron: IronMaterial) -> IronLaw:
+def law_of(iron: IronMaterial | Iron) -> IronLaw:
     """Return the material law of a study's iron.
 
     Raises

@@ -13,6 +13,9 @@ SIZE = DIPOLE["array"]["outer_radius_m"]
 WEDGE = [[0.2, -0.01], [0.23, -0.02], [0.25, 0.0], [0.23, 0.02], [0.2, 0.01]]
 
 
+BOX = {"kind": "box", "size_m": [0.1, 0.2, 0.04], "centre_m": [0.0, 0.0, 0.2]}
+
+
 def magnet_of(make, *bodies, **changes):
     return build_magnet(make(iron={"relative_permeability": 1000.0, "bodies": list(bodies)},
                              **changes))
@@ -82,6 +85,40 @@ def test_several_bodies(short_dipole):
     assert magnet.contains(points).tolist() == [True, True, False, False]
 
 
+@pytest.mark.parametrize(("body", "volume"), [
+    (BOX | {"rotation_deg": [20.0, -10.0, 70.0]}, 0.1 * 0.2 * 0.04),
+    ({"kind": "sphere", "radius_m": 0.08, "centre_m": [0.05, 0.0, 0.2]}, 4 / 3 * np.pi * 0.08**3),
+    (tube(0.02, 0.06, length_m=0.1, rotation_deg=[90.0, 0.0, 0.0], centre_m=[0.0, 0.0, 0.2]),
+     np.pi * (0.06**2 - 0.02**2) * 0.1)])
+def test_bodies_in_any_place(short_dipole, generator, body, volume):
+    """Monte Carlo, 4 sigma. All that is inside lies within the points of the surface, and
+    `measures` has the volume.
+    """
+    magnet = magnet_of(short_dipole, body)
+    (solid,) = magnet.iron
+    found, inside = fraction_inside(solid, generator)
+    assert found == pytest.approx(volume, abs=4 * np.sqrt(volume * 0.6**3 / 200_000))
+    assert solid.measures[0] == pytest.approx(volume, rel=1e-12)
+    low, high = (np.array([end(part) for part in solid.surface]) for end in (np.min, np.max))
+    assert ((inside >= low) & (inside <= high)).all()
+    assert (inside.max(axis=0) - inside.min(axis=0) > 0.8 * (high - low)).all()
+    assert solid.half_length == pytest.approx(np.abs(solid.surface[2]).max())
+    assert not magnet.iron_is_axisymmetric
+    # points on faces are moved outward along the body's own axes
+    if solid.sphere:
+        on = np.array([[0.05, 0.0, 0.28]])
+        assert solid.contact(on).on_face.all()
+        assert (solid.contact(on).outward[:, 2] > 0).all()
+
+
+def test_a_moved_coaxial_tube_is_still_coaxial(short_dipole):
+    (solid,) = magnet_of(short_dipole, tube(0.2, 0.25, centre_m=[0.0, 0.0, 0.05])).iron
+    assert solid.is_coaxial
+    assert (solid.z_min, solid.z_max) == pytest.approx((-0.03, 0.13))
+    assert not magnet_of(short_dipole, tube(
+        0.2, 0.25, rotation_deg=[180.0, 0.0, 0.0])).iron_is_axisymmetric
+
+
 @pytest.mark.parametrize(("body", "said"), [
     (tube(0.1, 0.25), "overlap"), (tube(0.0, 0.12, z_m=0.03), "overlap"),
     (tube(0.25, 0.2), "must be larger than inner_radius_m"),
@@ -89,7 +126,7 @@ def test_several_bodies(short_dipole):
     (prism(outline_m=[[0.2, 0], [0.21, 0], [0.22, 0]]), "some area"),
     (prism(outline_m=[[0.1, 0], [0.25, -0.01], [0.25, 0.01]]), "overlap"),
     (prism(copies=0), "greater than or equal to 1"),
-    ({"kind": "sphere", "radius_m": 0.1}, "'tube'")])
+    ({"kind": "ball", "radius_m": 0.1}, "'tube'")])
 def test_refusals(short_dipole, body, said):
     with pytest.raises(StudyError, match=said):
         magnet_of(short_dipole, body)

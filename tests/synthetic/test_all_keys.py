@@ -15,7 +15,7 @@ from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.moments.solve import solve_moments
 from halbach_fe.study.array import Array, BlockException, Ring
 from halbach_fe.study.free_blocks import COLUMNS, SIZES
-from halbach_fe.study.iron import IronPrism, IronTube
+from halbach_fe.study.iron import IronPrism, IronTube, PlacedIron
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
@@ -253,7 +253,18 @@ def solids(body, dimension=3, **material):
     return magnet_of(study).iron, build_magnet(study).iron
 
 
-@pytest.mark.parametrize("key", dict.fromkeys([*IronTube.model_fields, *IronPrism.model_fields]))
+@pytest.mark.parametrize("key", PlacedIron.model_fields)
+def test_iron_of_another_place_or_material_is_refused(key):
+    change = {"centre_m": [0.0, 0.0, 0.1], "rotation_deg": [0.0, 0.0, 5.0],
+              "relative_permeability": 10.0, "curve": {"kind": "steel", "name": "aisi_1010"}}[key]
+    study = study_of(RING | {"rings": 1}, 3, iron={"bodies": [POLE | {key: change}]} | IRON)
+    with pytest.raises(StudyError, match=r"iron.bodies\[0\].*to simulate a campaign"):
+        magnet_of(study)
+
+
+@pytest.mark.parametrize("key", [
+    key for key in dict.fromkeys([*IronTube.model_fields, *IronPrism.model_fields])
+    if key not in PlacedIron.model_fields])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_every_key_of_a_body_of_iron(key, dimension, generator):
     """The iron fills the same space as the model's, and another one than without the key."""

@@ -1,0 +1,210 @@
+"""Mesh of bodies of iron and of the air near them, in curved tetrahedra of second order.
+
+Blocks do not shape it. Around the air lies a shell that GetDP maps to the rest of space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import gmsh
+import numpy as np
+
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.geo.session import gmsh_session, write_mesh
+from halbach_fe.geometry import domain as tags
+from halbach_fe.geometry.domain import BlockRegion, Regions
+from halbach_fe.geometry.iron import IronSolid
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the elements of iron.
+
+    Attributes
+    ----------
+    iron : float
+        Largest size in m.
+    thickness : float
+        Largest size relative to the ratio of a body's volume and surface, half the thickness of a
+        plate.
+    curvature : float
+        Largest size relative to the radius of a round body.
+    edge : float
+        Size along the edges, where the field is singular, relative to that in the body.
+    growth : float
+        Change of the size per unit of distance in the air.
+    """
+
+    iron: float
+    thickness: float
+    curvature: float
+    edge: float
+    growth: float
+
+    @classmethod
+    def of(cls, size: float, coarseness: float = 1.0) -> Sizes:
+        """Return those for elements of a size in m; a larger ``coarseness`` is for error bars."""
+        return cls(coarseness * size, 1.2 * coarseness, 0.25 * coarseness, 0.4,
+                   0.35 * coarseness**0.6)
+
+    def of_body(self, body: IronSolid) -> float:
+        """Return the size in m in a body."""
+        volume, surface, _ = body.measures
+        round_body = np.inf if body.outline else self.curvature * body.outer_radius
+        return min(self.iron, self.thickness * volume / surface, round_body)
+
+    def count(self, bodies: Sequence[IronSolid]) -> tuple[int, int]:
+        """Estimate the numbers of elements and of unknowns of the mesh, right to a third or so.
+
+        They are integrals of 1 / size^3 over the bodies, their edges and the air near them.
+        """
+        growth, unknowns = self.growth, 700 + 150 * self.growth**-3  # some, and those far away
+        for body in bodies:
+            volume, surface, edges = body.measures
+            size = self.of_body(body)
+            small, reach = self.edge * size, (1 - self.edge) * size / growth
+            inside = volume / size**3 + edges * np.pi / 4 * reach**2 / (small * size**2)
+            unknowns += 5.0 * inside + 2.0 * surface / (growth * size**2) + (
+                5.5 * 0.75 * np.pi * edges / (growth**2 * small))
+        return round(0.77 * unknowns), round(unknowns)
+
+
+@dataclass(frozen=True)
+class Shell:
+    """The spherical shell that is mapped to infinity: middle and radii in m."""
+
+    middle: tuple[float, float, float]
+    inner: float
+    outer: float
+
+
+def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: Path
+              ) -> tuple[Regions, Shell]:
+    """Mesh bodies of iron and the air around, write the mesh, and return regions and shell.
+
+    Raises
+    ------
+    StudyError
+        If bodies overlap.
+    MeshError
+        If Gmsh fails.
+    """
+    with gmsh_session(name):
+        occ = gmsh.model.occ
+        drawn = [_volume(body) for body in bodies]
+        shell = _shell(drawn)
+        whole = sum(occ.getMass(*volume) for volume in drawn)
+        inner, outer = (occ.addSphere(*shell.middle, radius)
+                        for radius in (shell.inner, shell.outer))
+        _, parts = occ.fragment(drawn, [(3, inner), (3, outer)])
+        occ.synchronize()
+        pieces = [[tag for _, tag in part] for part in parts]
+        iron = {tag for part in pieces[:-2] for tag in part}
+        if sum(occ.getMass(3, tag) for tag in iron) < (1 - SAME_VOLUME) * whole:
+            raise StudyError(must_be("`iron.bodies`", f"study {name}", "bodies that do not overlap",
+                                     "bodies that do", "Move them apart, or let them touch."))
+        air = set(pieces[-2]) - iron
+        regions = [(tags.AIR_TAG, air), (tags.SHELL_TAG, set(pieces[-1]) - air - iron)]
+        regions += [(tags.FIRST_BLOCK_TAG + number, set(part))
+                    for number, part in enumerate(pieces[:-2])]
+        for tag, volumes in regions:
+            gmsh.model.addPhysicalGroup(3, sorted(volumes), tag)
+        rim = [tag for _, tag in gmsh.model.getBoundary([(3, tag) for tag in pieces[-1]],
+                                                        oriented=False)]
+        far = [tag for tag in rim if np.ptp(np.array(
+            gmsh.model.getBoundingBox(2, tag)).reshape(2, 3), axis=0).max() > 2 * shell.inner]
+        gmsh.model.addPhysicalGroup(2, far, tags.OUTER_BOUNDARY_TAG)
+        _set_sizes(bodies, pieces[:-2], sizes, shell)
+        gmsh.model.mesh.generate(3)
+        gmsh.model.mesh.setOrder(2)
+        gmsh.model.mesh.optimize("HighOrder")
+        write_mesh(mesh_path)
+    return Regions(
+        study=name, dimension=3, air=tags.AIR_TAG, iron=None, shell=tags.SHELL_TAG,
+        outer_boundary=tags.OUTER_BOUNDARY_TAG,
+        blocks=tuple(BlockRegion(name=f"iron{number + 1}", ring=number + 1, slot=0,
+                                 tag=tags.FIRST_BLOCK_TAG + number)
+                     for number in range(len(bodies)))), shell
+
+
+SAME_VOLUME = 1e-6
+"""Part of the iron's volume that overlaps may take: rounding of coordinates."""
+
+
+def _shell(volumes: Sequence[tuple[int, int]]) -> Shell:
+    """Return a shell around volumes."""
+    boxes = np.array([gmsh.model.occ.getBoundingBox(*volume) for volume in volumes])
+    low, high = boxes[:, :3].min(axis=0), boxes[:, 3:].max(axis=0)
+    x, y, z = (low + high) / 2
+    radius = 3.0 * float(np.linalg.norm(high - low)) / 2
+    return Shell((x, y, z), radius, 1.3 * radius)
+
+
+def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes: Sizes,
+               shell: Shell) -> None:
+    """Set the sizes of elements: small at the edges of iron, growing away from it.
+
+    ``iron`` has the volumes of every body.
+    """
+    field = gmsh.model.mesh.field
+    for option in ("ExtendFromBoundary", "FromPoints", "FromCurvature"):
+        gmsh.option.setNumber(f"Mesh.MeshSize{option}", 0)
+    used = []
+
+    def limit(kind: str, entities: list[tuple[int, int]], size: float) -> None:
+        distance = field.add("Distance")
+        field.setNumbers(distance, kind, sorted({tag for _, tag in entities}))
+        field.setNumber(distance, "Sampling", 40)
+        used.append(field.add("MathEval"))
+        field.setString(used[-1], "F", f"{size:.9g}+{sizes.growth:.9g}*F{distance}")
+
+    for body, volumes in zip(bodies, iron, strict=True):
+        solid = [(3, tag) for tag in volumes]
+        faces = gmsh.model.getBoundary(solid, oriented=False)
+        size = sizes.of_body(body)
+        limit("SurfacesList", faces, size)
+        edges = [one for one in gmsh.model.getBoundary(faces, combined=False, oriented=False)
+                 if _is_sharp(one)]
+        if edges:
+            limit("CurvesList", edges, sizes.edge * size)
+        used.append(field.add("Constant"))
+        field.setNumbers(used[-1], "VolumesList", list(volumes))
+        field.setNumber(used[-1], "VIn", size)
+        field.setNumber(used[-1], "VOut", shell.inner / 3)
+    least = field.add("Min")
+    field.setNumbers(least, "FieldsList", used)
+    field.setAsBackgroundMesh(least)
+
+
+def _is_sharp(curve: tuple[int, int]) -> bool:
+    """Tell whether a curve is an edge between two faces, and no seam of a round one."""
+    faces, _ = gmsh.model.getAdjacencies(*curve)
+    return len(faces) > 1 and gmsh.model.occ.getMass(*curve) > 0
+
+
+def _volume(body: IronSolid) -> tuple[int, int]:
+    """Add a body to the Gmsh model in its place; return its dimension and tag."""
+    occ = gmsh.model.occ
+    if body.sphere:
+        volume = 3, occ.addSphere(0.0, 0.0, 0.0, body.outer_radius)
+    elif body.outline is not None:
+        starts = [occ.addPoint(*edge.start, body.z_min) for edge in body.outline]
+        lines = [occ.addLine(start, end) for start, end in pairwise([*starts, starts[0]])]
+        face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
+        found = occ.extrude([(2, face)], 0, 0, body.z_max - body.z_min)
+        volume = next(each for each in found if each[0] == 3)
+    else:
+        ends = 0.0, 0.0, body.z_min, 0.0, 0.0, body.z_max - body.z_min
+        volume = 3, occ.addCylinder(*ends, body.outer_radius)
+        if body.inner_radius:
+            hole = 3, occ.addCylinder(*ends, body.inner_radius)
+            (volume,), _ = occ.cut([volume], [hole])
+    angle = float(np.linalg.norm(body.turn_rad))
+    if angle:
+        occ.rotate([volume], 0, 0, 0, *body.turn_rad, angle)
+    occ.translate([volume], *body.origin_m)
+    return volume

@@ -1,0 +1,451 @@
+"""Bodies of iron of any shape in the field of sources that no mesh follows, in 3D.
+
+As for rotationally symmetric iron (`halbach_fe.solver.axisymmetric_iron`), the sources' field mu_0
+H_s in the iron is given and becomes the gradient of a finite-element potential psi_s there. The
+unknown is the total potential psi in the iron and the reaction's potential outside, so that nothing
+cancels in iron of high permeability (J. Simkin, C. W. Trowbridge, Int. J. Numer. Meth. Engng. 14
+(1979) 423). With psi_s continued by 0 to the nodes outside,
+
+    S (psi - psi_s) + int (mu_r(|grad psi|) - 1) grad psi . grad v = 0    for all v.
+
+GetDP assembles the stiffness S of vacuum, see pro/iron_bodies.pro. The steps of Newton's method are
+solved by conjugate gradients, with two levels as the preconditioner: the corners of the elements,
+which are factorized, and all nodes, which a Gauss-Seidel sweep smooths.
+
+The field outside is that of the polarization J = (mu_r - 1) mu_0 H of the iron, integrated over its
+elements. Its error falls faster than that of the gradient of the potential in the air, because it
+is a mean over all of the iron.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sparse
+import scipy.sparse.linalg as sparse_linalg
+from scipy.sparse.csgraph import connected_components
+
+from halbach_fe import pro
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import GetDPError, OutputError, StudyError, must_be
+from halbach_fe.core.files import make_folder
+from halbach_fe.core.threads import available_memory, in_threads, share_out
+from halbach_fe.geometry import domain as tags
+from halbach_fe.geometry.iron import IronSolid
+from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.solver.axisymmetric_iron import Source, conjugate_gradients, newton
+from halbach_fe.solver.condensed_newton import factorize
+from halbach_fe.solver.dofs import read_matrix, read_solutions, read_unknowns
+from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
+from halbach_fe.solver.interpolation import quadrature, shape_functions
+from halbach_fe.solver.iron_modes import MESH
+from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
+from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
+from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
+
+PROBLEM = "iron_bodies.pro"
+POINTS = 15  # Gauss points of an element
+
+ROUGHLY = (*CONJUGATE_GRADIENTS, "-ksp_rtol", "1e-5")
+"""PETSc options for GetDP's solution, which only verifies the matrix."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The discrete problem of the iron.
+
+    Attributes
+    ----------
+    bodies : tuple of IronSolid
+    stiffness_of_vacuum : sparse array, shape (n, n)
+    nodes : ndarray of int, shape (e, 10)
+        Unknowns of the iron's elements.
+    slopes : ndarray, shape (e, 15, 10, 3), in 1/m
+        Gradients of the functions of the nodes at the Gauss points.
+    weights : ndarray, shape (e, 15), in m^3
+    places : ndarray, shape (e, 10, 3), in m
+        Places of the nodes.
+    body : ndarray of int, shape (e,)
+        Body of each element.
+    coarse : sparse array, shape (n, corners)
+        Values at all nodes of those at the corners, linear in between.
+    """
+
+    bodies: tuple[IronSolid, ...]
+    stiffness_of_vacuum: sparse.csr_array
+    nodes: Ints
+    slopes: Floats
+    weights: Floats
+    places: Floats
+    body: Ints
+    coarse: sparse.csr_array
+
+    @cached_property
+    def points(self) -> Floats:
+        """The Gauss points (15 e, 3) in m."""
+        values, _ = shape_functions("tetra10", _reference())
+        return np.einsum("qa,eai->eqi", values, self.places).reshape(-1, 3)
+
+    def field(self, potential: Floats) -> Floats:
+        """Return grad psi (e, 15, 3, c) of potentials (n, c)."""
+        return np.asarray(np.einsum(
+            "eqai,eac->eqic", self.slopes, potential[self.nodes], optimize=True))
+
+    def integrate(self, vectors: Floats) -> Floats:
+        """Return the integrals (n, c) of vectors (e, 15, 3, c) times grad v."""
+        parts = np.einsum("eqai,eqic->eac", self.slopes, vectors * self.weights[..., None, None],
+                          optimize=True)
+        return np.stack([np.bincount(self.nodes.ravel(), part.ravel(),
+                                     self.stiffness_of_vacuum.shape[0])
+                         for part in np.moveaxis(parts, 2, 0)], axis=1)
+
+    def stiffness(self, potential: Floats) -> Floats:
+        """Return S psi (n, c)."""
+        return np.asarray(self.stiffness_of_vacuum @ potential)
+
+    def dot(self, a: Floats, b: Floats) -> Floats:
+        """Return the scalar products (c,) of potentials and residuals (n, c)."""
+        return np.asarray(np.einsum("nc,nc->c", a, b))
+
+    def law(self, field: Floats) -> tuple[Floats, Floats]:
+        """Return mu_r - 1 and 2 d mu_r / d(|g|^2), both (e, 15), for grad psi (e, 15, 3)."""
+        square = np.einsum("eqi,eqi->eq", field, field)
+        excess, slope = np.empty_like(square), np.zeros_like(square)
+        for number, body in enumerate(self.bodies):
+            mine = self.body == number
+            if isinstance(body.law, float | int):
+                excess[mine] = body.law - 1
+            else:
+                curve = body.law.permeability
+                excess[mine] = curve.coefficient(square[mine]) - 1
+                slope[mine] = 2 * curve.slope(square[mine])
+        return excess, slope
+
+    def residual(self, total: Floats, source: Floats) -> Floats:
+        """Return the residual (n, 1) of the total potential."""
+        field = self.field(total)
+        excess, _ = self.law(field[..., 0])
+        return self.stiffness(total - source) + self.integrate(excess[..., None, None] * field)
+
+    @cached_property
+    def _linear(self) -> Tangent:
+        return self._tangent(np.zeros((self.stiffness_of_vacuum.shape[0], 1)))
+
+    def tangent(self, total: Floats) -> Tangent:
+        """Return the derivative of the residual at a total potential (n, 1)."""
+        if all(isinstance(body.law, float | int) for body in self.bodies):
+            return self._linear
+        return self._tangent(total)
+
+    def _tangent(self, total: Floats) -> Tangent:
+        field = self.field(total)[..., 0]
+        excess, slope = self.law(field)
+        differential = (excess[..., None, None] * np.eye(3)
+                        + (slope[..., None] * field)[..., None] * field[..., None, :])
+        return Tangent.of(self, self.stiffness_of_vacuum + self.matrix(differential))
+
+    def matrix(self, differential: Floats) -> sparse.csr_array:
+        """Return the integrals (n, n) of (tensor (e, 15, 3, 3) grad u) . grad v."""
+        size = self.stiffness_of_vacuum.shape[0]
+        parts = np.empty((len(self.nodes), 10, 10))
+        step = 4096  # elements at a time, which limits the memory
+        for first in range(0, len(parts), step):
+            some = slice(first, first + step)
+            weighted = differential[some] * self.weights[some, :, None, None]
+            parts[some] = np.einsum("eqai,eqij,eqbj->eab", self.slopes[some], weighted,
+                                    self.slopes[some], optimize=True)
+        rows = np.broadcast_to(self.nodes[:, :, None], parts.shape)
+        columns = np.broadcast_to(self.nodes[:, None, :], parts.shape)
+        return sparse.csr_array(sparse.coo_array(
+            (parts.ravel(), (rows.ravel(), columns.ravel())), (size, size)))
+
+    def source_potential(self, values: Floats) -> Floats:
+        """Return the potential (n, c) in T m of sources (15 e, 3, c), 0 outside the iron.
+
+        It is free by a constant in every connected body, which the reaction does not depend on.
+        """
+        own = self.matrix(np.broadcast_to(np.eye(3), (*self.weights.shape, 3, 3)))
+        outside = np.ones(own.shape[0])
+        outside[self.nodes] = 0
+        label = connected_components(own, directed=False)[1]
+        fixed = np.unique(label, return_index=True)[1]
+        size = own.diagonal()
+        extra = np.where(outside == 1, 1.0, 0.0)
+        extra[fixed] += size[fixed]  # the solution is 0 there, as the rows add up to 0
+        tangent = Tangent.of(self, sparse.csr_array(own + sparse.diags_array(extra)))
+        right = -self.integrate(values.reshape(*self.weights.shape, 3, -1))
+        return tangent.solve(right, 1e-10)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """The derivative of the residual at a state, and its preconditioner."""
+
+    problem: Problem
+    matrix: sparse.csr_array
+    coarse: sparse_linalg.SuperLU
+
+    @classmethod
+    def of(cls, problem: Problem, matrix: sparse.csr_array) -> Tangent:
+        """Return the tangent of a matrix (n, n)."""
+        matrix = sparse.csr_array(matrix)
+        up = problem.coarse
+        return cls(problem, matrix, factorize(up.T @ (matrix @ up)))
+
+    def precondition(self, residual: Floats) -> Floats:
+        """Return approximate solutions (n, c) by a sweep, the coarse level and a sweep back."""
+        from halbach_fe.solver.tetrahedra import sweep  # imports numba
+
+        a, up = self.matrix, self.problem.coarse
+        found = np.zeros_like(residual)
+        sweep(a.indptr, a.indices, a.data, residual, found, False)
+        rest = np.ascontiguousarray(up.T @ (residual - a @ found))
+        for column in range(rest.shape[1]):
+            rest[:, column] = self.coarse.solve(rest[:, column].copy())
+        found += up @ rest
+        sweep(a.indptr, a.indices, a.data, residual, found, True)
+        return found
+
+    def solve(self, right: Floats, tolerance: float) -> Floats:
+        """Solve for steps (n, c), see `conjugate_gradients`."""
+        return conjugate_gradients(lambda step: self.matrix @ step, self.precondition,
+                                   self.problem.dot, right, tolerance)
+
+
+@dataclass(frozen=True)
+class BodiesReaction:
+    """The field that iron adds to that of its sources; `solve_bodies` returns it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the study.
+    problem : Problem
+    total : ndarray, shape (n, 1), in T m
+        The total potential in the iron.
+    residuals : tuple of float
+        Relative residual of Newton's method at the start and after every step.
+    coarse : BodiesReaction or None
+        The solution with larger elements, for the error bar.
+    """
+
+    name: str
+    problem: Problem
+    total: Floats
+    residuals: tuple[float, ...]
+    coarse: BodiesReaction | None
+
+    @cached_property
+    def polarization(self) -> Floats:
+        """J (e, 15, 3) in T at the Gauss points."""
+        field = self.problem.field(self.total)[..., 0]
+        return -self.problem.law(field)[0][..., None] * field
+
+    def field(self, points: Floats) -> Floats:
+        """Return the reaction B (n, 3) in T at points (n, 3) in m outside the iron."""
+        return _field_of(self.problem, self.polarization, points)
+
+    def error(self, points: Floats) -> Floats:
+        """Return the error bar (n, 3) in T of `field`: the change from the coarser solution."""
+        if self.coarse is None:
+            return np.full((len(points), 3), np.nan)
+        change = self.field(points) - self.coarse.field(points)
+        return np.repeat(np.linalg.norm(change, axis=1)[:, None], 3, axis=1)
+
+    def nodes(self, _angles: int = 0) -> Floats:
+        """Return the points (k, 3) in m in the iron for `tangent`."""
+        return self.problem.points
+
+    def tangent(self, sources: Sequence[Source] | Floats, points: Floats) -> Floats:
+        """Return the derivative (c, n, 3) in T of the reaction with respect to additional sources.
+
+        They are functions, or values (c, k, 3) in T of their mu_0 H at `nodes`.
+        """
+        problem = self.problem
+        values = np.stack([source(problem.points) if callable(source) else source
+                           for source in sources], axis=2)
+        tangent = problem.tangent(self.total)
+        own = problem.source_potential(values)
+        total = tangent.solve(problem.stiffness(own), 1e-7)
+        field = problem.field(self.total)[..., 0]
+        excess, slope = problem.law(field)
+        change = problem.field(total)
+        along = np.einsum("eqi,eqic->eqc", field, change)
+        polarization = -(excess[..., None, None] * change
+                         + (slope[..., None] * field)[..., None] * along[:, :, None])
+        return np.stack([_field_of(problem, part, points)
+                         for part in np.moveaxis(polarization, 3, 0)])
+
+
+def _reference() -> Floats:
+    """Return the reference coordinates (15, 3) of the Gauss points."""
+    from halbach_fe.solver.interpolation import _RULES
+
+    return _RULES["tetra10"][0]
+
+
+def _field_of(problem: Problem, polarization: Floats, points: Floats) -> Floats:
+    """Return B (n, 3) in T at points (n, 3) in m outside of a polarization (e, 15, 3) in T."""
+    from halbach_fe.solver.interpolation import _RULES
+    from halbach_fe.solver.tetrahedra import add_field
+
+    reference, weights = _RULES["tetra10"]
+    values, _ = shape_functions("tetra10", reference)
+    # the polarization in an element as a polynomial of second degree
+    by_node = np.einsum("aq,eqi->eai", np.linalg.pinv(values), polarization)
+    dipoles = polarization * problem.weights[..., None]
+    middle = problem.places[:, :4].mean(axis=1)
+    reach = np.linalg.norm(problem.places - middle[:, None], axis=2).max(axis=1)
+    found = np.zeros((len(points), 3))
+    points = np.ascontiguousarray(points)
+    gauss = problem.points.reshape(-1, POINTS, 3)
+
+    def work(first: int, last: int) -> None:
+        add_field(first, last, points, middle, reach, gauss, dipoles, problem.places, by_node,
+                  reference, weights, found)
+
+    in_threads(work, share_out(len(points)) if len(points) > 1 else [(0, len(points))])
+    return found
+
+
+COARSER = 2.0
+"""Ratio of the sizes of elements of two meshes, whose difference is the error bar."""
+
+
+def solve_bodies(
+    magnet: Magnet, source: Source, session: Session, estimate: bool = True,
+    start: BodiesReaction | None = None, coarseness: float = 1.0,
+) -> BodiesReaction:
+    """Solve for the reaction of a magnet's bodies of iron to a source.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    source : callable
+        mu_0 H of the sources in T at points (n, 3) in m in the iron.
+    session : Session
+    estimate : bool
+        Whether to solve once more with larger elements, for the error bar.
+    start : BodiesReaction, optional
+        Solution of the same iron on the same mesh with a similar source.
+    coarseness : float
+        Factor to the sizes of elements.
+    """
+    problem = start.problem if start else assemble_bodies(magnet, session, coarseness)
+    own = problem.source_potential(source(problem.points)[..., None])
+    total, residuals = newton(problem, own, start.total if start else None)
+    coarse = solve_bodies(magnet, source, session.within("coarse"), False,
+                          coarseness=COARSER * coarseness) if estimate else None
+    return BodiesReaction(magnet.name, problem, total, residuals, coarse)
+
+
+def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Problem:
+    """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
+    from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
+
+    _check_memory(magnet, size_of(magnet, coarseness).unknowns)
+    files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
+    make_folder(session.folder)
+    try:
+        regions, shell = mesh_iron(magnet.name, magnet.iron, Sizes.of(
+            magnet.study.mesh.block_size_m, coarseness), files.mesh)
+        regions.write(files.regions)
+    except OSError as error:
+        raise OutputError(
+            f"Cannot write the mesh into {session.folder}: {error.strerror}.") from None
+    mesh = verify_mesh(files)
+    count = mesh.inner.nodes
+    found = []
+
+    def stage(folder: Path) -> Job:
+        (folder / PROBLEM).write_bytes(resources.files(pro).joinpath(PROBLEM).read_bytes())
+        (folder / MESH).write_bytes(mesh.path.read_bytes())
+        x, y, z = shell.middle
+        return Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
+                   solutions=SOLUTIONS_FILE, unknowns=count, time_limit_s=session.time_limit_s,
+                   numbers={"R_INNER": shell.inner, "R_OUTER": shell.outer, "CX": x, "CY": y,
+                            "CZ": z, "BODIES": len(magnet.iron)},
+                   options=ROUGHLY, linear_residual=1e-3)
+
+    def read(folder: Path) -> Floats:
+        found.append((read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", mesh.cell_type),
+                      read_matrix(folder / MATRIX_FILE, count)))
+        return np.array(read_solutions(folder / SOLUTIONS_FILE, count, 1), float)
+
+    (solution,) = run_tasks([Task(
+        "getdp-iron", stage, read, (1, count), 1,
+        RunSize("scalar_potential", mesh.elements, count, 1), matrix=True)], session)
+    unknowns, matrix = found[0]
+    problem = _problem(magnet.iron, mesh, unknowns.functions[0], matrix)
+    along_z = np.zeros((*problem.weights.shape, 3, 1))
+    along_z[..., 2, 0] = 1.0
+    right = problem.integrate(along_z)
+    difference = np.abs(matrix @ solution.T - right).max() / np.abs(right).max()
+    # the solution is no more exact than that; another numbering makes a difference of order 1
+    if not difference <= 1e-3:
+        raise GetDPError(
+            f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
+            "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+    return problem
+
+
+def size_of(magnet: Magnet, coarseness: float) -> RunSize:
+    """Estimate the size of the run for a magnet's iron, without meshing it."""
+    from halbach_fe.geo.iron_bodies import Sizes
+
+    elements, unknowns = Sizes.of(magnet.study.mesh.block_size_m, coarseness).count(magnet.iron)
+    return RunSize("scalar_potential", elements, unknowns, 1)
+
+
+def _check_memory(magnet: Magnet, unknowns: int) -> None:
+    """Refuse iron whose mesh would not fit into memory.
+
+    Raises
+    ------
+    StudyError
+    """
+    bytes_each = 16_000  # memory in bytes per unknown
+    needed, available = bytes_each * unknowns / 2**30, available_memory()
+    if available is not None and needed > available:
+        raise StudyError(must_be(
+            "`mesh.block_size_m`", f"study {magnet.name}",
+            f"so large that the mesh of the iron fits into the {available:.2g} GiB of memory that "
+            "are left", f"{magnet.study.mesh.block_size_m:g}, for some {unknowns:.2g} unknowns "
+            f"and {needed:.2g} GiB", "Enlarge it, or leave out thin bodies of iron."))
+
+
+def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,
+             matrix: sparse.csr_array) -> Problem:
+    """Return the discrete problem; ``index`` has the unknown of a node, counted from 1."""
+    iron = np.flatnonzero(mesh.tags >= tags.FIRST_BLOCK_TAG)
+    located, weights = quadrature(mesh, iron)
+    _, slopes = shape_functions(mesh.cell_type, located.reference)
+    jacobian = np.einsum("nkd,nke->nde", mesh.points[mesh.cells[located.cells]], slopes)
+    slopes = np.einsum("nke,ned->nkd", slopes, np.linalg.inv(jacobian))
+    return Problem(
+        bodies, matrix, index[mesh.cells[iron] + 1], slopes.reshape(-1, POINTS, 10, 3),
+        weights.reshape(-1, POINTS), mesh.points[mesh.cells[iron]],
+        mesh.tags[iron] - tags.FIRST_BLOCK_TAG, _prolongation(mesh, index))
+
+
+def _prolongation(mesh: VerifiedMesh, index: Ints) -> sparse.csr_array:
+    """Return the operator (n, corners) from values at the corners to those at all unknowns."""
+    ends = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])  # as meshio orders edges
+    cells = index[mesh.cells + 1]
+    corners = np.unique(cells[:, :4])
+    corners = corners[corners >= 0]
+    number = np.full(int(index.max()) + 2, -1)
+    number[corners] = np.arange(len(corners))
+    middle = np.repeat(cells[:, 4:].reshape(-1), 2)
+    of_edge = cells[:, ends].reshape(-1)
+    used = (middle >= 0) & (of_edge >= 0)
+    pairs = np.unique(np.column_stack([middle[used], number[of_edge[used]]]), axis=0)
+    rows = np.concatenate([corners, pairs[:, 0]])
+    columns = np.concatenate([np.arange(len(corners)), pairs[:, 1]])
+    values = np.concatenate([np.ones(len(corners)), np.full(len(pairs), 0.5)])
+    return sparse.csr_array((values, (rows, columns)), shape=(int(index.max()) + 1, len(corners)))
