@@ -67,7 +67,8 @@ from halbach_fe.measurement.scan_lines import scan_lines
 from halbach_fe.study.types import COMPONENTS
 
 FEWEST_SHARED = 40
-"""Smallest number of points of a map that another one has around them."""
+"""Smallest number of points of a map that another one has around them. Half as many do where the
+axes are as stated, one of 96 ways to name them."""
 
 MARGIN = 0.25
 """Distance outside of the box about a map, in units of its spacing, up to which it knows the field
@@ -533,11 +534,17 @@ def _shifts(
     readings = count * len(other.points) / there.size
     odds = 1.5 * readings * np.log((np.maximum(size, 0) / 2 + noise) / (
         np.maximum(left, 0) + noise))
-    odds[readings < FEWEST_SHARED] = -np.inf
+    odds[readings < _fewest_shared(turn, sign)] = -np.inf
     peaks = np.argwhere((odds == maximum_filter(odds, 5)) & np.isfinite(odds))
     best = sorted(peaks.tolist(), key=lambda place: -odds[tuple(place)])[:PLACES]
     return [(float(odds[tuple(place)]), Pose(turn, low + step * (
         np.array(place) - np.array(there.shape) + 1) - start)) for place in best]
+
+
+def _fewest_shared(turn: Floats, sign: int) -> float:
+    """Return the least number of shared points for axes with a turn (3, 3)."""
+    as_stated = sign == 1 and np.linalg.norm(turn - np.eye(3)) < TURNED_RAD
+    return FEWEST_SHARED / 2 if as_stated else FEWEST_SHARED
 
 
 def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
@@ -549,7 +556,7 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
     noise = noise or 1e-6 * other.check.size_T
     for _ in range(2):  # with the readings of the overlap that the first pose has, then the second
         rows = np.flatnonzero(one.holds(pose.places(other.points)))
-        if len(rows) < FEWEST_SHARED:
+        if len(rows) < _fewest_shared(pose.turn, sign):
             return _Match(pose, sign, np.inf, np.nan, -np.inf)
         rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), COMPARED)).astype(int)]
         points, read = other.points[rows], sign * other.ideal_T[rows]
