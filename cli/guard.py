@@ -52,9 +52,6 @@ PATIENCE_S = 5.0
 """Time in s that a command has to end after a signal. GetDP and the processes of a pool take less
 than one."""
 
-STOP = 0
-"""No signal's number: it ends the thread that reads them."""
-
 OF_THE_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ESTALE,
                errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENAMETOOLONG}
 """Errors of the system for which halbach-fe is not to blame, wherever they come from."""
@@ -104,11 +101,12 @@ def _ended_in_time(numbers: Set[int]) -> Iterator[None]:
     number of a signal at once, and a thread reads it there. What is being written has a temporary
     name, and GetDP ends without its parent: the process may end as if it were killed.
     """
+    stop = 0  # no signal's number: it ends the thread that reads them
     ended, (reading, writing) = Event(), os.pipe()
     os.set_blocking(writing, False)
 
     def wait() -> None:
-        while (number := os.read(reading, 1)[0]) != STOP:
+        while (number := os.read(reading, 1)[0]) != stop:
             if number in numbers and not ended.wait(PATIENCE_S):
                 say("interrupted")
                 os._exit(130)
@@ -121,7 +119,7 @@ def _ended_in_time(numbers: Set[int]) -> Iterator[None]:
     finally:
         ended.set()
         signal.set_wakeup_fd(before)
-        os.write(writing, bytes([STOP]))
+        os.write(writing, bytes([stop]))
         thread.join()
         os.close(reading)
         os.close(writing)

@@ -29,21 +29,6 @@ from halbach_fe.diagnosis.model_selection import (
     with_candidates,
 )
 
-MOST_TERMS = 3
-"""Largest number of families in one explanation."""
-
-SEVERAL = 2
-"""Number of effects from which one unlisted cause is reported if it explains the readings as well:
-effects seldom come together."""
-
-FITS = 1.2
-"""Chi-squared per reading up to which terms alone are a full explanation, so that no other has to
-be looked for."""
-
-LARGE_SIZE = 30.0
-"""Rms size, in units of the noise, of causes of any shape that shall leave nothing to an effect but
-what is its own."""
-
 
 @dataclass(frozen=True)
 class Term:
@@ -282,9 +267,10 @@ class Competition:
         return self._extended[key]
 
     def _extend(self, effects: Sequence[int]) -> Explanation:
+        most_terms = 3  # largest number of families in one explanation
         kept = list(effects)
         terms: list[Term] = []
-        while len(terms) < MOST_TERMS:
+        while len(terms) < most_terms:
             term = self.likeliest_term(kept, terms)
             if term is None:
                 break
@@ -332,9 +318,12 @@ class Competition:
         """Return those effects that nothing of any shape could replace: all families together,
         each as large as may be.
         """
+        # Rms size, in units of the noise, of causes of any shape that shall leave nothing to an
+        # effect but what is its own.
+        large_size = 30.0
         terms = []
         for family, part in zip(self.families, self._parts, strict=True):
-            deviations = LARGE_SIZE * family.spectra[-2]
+            deviations = large_size * family.spectra[-2]
             terms.append(Term(family, Fitted(0.0, 0.0, (), False, deviations, deviations), part,
                               deviations))
         return self.needed(effects, terms)
@@ -353,10 +342,16 @@ class Competition:
             Those of them that are sources at so many places that they could make up any field, and
             so name nothing. They are left to terms; the other effects are judged beside these.
         """
+        # Chi-squared per reading up to which terms alone are a full explanation, so that no other
+        # has to be looked for.
+        fits = 1.2
+        # Number of effects from which one unlisted cause is reported if it explains the readings as
+        # well: effects seldom come together.
+        several = 2
         by_catalogue = self.explanation(catalogued, ())
         without = self.extended(())
         beside = self.with_more_effects(without)
-        if beside == without and without.chi2 < FITS and (
+        if beside == without and without.chi2 < fits and (
                 without.log_odds > by_catalogue.log_odds + DETECTION_LOG_ODDS):
             return without, without
         found = [without, beside]
@@ -370,7 +365,7 @@ class Competition:
             best = self.extended(others) if others else without
         if not best.terms:
             tie = without.log_odds > best.log_odds - INDISTINGUISHABLE_LOG_EVIDENCE
-            instead = tie and len(best.effects) >= SEVERAL
+            instead = tie and len(best.effects) >= several
             return without if instead and without.terms else by_catalogue, without
         if not best.effects:
             return best, without

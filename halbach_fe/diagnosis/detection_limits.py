@@ -23,9 +23,6 @@ from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import marginal_of
 from halbach_fe.inference.result import InferenceResult
 
-BLOCKS_AT_ONCE = 100
-"""Number of blocks whose signatures are kept at a time, to bound their memory."""
-
 
 def detection_limits(
     update: InferenceResult, campaign: Campaign, columns: Floats
@@ -46,6 +43,8 @@ def detection_limits(
     DetectionLimits or None
         None if no block is magnetized.
     """
+    # Number of blocks whose signatures are kept at a time, to bound their memory.
+    blocks_at_once = 100
     places = each_block(update.study)
     if not places:
         return None
@@ -56,10 +55,10 @@ def detection_limits(
     def limits(effect: Effect, count: int) -> Floats:
         """Return the limits (places,) of an effect by its first ``count`` parameters."""
         sd, found = effect.parameters[0].sd, []
-        for first in range(0, len(places), BLOCKS_AT_ONCE):
+        for first in range(0, len(places), blocks_at_once):
             signatures = [sd * whitened(update.observation.read(
                 scene.signature(Hypothesis(effect, place))[:count]))
-                for place in places[first:first + BLOCKS_AT_ONCE]]
+                for place in places[first:first + blocks_at_once]]
             evidence = marginal.evidence(np.hstack([columns, *signatures]),
                                          np.zeros(len(columns))).given(range(columns.shape[1]))
             for number in range(len(signatures)):

@@ -116,9 +116,6 @@ WORSE = 3.0
 """Standard deviations of the mean square of held-out residuals by which a round must predict worse
 than the best one if it is not to be the answer."""
 
-ON_AXIS_M = 1e-6
-"""Distance from the axis below which a point has no azimuth."""
-
 Rivals = dict[Hypothesis, tuple[tuple[Candidate, float], ...]]
 """Alternatives of effects, with their log Bayes factors less that of the effect."""
 
@@ -514,6 +511,7 @@ def _groups(update: InferenceResult, marginal: Marginal, residual: Floats) -> li
     Kinds of groups with one member only or with more than 40 are left out. Positions are those that
     the map states; of several maps, those in the magnet.
     """
+    on_axis_m = 1e-6  # distance from the axis below which a point has no azimuth
     chosen = ~update.held_out
     observation, several = update.observation, update.is_campaign
     x, y, z = (observation.places if several else observation.positions)[chosen].T
@@ -526,7 +524,7 @@ def _groups(update: InferenceResult, marginal: Marginal, residual: Floats) -> li
         "map": maps,
         "z": [f"{edges[k]:.3f} ... {edges[k + 1]:.3f} m" for k in window],
         "angle": [f"{30 * int(azimuth // 30)} ... {30 * int(azimuth // 30) + 30} deg"
-                  if distance > ON_AXIS_M else "on the axis"
+                  if distance > on_axis_m else "on the axis"
                   for azimuth, distance in zip(angle, radius, strict=True)],
         "radius": [f"{distance:.4f} m" for distance in radius],
         "label": [f"{label} of {name}" if several else label

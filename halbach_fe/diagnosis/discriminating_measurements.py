@@ -54,18 +54,9 @@ from halbach_fe.study.types import COMPONENTS
 SEPARATING_GAIN = 5.0
 """Expected gain in the log Bayes factor above which a measurement distinguishes two effects."""
 
-MAX_RIVALS = 3
-"""Largest number of rivals from which each identified effect is to be distinguished."""
-
 MAX_READINGS = 1500
 """Number of readings to which the present map is thinned for the comparison. The noise of the
 remaining readings is reduced, so that the thinned map holds the same information."""
-
-NMR_RELATIVE_SD = 2e-6
-"""Standard deviation of an NMR teslameter relative to the field."""
-
-NMR_MIN_FIELD_T = 0.04
-"""Lowest field that the usual NMR probes measure."""
 
 SENSOR_KEYS = {*PROBE_KEYS, "offset_T", "drift_T"}
 """Keys of the study's instrument that belong to the sensors and turn with the probe. All others
@@ -255,6 +246,8 @@ def candidate_measurements(
 
     They are made by the mapper and probe of map ``name``, or of the only one.
     """
+    nmr_min_field_t = 0.04  # lowest field that the usual NMR probes measure
+    nmr_relative_sd = 2e-6  # standard deviation of an NMR teslameter relative to the field
     study, observation = diagnosis.before.study, diagnosis.before.observation
     present = present_scan(diagnosis, data, name)
     same = "the same map" if name is None else f"map {name} again,"
@@ -271,11 +264,11 @@ def candidate_measurements(
         CandidateMeasurement(
             "probe_reversed", f"{same} with the probe turned by 180° about x",
             replace(present, probe_rotation=present.probe_rotation @ np.diag([1.0, -1.0, -1.0])))]
-    if size > NMR_MIN_FIELD_T:
+    if size > nmr_min_field_t:
         found.append(CandidateMeasurement(
             "nmr_point", "one NMR reading in the middle of the bore", ProposedScan(
                 np.zeros((1, 3)), np.zeros(1), sparse.csr_array(centre[None] / size),
-                independent_noise(np.array([NMR_RELATIVE_SD * size])), np.eye(3), np.eye(3),
+                independent_noise(np.array([nmr_relative_sd * size])), np.eye(3), np.eye(3),
                 mapped=False)))
     radii = np.unique(np.round(np.hypot(places[:, 0], places[:, 1]), 6))
     magnet = build_magnet(study)
@@ -513,6 +506,8 @@ def _rivals(
     campaign: Campaign,
 ) -> list[Hypothesis]:
     """Return the best effects that the readings cannot distinguish, each at its best place."""
+    # Largest number of rivals from which each identified effect is to be distinguished.
+    max_rivals = 3
     found: dict[str, Hypothesis] = {}
     for rival, _ in identified.selection.alternatives:
         if rival.effect not in (identified.selection.candidate.effect, *found):
@@ -521,7 +516,7 @@ def _rivals(
             for place in campaign.places(effect, study):
                 if place.name == rival.place:
                     found[rival.effect] = Hypothesis(effect, place)
-    return list(found.values())[:MAX_RIVALS]
+    return list(found.values())[:max_rivals]
 
 
 def _point_scan(points: Floats, sigma: float, name: str | None) -> ProposedScan:

@@ -41,9 +41,6 @@ NEGLIGIBLE = 1e-12
 at the largest size, for which it is left out: a residual of a thousand standard deviations along it
 would change the log evidence by less than 1e-6."""
 
-SLENDER = 1e-3
-"""Width of a line relative to its length, up to which it is one."""
-
 SMOOTH_WAVES = (2.0, 5.0)
 ROUGH_WAVES = (3.0, 15.0)
 """Numbers of half waves over the range of a coordinate at which the spectrum of a smooth function
@@ -261,9 +258,10 @@ def instrument_families(
 
 def _on_a_line_along_z(points: Floats) -> bool:
     """Tell whether points (n, 3) in m lie on one line, rather along the magnet than across."""
+    slender = 1e-3  # width of a line relative to its length, up to which it is one
     centred = points - points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
-    return len(points) > 2 and bool(sizes[1] < SLENDER * sizes[0]) and abs(axes[0, 2]) > 0.5**0.5
+    return len(points) > 2 and bool(sizes[1] < slender * sizes[0]) and abs(axes[0, 2]) > 0.5**0.5
 
 
 def _products(functions: Floats, shape: Floats) -> Floats:

@@ -63,36 +63,6 @@ MIN_USED = 0.9
 """Smallest share of the observed values that a convention must use. One that puts a component of a
 cross-section along z, which is not observed there, has less to explain than the others."""
 
-BLOCK_MAGNETIZATION_SD = 0.02
-"""Standard deviation of a block's magnetization along each axis, relative to its nominal
-magnitude."""
-
-EFFECT_FIELD_SD = 0.003
-"""Standard deviation that effects of usual size add to a reading, relative to the main field."""
-
-MAX_SCALE_CHANGE = 0.1
-"""Largest relative change of the whole field that iron, permeability and temperature may cause."""
-
-MIN_MISFIT = 2.0
-"""Misfit above which a gross error is searched, relative to that of blocks and usual effects.
-Blocks with errors of 1 % and 1 deg cause 0.5, with an effect of three standard deviations up to 1.
-One block upside down in an array of 64 causes 4 to 6, and no gross error explains it."""
-
-MIN_MISFIT_REDUCTION = 3.0
-"""Factor by which correcting an error must reduce the misfit. The best wrong error reduces the
-misfit of an upside-down or missing block, or of sensors displaced by 6 mm, by no more than a factor
-of 2."""
-
-MAX_REMAINING_MISFIT = 0.05
-"""Largest misfit that may remain after the correction, relative to the map's rms."""
-
-MAX_OF_A_BLOCK = 0.5
-"""Largest misfit relative to the map's rms at which a missing or upside-down block is tried beside
-an error: two of eight blocks of the only ring."""
-
-MAX_TRIED_WITH_A_BLOCK = 4
-"""Largest number of conventions that are tried with every block missing and upside down."""
-
 WRONG_BLOCK_FACTORS = (1.0, 2.0)
 """Multiple of a block's field that is lacking if it is missing, and if it is upside down."""
 
@@ -101,16 +71,6 @@ INDISTINGUISHABLE_MISFIT_RATIO = 1.2
 
 MAX_ERRORS = 3
 """Largest number of errors in a combination, and of successive corrections."""
-
-MIN_MISFIT_OF_SEVERAL_ERRORS = 0.15
-"""Smallest misfit, relative to the map's rms, at which combinations of errors are tried."""
-
-MIN_MISFIT_OF_WRONG_UNIT = 0.5
-"""Smallest misfit, relative to the map's rms, at which other units are tried."""
-
-MIN_RADIUS_CHANGE = 0.03
-"""Smallest relative change of the radius that is a gross error. Smaller changes are effects of the
-catalogue."""
 
 MIN_SHIFT_M = 0.006
 """Smallest displacement of the points that is a gross error: six standard deviations of the effects
@@ -270,14 +230,23 @@ class _Search:
 
         None if the map has no gross error, or no error explains the misfit.
         """
+        # Smallest misfit, relative to the map's rms, at which other units are tried.
+        min_misfit_of_wrong_unit = 0.5
+        # Smallest misfit, relative to the map's rms, at which combinations of errors are tried.
+        min_misfit_of_several_errors = 0.15
+        # Misfit above which a gross error is searched, relative to that of blocks and usual
+        # effects. Blocks with errors of 1 % and 1 deg cause 0.5, with an effect of three standard
+        # deviations up to 1. One block upside down in an array of 64 causes 4 to 6, and no gross
+        # error explains it.
+        min_misfit = 2.0
         before = self.misfit(MapConvention())
         if self.present < MIN_READINGS:
             return None
-        if before.standard <= MIN_MISFIT:
+        if before.standard <= min_misfit:
             return self.hidden_by_symmetry(before) if self.table else None
-        if before.relative < MIN_MISFIT_OF_WRONG_UNIT:
+        if before.relative < min_misfit_of_wrong_unit:
             self.lengths = self.flux_densities = (1.0,)
-        combined = before.relative > MIN_MISFIT_OF_SEVERAL_ERRORS
+        combined = before.relative > min_misfit_of_several_errors
         without_error = self.with_a_wrong_block(MapConvention())
         for level in range(1, MAX_ERRORS + 1 if combined else 2):
             for conventions in (self.conventions(level), self.elsewhere(level)):
@@ -331,8 +300,13 @@ class _Search:
         The block is then left to the catalogue of effects. Without this, the fewest further errors
         would be looked for that happen to imitate the block, such as another number of rings.
         """
-        near = sorted((trial for trial in tried if trial[0].relative <= MAX_OF_A_BLOCK),
-                      key=lambda trial: trial[0].standard)[:MAX_TRIED_WITH_A_BLOCK]
+        # Largest number of conventions that are tried with every block missing and upside down.
+        max_tried_with_a_block = 4
+        # Largest misfit relative to the map's rms at which a missing or upside-down block is tried
+        # beside an error: two of eight blocks of the only ring.
+        max_of_a_block = 0.5
+        near = sorted((trial for trial in tried if trial[0].relative <= max_of_a_block),
+                      key=lambda trial: trial[0].standard)[:max_tried_with_a_block]
         found = [(self.with_a_wrong_block(convention), convention) for _, convention in near]
         return [trial for trial in found if self.explains(before, *trial)]
 
@@ -362,8 +336,14 @@ class _Search:
 
     def explains(self, before: _Misfit, after: _Misfit, convention: MapConvention) -> bool:
         """Tell whether a convention removes nearly all of the misfit and fits a valid study."""
-        if not (after.standard <= before.standard / MIN_MISFIT_REDUCTION
-                and after.relative <= MAX_REMAINING_MISFIT):
+        # Largest misfit that may remain after the correction, relative to the map's rms.
+        max_remaining_misfit = 0.05
+        # Factor by which correcting an error must reduce the misfit. The best wrong error reduces
+        # the misfit of an upside-down or missing block, or of sensors displaced by 6 mm, by no more
+        # than a factor of 2.
+        min_misfit_reduction = 3.0
+        if not (after.standard <= before.standard / min_misfit_reduction
+                and after.relative <= max_remaining_misfit):
             return False
         try:
             convention.apply(self.study)
@@ -528,6 +508,12 @@ class _Search:
         self, convention: MapConvention, field: Floats, variance: Floats
     ) -> tuple[Floats, float] | None:
         """Compare the map with a field (n, 3) in T of given variance, see `residual`."""
+        # Largest relative change of the whole field that iron, permeability and temperature may
+        # cause.
+        max_scale_change = 0.1
+        # Standard deviation that effects of usual size add to a reading, relative to the main
+        # field.
+        effect_field_sd = 0.003
         old = self.study.instrument
         shown = to_magnet_axes(compose_axes(old.field_axes, convention.fields), self.values) * (
             old.flux_density_unit_T * convention.flux_density_unit)
@@ -535,11 +521,11 @@ class _Search:
         if not used.any() or used.sum() < MIN_USED * self.present:
             return None
         whole = max(_size(shown), 1e-300)
-        sd = np.sqrt(variance[used] + (EFFECT_FIELD_SD * max(whole, _size(field))) ** 2)
+        sd = np.sqrt(variance[used] + (effect_field_sd * max(whole, _size(field))) ** 2)
         shown, field = shown[used], field[used]
         weighted = field / sd
         scale = np.clip(weighted @ (shown / sd) / max(float(weighted @ weighted), 1e-300),
-                        1 - MAX_SCALE_CHANGE, 1 + MAX_SCALE_CHANGE)
+                        1 - max_scale_change, 1 + max_scale_change)
         difference = shown - scale * field
         return difference / sd, float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole)
 
@@ -619,6 +605,9 @@ class _Nominal:
         cls, study: Study, blocks: Sequence[MagnetBlock], shown: Floats
     ) -> _Nominal | None:
         """Compute it at the points (n, 3) of a map's file; None if a point is inside material."""
+        # Standard deviation of a block's magnetization along each axis, relative to its nominal
+        # magnitude.
+        block_magnetization_sd = 0.02
         points = _probe_points(study.instrument, shown)
         if any(block.contains(points).any() for block in blocks):
             return None
@@ -627,7 +616,7 @@ class _Nominal:
             x, y, _ = block.easy_axis
             field += unit @ (np.array(block.easy_axis) * block.remanence)
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)
-            variance += np.sum((BLOCK_MAGNETIZATION_SD * block.remanence * unit) ** 2, axis=2)
+            variance += np.sum((block_magnetization_sd * block.remanence * unit) ** 2, axis=2)
         sensors = sensor_matrix(study.instrument).T
         return cls(field @ sensors, across @ sensors,
                    external_field(build_magnet(study), points) @ sensors, variance)
@@ -650,8 +639,11 @@ def _small(convention: MapConvention) -> bool:
     """Tell whether an error is small enough for the catalogue's effects, which are found by
     linearization.
     """
+    # Smallest relative change of the radius that is a gross error. Smaller changes are effects of
+    # the catalogue.
+    min_radius_change = 0.03
     moved = np.linalg.norm([convention.offset_m, *convention.shift_m])
-    return bool(0 < abs(convention.radius - 1) < MIN_RADIUS_CHANGE or 0 < moved < MIN_SHIFT_M)
+    return bool(0 < abs(convention.radius - 1) < min_radius_change or 0 < moved < MIN_SHIFT_M)
 
 
 def _best(found: Sequence[tuple[_Misfit, MapConvention]]) -> list[tuple[_Misfit, MapConvention]]:

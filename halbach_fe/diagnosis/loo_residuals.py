@@ -15,9 +15,6 @@ from halbach_fe.stats.small_samples import false_discovery_rates
 DISCOVERIES = 0.01
 """False discovery rate among the groups that are reported to disagree with the model."""
 
-SINGULAR = 1e-10
-"""Smallest eigenvalue of a matrix, relative to its largest one, that is more than rounding."""
-
 
 @dataclass(frozen=True)
 class ResidualGroup:
@@ -72,15 +69,17 @@ def _solve_less_product(half: Floats, right: Floats) -> Floats:
 
 def _solve_semidefinite(matrix: Floats, right: Floats) -> Floats:
     """Return the solution x (n,) of a positive semidefinite system, the smallest of several."""
+    # Smallest eigenvalue of a matrix, relative to its largest one, that is more than rounding.
+    singular = 1e-10
     try:
         factor = linalg.cho_factor(matrix, lower=True)
     except linalg.LinAlgError:
         pass
     else:
         size = np.diag(factor[0])
-        if size.min()**2 > SINGULAR * size.max()**2:
+        if size.min()**2 > singular * size.max()**2:
             return np.asarray(linalg.cho_solve(factor, right))
-    return np.asarray(np.linalg.lstsq(matrix, right, rcond=SINGULAR)[0])
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=singular)[0])
 
 
 def residual_groups(

@@ -22,9 +22,6 @@ LENGTH_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
 FLUX_DENSITY_UNITS = {1e-3: "millitesla", 1e-4: "gauss", 0.1: "kilogauss"}
 """Flux density units by their size in T."""
 
-MAX_RING_DIFFERENCE = 4
-"""Largest difference between the numbers of rings of the true magnet and of the study's."""
-
 ALL_AXES: tuple[Axes, ...] = tuple(
     tuple(sign + name for sign, name in zip(signs, names, strict=True))  # type: ignore[misc]
     for names in permutations(COMPONENTS) for signs in product(("", "-"), repeat=3))
@@ -143,6 +140,8 @@ class MapConvention:
 
 def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
     """Return magnets that may have been measured by mistake in place of the study's."""
+    # Largest difference between the numbers of rings of the true magnet and of the study's.
+    max_ring_difference = 4
     array = study.array
     if not array.is_uniform:
         return ()
@@ -165,8 +164,8 @@ def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
                 array.first_magnetization_angle_deg + angle)),
             turn_rad=float(np.radians(angle))))
     if study.dimension == 3:
-        fewest = max(1, array.rings - MAX_RING_DIFFERENCE)
-        for rings in range(fewest, array.rings + MAX_RING_DIFFERENCE + 1):
+        fewest = max(1, array.rings - max_ring_difference)
+        for rings in range(fewest, array.rings + max_ring_difference + 1):
             if rings != array.rings:
                 found.append(ArrayVariant(
                     "wrong_ring_count", f"a magnet of {_count(rings, 'ring')}",

@@ -27,15 +27,9 @@ MIN_MISFIT_OF_A_POSE = 0.3
 searched. In a bore of radius 20 mm a displacement by 4 mm leaves up to 0.13 and one by 6 mm, which
 is found as a gross error, up to 0.2."""
 
-MIN_REDUCTION = 3.0
-"""Factor by which the registered pose must reduce the misfit to be believed."""
-
 GOOD = 0.05
 """Misfit that is good enough even if it was not larger in the stated place: of a map that lies
 right beside another one that does not."""
-
-POSSIBLE = 0.05
-"""Odds from which another pose is named beside the best one."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +116,8 @@ def find_poses(
     study : Study
         The study with the instruments of these poses.
     """
+    possible = 0.05  # odds from which another pose is named beside the best one
+    min_reduction = 3.0  # factor by which the registered pose must reduce the misfit to be believed
     before = misfits_of(study, data)
     if study.dimension == 2 or max(before.values()) < MIN_MISFIT_OF_A_POSE:
         return (), study
@@ -139,13 +135,13 @@ def find_poses(
         say(f"no pose explains the map: {error}")
         return (), study
     after = misfits_of(registered, data)
-    if any(after[name] > min(MIN_MISFIT_OF_A_POSE, max(misfit / MIN_REDUCTION, GOOD))
+    if any(after[name] > min(MIN_MISFIT_OF_A_POSE, max(misfit / min_reduction, GOOD))
            for name, misfit in before.items()):
         say("no pose explains the map")
         return (), study
     poses = [FoundPose(
         found[one.name][0], one.study.instrument, one.study.instrument_sd,
-        tuple(float(each) for each in odds(found[one.name])[1:] if each > POSSIBLE),
+        tuple(float(each) for each in odds(found[one.name])[1:] if each > possible),
         before[one.name], after[one.name], one.name if several else None)
         for one in maps_of(registered, data)]
     return tuple(poses), with_poses(study, poses)

@@ -32,44 +32,11 @@ from halbach_fe.study.types import COMPONENTS
 NEIGHBOURS = 24
 """Number of neighbours of the same component. A second-order polynomial has ten coefficients."""
 
-LOCAL_SCALE_FACTOR = 9.0
-"""Smallest deviation of an outlier, in units of the local scale. The scale is the median of about
-24 numbers: of noise of unknown level, one reading in 10^5 deviates further."""
-
-OUTLIER_PRIOR_ODDS = 1e-3
-"""Prior odds that a reading is an outlier."""
-
-OUTLIER_RANGE = 0.1
-"""Largest error of an outlier relative to the map's largest reading. All errors up to it, of either
-sign, are equally likely."""
-
-OUTLIER_LOG_ODDS = 5.0
-"""Log posterior odds above which a reading is an outlier: deviations of about six standard
-deviations."""
-
-ROBUST_FITS = 6
-"""Number of reweighted fits of a polynomial. Neighbours far from the previous fit have less weight,
-because several of them may be outliers."""
-
-CAUCHY_SCALE = 2.385
-"""Distance in units of the local scale at which a neighbour has half its weight (P. W. Holland and
-R. E. Welsch, Communications in Statistics A6 (1977) 813)."""
-
-CROWD_NEIGHBOURS = 4
-"""Number of nearest neighbours that are examined for further outliers, see `_crowded`."""
-
 CROWD_PROBABILITY = 1e-4
 """Probability of as many neighbouring outliers by chance, below which they are not outliers."""
 
 MAD_TO_SD = 1.4826
 """Ratio of the standard deviation to the median magnitude of normal numbers."""
-
-MAX_PASSES = 6
-"""Largest number of passes. Several passes are needed because large outliers distort the prediction
-of other readings, and so hide small outliers."""
-
-MAX_OUTLIER_FRACTION = 0.1
-"""Largest fraction of the readings that may be outliers. If more are found, none is reported."""
 
 
 @dataclass(frozen=True)
@@ -219,19 +186,24 @@ def find_outliers(
     largest : float
         Magnitude of the largest reading in T.
     """
+    # Largest fraction of the readings that may be outliers. If more are found, none is reported.
+    max_outlier_fraction = 0.1
+    # Largest number of passes. Several passes are needed because large outliers distort the
+    # prediction of other readings, and so hide small outliers.
+    max_passes = 6
     groups = [_Neighbourhood.of(rows, positions[rows]) for label in dict.fromkeys(labels)
                       if len(rows := np.flatnonzero(np.array(labels) == label)) > NEIGHBOURS / 2]
     flagged = np.zeros(len(residual), bool)
-    for _ in range(MAX_PASSES):
+    for _ in range(max_passes):
         predicted = leave_one_out(root, residual, noise, training & ~flagged)
         before = flagged
         flagged = np.zeros(len(residual), bool)
         for group in groups:
             flagged[group.rows] = group.outlying(predicted, before[group.rows], largest)
-        if (flagged == before).all() or flagged.mean() > MAX_OUTLIER_FRACTION:
+        if (flagged == before).all() or flagged.mean() > max_outlier_fraction:
             break
     flagged &= ~_crowded(flagged, groups)
-    return flagged if flagged.mean() <= MAX_OUTLIER_FRACTION else np.zeros(len(residual), bool)
+    return flagged if flagged.mean() <= max_outlier_fraction else np.zeros(len(residual), bool)
 
 
 def _crowded(
@@ -241,12 +213,14 @@ def _crowded(
 
     Such readings are no outliers: a local source, for example, affects neighbours alike.
     """
+    # Number of nearest neighbours that are examined for further outliers, see `_crowded`.
+    crowd_neighbours = 4
     flagged_neighbours = np.zeros(len(flagged), int)
     for group in neighbourhoods:
-        nearest = group.rows[group.nearest[:, :CROWD_NEIGHBOURS]]
+        nearest = group.rows[group.nearest[:, :crowd_neighbours]]
         flagged_neighbours[group.rows] = flagged[nearest].sum(axis=1)
     pairs = flagged_neighbours[flagged].sum()
-    expected = CROWD_NEIGHBOURS * flagged.sum() * flagged.mean()
+    expected = crowd_neighbours * flagged.sum() * flagged.mean()
     crowded = flagged & (flagged_neighbours > 0)
     probability = special.pdtrc(pairs - 1, expected)
     return crowded if probability < CROWD_PROBABILITY else np.zeros_like(flagged)
@@ -293,16 +267,29 @@ class _Neighbourhood:
         Suspects deviate from a robust fit to their neighbours. Outliers are those suspects that
         deviate also from an ordinary fit to the neighbours that are no suspects.
         """
+        # Number of reweighted fits of a polynomial. Neighbours far from the previous fit have less
+        # weight, because several of them may be outliers.
+        robust_fits = 6
+        # Log posterior odds above which a reading is an outlier: deviations of about six standard
+        # deviations.
+        outlier_log_odds = 5.0
+        # Largest error of an outlier relative to the map's largest reading. All errors up to it, of
+        # either sign, are equally likely.
+        outlier_range = 0.1
+        outlier_prior_odds = 1e-3  # prior odds that a reading is an outlier
+        # Smallest deviation of an outlier, in units of the local scale. The scale is the median of
+        # about 24 numbers: of noise of unknown level, one reading in 10^5 deviates further.
+        local_scale_factor = 9.0
         difference, sd = predicted.difference[self.rows], predicted.sd[self.rows]
 
         def is_outlying(flagged: NDArray[np.bool_], fits: int) -> NDArray[np.bool_]:
             deviation, own, local = self._deviations(difference, flagged, fits)
             standard = deviation / (own * sd)
-            volume = 2 * OUTLIER_RANGE * largest / (np.sqrt(2 * np.pi) * sd)
-            odds = standard**2 / 2 - np.log(volume) + np.log(OUTLIER_PRIOR_ODDS)
-            return (odds > OUTLIER_LOG_ODDS) & (deviation > LOCAL_SCALE_FACTOR * local)
+            volume = 2 * outlier_range * largest / (np.sqrt(2 * np.pi) * sd)
+            odds = standard**2 / 2 - np.log(volume) + np.log(outlier_prior_odds)
+            return (odds > outlier_log_odds) & (deviation > local_scale_factor * local)
 
-        suspects = flagged | is_outlying(flagged, ROBUST_FITS)
+        suspects = flagged | is_outlying(flagged, robust_fits)
         while True:
             left = suspects & is_outlying(suspects, 1)
             if (left == suspects).all():
@@ -322,6 +309,9 @@ class _Neighbourhood:
         local : ndarray, shape (k,)
             Standard deviation of the deviation according to the scatter of the neighbours.
         """
+        # Distance in units of the local scale at which a neighbour has half its weight (P. W.
+        # Holland and R. E. Welsch, Communications in Statistics A6 (1977) 813).
+        cauchy_scale = 2.385
         good = ~flagged[self.nearest]
         terms, values = self.terms * good[:, :, None], difference[self.nearest] * good
         root = good.astype(float)
@@ -329,7 +319,7 @@ class _Neighbourhood:
             inverse = np.linalg.pinv(terms * root[:, :, None], rcond=1e-6) * root[:, None]
             rest = values - np.einsum("kij,kjl,kl->ki", terms, inverse, values, optimize=True)
             typical = np.nanmedian(np.where(good, np.abs(rest), np.nan), axis=1)[:, None]
-            root = good / np.hypot(1, rest / np.maximum(CAUCHY_SCALE * MAD_TO_SD * typical, 1e-300))
+            root = good / np.hypot(1, rest / np.maximum(cauchy_scale * MAD_TO_SD * typical, 1e-300))
         weights = inverse[:, 0]
         rank = np.einsum("kij,kji->k", terms, inverse)
         free = np.maximum(good.sum(axis=1) - rank, 1)

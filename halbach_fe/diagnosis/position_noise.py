@@ -32,27 +32,8 @@ from halbach_fe.study.model import Study
 CANDIDATE_SDS_M = np.geomspace(2e-5, 5e-4, 8)
 """Standard deviations of a position whose evidence is averaged, with equal prior probability."""
 
-MAX_NOISE_FACTOR = 30.0
-"""Largest factor of the noise in the alternative of noise that is larger everywhere."""
-
-SMOOTH_SCALE = 30.0
-"""Prior standard deviation of the smooth terms in units of the noise of a reading. It is large, so
-that the smooth terms can explain any smooth discrepancy."""
-
-EFFECT_SCALE = 3.0
-"""Factor by which the prior standard deviations of effects are widened, so that effects can explain
-as much as they are able to."""
-
 MAX_READINGS = 3000
 """Largest number of readings that are compared. Of more readings, a random subset is taken."""
-
-NEGLIGIBLE_VARIANCE = 1e-2
-"""Variance below which a principal component of the nuisance terms is dropped: its sum over all
-readings, in units of the noise variance of one reading."""
-
-MIN_CHI2_EXCESS = 2.0
-"""Excess of chi-squared, in its standard deviations, below which no noise is missing and nothing is
-computed."""
 
 CONVERGENCE_TOLERANCE = 0.1
 """Largest relative change between rounds that counts as converged."""
@@ -140,9 +121,18 @@ def _of_map(
     marginal, columns, residual, current, with_smooth
         See `estimate_position_noise`, for these readings only.
     """
+    # Excess of chi-squared, in its standard deviations, below which no noise is missing and nothing
+    # is computed.
+    min_chi2_excess = 2.0
+    # Factor by which the prior standard deviations of effects are widened, so that effects can
+    # explain as much as they are able to.
+    effect_scale = 3.0
+    # Prior standard deviation of the smooth terms in units of the noise of a reading. It is large,
+    # so that the smooth terms can explain any smooth discrepancy.
+    smooth_scale = 30.0
     count = len(residual)
     chi2 = float(residual @ marginal.remove(residual[:, None])[:, 0]) / count
-    if current is None and chi2 < 1 + MIN_CHI2_EXCESS * np.sqrt(2 / count):
+    if current is None and chi2 < 1 + min_chi2_excess * np.sqrt(2 / count):
         return None
     training = np.flatnonzero(~update.held_out)[own]
     noise = update.errors.subset(training)
@@ -154,12 +144,12 @@ def _of_map(
     # the whitening contains the present noise of positions in the gradient of this magnet
     magnet = update.noise_magnet.with_study(scanned.study_of(update.study))
     moved = noise.whitening @ readings_per_displacement(magnet, analysis, points, np.ones(3))
-    scale, smooth = SMOOTH_SCALE * float(np.median(noise.sd)), []
+    scale, smooth = smooth_scale * float(np.median(noise.sd)), []
     for terms in (harmonic_fields(points, 5, 8), sensor_errors(points, 2, 6)) if (
             with_smooth) else ():
         readings = scale * (analysis @ terms.fields.reshape(len(terms.fields), -1).T)
         smooth.append(noise.whiten(readings * np.exp(-terms.fineness @ DECAY_RATES[0])))
-    nuisance = np.hstack([marginal.whitened, EFFECT_SCALE * columns, *smooth])
+    nuisance = np.hstack([marginal.whitened, effect_scale * columns, *smooth])
     found = compare_noise_models(nuisance[rows], residual[rows], sparse.csr_array(moved[rows]),
                                  current.sd_m if current else 0.0)
     log_odds = found.log_bayes_factor + np.log(EFFECT_PRIOR_ODDS)
@@ -208,6 +198,8 @@ def compare_noise_models(
     current_sd_m : float
         Standard deviation of the position noise that the whitening already includes.
     """
+    # Largest factor of the noise in the alternative of noise that is larger everywhere.
+    max_noise_factor = 30.0
     moved = sparse.csr_array(per_displacement @ per_displacement.T)
     root = _compressed(root)
 
@@ -231,7 +223,7 @@ def compare_noise_models(
     mean = float(special.logsumexp(log_evidences) - np.log(len(log_evidences)))
     over_none = factor = mean - log_evidence(0.0)
     if factor > DETECTION_LOG_ODDS:
-        larger = best(partial(log_evidence, 0.0), 1.0, MAX_NOISE_FACTOR)
+        larger = best(partial(log_evidence, 0.0), 1.0, max_noise_factor)
         factor = min(factor, mean - log_evidence(0.0, larger))
     if factor < DETECTION_LOG_ODDS:
         return PositionNoise(factor, 0.0)
@@ -247,10 +239,13 @@ def _compressed(root: Floats) -> Floats:
     linearly dependent: a Cholesky factorization with pivots ends where no reading has more of the
     covariance left than is negligible. Eigenvectors of what it keeps are the fewest columns.
     """
+    # Variance below which a principal component of the nuisance terms is dropped: its sum over all
+    # readings, in units of the noise variance of one reading.
+    negligible_variance = 1e-2
     covariance = root @ root.T
-    factor, order, rank, _ = linalg.lapack.dpstrf(covariance, tol=NEGLIGIBLE_VARIANCE / len(root),
+    factor, order, rank, _ = linalg.lapack.dpstrf(covariance, tol=negligible_variance / len(root),
                                                   lower=True, overwrite_a=True)
     kept = np.empty((len(root), rank))
     kept[order - 1] = np.tril(factor)[:, :rank]
     values, vectors = np.linalg.eigh(kept.T @ kept)
-    return np.asarray(kept @ vectors[:, values > NEGLIGIBLE_VARIANCE])
+    return np.asarray(kept @ vectors[:, values > negligible_variance])

@@ -52,18 +52,8 @@ DISPLAY_UNITS = {
 PRESENT = "present"
 """Amount of an effect that is all or nothing."""
 
-MOST_DISPLACED_MM = 10.0
-"""Largest displacement of a block that reports state; signatures are linear up to a few mm."""
-
 OUTWARDS = {"wrong_radius": "farther out"}
 """Direction of displacements with one amplitude."""
-
-MAX_LISTED_ROWS = 10
-"""Largest number of outliers that a report lists. The summary has all of them."""
-
-UNTOLD = 1e-9
-"""Amplitude in standard deviations below which the readings say nothing of a parameter, such as the
-z of a map in a cross-section: its value is that of the prior, 0 but for rounding."""
 
 LOSS = "loss"
 """Parameter of effects that weaken blocks; a block that loses more than it had is reversed."""
@@ -200,10 +190,13 @@ def amounts(identified: IdentifiedEffect) -> list[str]:
 
 def _uncertain(identified: IdentifiedEffect) -> list[tuple[Parameter, float, float]]:
     """Return the parameters, values and standard deviations of amplitudes that were fitted."""
+    # Amplitude in standard deviations below which the readings say nothing of a parameter, such as
+    # the z of a map in a cross-section: its value is that of the prior, 0 but for rounding.
+    untold = 1e-9
     values, deviations = identified.reported
     return [(parameter, value, sd) for parameter, value, sd in zip(
         identified.parameters, values.tolist(), deviations.tolist(), strict=True)
-        if sd > 0 and (abs(value) > UNTOLD * sd or np.abs(values).max() == 0)]
+        if sd > 0 and (abs(value) > untold * sd or np.abs(values).max() == 0)]
 
 
 def human_unit(parameter: Parameter) -> tuple[str, float]:
@@ -336,9 +329,11 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
 
 def _rows_in_words(rows: Sequence[int]) -> str:
     """Name rows of a map."""
+    # Largest number of outliers that a report lists. The summary has all of them.
+    max_listed_rows = 10
     different = sorted(set(rows))
     return f"row{'s' if len(different) > 1 else ''} " + ", ".join(
-        map(str, different[:MAX_LISTED_ROWS])) + ", ..." * (len(different) > MAX_LISTED_ROWS)
+        map(str, different[:max_listed_rows])) + ", ..." * (len(different) > max_listed_rows)
 
 
 def position_in_words(position: PossiblePosition) -> str:
@@ -480,12 +475,14 @@ def _limits_entry(limits: DetectionLimits) -> dict[str, object]:
 
 def limits_in_words(limits: DetectionLimits) -> str:
     """Say in a sentence which changes of a block the map would have shown."""
+    # Largest displacement of a block that reports state; signatures are linear up to a few mm.
+    most_displaced_mm = 10.0
     def amount(value: float, unit: str, most: float) -> str:
         return f"{value:.2g} {unit}" if value < most else f"more than {most:g} {unit}"
 
     parts = []
     for values, unit, most in ((100 * limits.loss, "%", 100.0),
-                               (1e3 * limits.displacement_m, "mm", MOST_DISPLACED_MM)):
+                               (1e3 * limits.displacement_m, "mm", most_displaced_mm)):
         parts.append((amount(float(np.median(values)), unit, most),
                       amount(float(values.max()), unit, most),
                       _name_in_words(limits.worst(values))))

@@ -58,15 +58,8 @@ functions for each component."""
 MANY = 3
 """Number of sources from which they may stand for a field of any shape."""
 
-NEAR_SOURCES = 0.6
-"""Distance, relative to that from the axis, within which two magnetized objects may stand for one
-between them: the places that are compared are 30 degrees apart, which is 0.52."""
-
 SUSPECTED = 0.5
 """Probability from which an effect that is not certain enough to be named is suspected."""
-
-SHARE_OF_SUSPECTS = 0.9
-"""Share of the suspects' probability that those that are listed have together."""
 
 IMITATED = 0.1
 """Probability of something that blocks imitate from which an update is called uncertain."""
@@ -163,12 +156,15 @@ def judge(
 
 def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
     """Tell whether many sources are in several places, rather than beside one between them."""
+    # Distance, relative to that from the axis, within which two magnetized objects may stand for
+    # one between them: the places that are compared are 30 degrees apart, which is 0.52.
+    near_sources = 0.6
     if len(places) < MANY:
         return False
     points = np.array(places)
     radius = np.hypot(points[:, 0], points[:, 1])
     apart = np.linalg.norm(points[:, None] - points, axis=2)
-    near = apart < NEAR_SOURCES * np.maximum(radius[:, None], radius)
+    near = apart < near_sources * np.maximum(radius[:, None], radius)
     return bool(connected_components(near)[0] > 1)
 
 
@@ -318,7 +314,9 @@ class Further:
 
 def _together(by_name: dict[str, float]) -> dict[str, float]:
     """Return the likeliest effects that have most of the probability together."""
-    most = SHARE_OF_SUSPECTS * sum(by_name.values())
+    # Share of the suspects' probability that those that are listed have together.
+    share_of_suspects = 0.9
+    most = share_of_suspects * sum(by_name.values())
     found: dict[str, float] = {}
     for name, probability in by_name.items():
         if sum(found.values()) >= most:

@@ -52,18 +52,6 @@ FAR = 0.5
 """Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
 block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
 
-ALONG_DEG = 5.0
-"""Angle in degrees within which a moment lies along the nominal one: easy axes of blocks are a few
-degrees off, other axes of a block 90."""
-
-VOLUME_TOLERANCE = 0.1
-"""Largest deviation of a measured volume from that of the study's block, relative to the latter.
-The chamfers and tolerances of blocks change it by less."""
-
-SAME_TEMPERATURE_K = 2.0
-"""Largest difference of temperatures at which moments count as measured at the same one. It changes
-the moment of NdFeB, of -0.0012/K, by 0.24 %, no more than usual coils determine it."""
-
 ROOM_C, OTHER_TEMPERATURE_K = 20.0, 10.0
 """Temperature in degrees Celsius at which data sheets state remanences, and the distance in K from
 it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
@@ -485,6 +473,9 @@ def _conversions(
     real volume differs a little. In 2D blocks get the length of the rings, or else the median of
     those that follow from their volumes.
     """
+    # Largest deviation of a measured volume from that of the study's block, relative to the latter.
+    # The chamfers and tolerances of blocks change it by less.
+    volume_tolerance = 0.1
     flat = magnet.dimension == 2
     length = magnet.array.ring_length_m
     if flat and not length:
@@ -499,10 +490,10 @@ def _conversions(
         block, volume = blocks[number], table.volume[row]
         if flat and length:
             block = replace(block, z_min=-length / 2, z_max=length / 2)
-        if abs(volume / block.volume - 1) > VOLUME_TOLERANCE:  # False for NaN, an unknown volume
+        if abs(volume / block.volume - 1) > volume_tolerance:  # False for NaN, an unknown volume
             raise MeasurementError(must_be(
                 f"volume_m3 of block {table.serial[row]}", table.source,
-                f"near the study's, within {100 * VOLUME_TOLERANCE:g} % of the "
+                f"near the study's, within {100 * volume_tolerance:g} % of the "
                 f"{block.volume:.4g} m^3 of its block {block.name}", f"{volume:.4g} m^3",
                 "Check its unit, and the sizes of the study's blocks."))
         real.append(block)
@@ -522,13 +513,16 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
     MeasurementError
         If a temperature is missing, or if temperatures differ and the study has no coefficient.
     """
+    # Largest difference of temperatures at which moments count as measured at the same one. It
+    # changes the moment of NdFeB, of -0.0012/K, by 0.24 %, no more than usual coils determine it.
+    same_temperature_k = 2.0
     coefficient = magnet.study.prior.temperature_coefficient_per_K
     reference = magnet.study.prior.reference_temperature_C
     if coefficient is None or reference is None:  # the study has both or neither
         known = table.temperature[~np.isnan(table.temperature)]
-        if len(known) and np.ptp(known) > SAME_TEMPERATURE_K:
+        if len(known) and np.ptp(known) > same_temperature_k:
             raise MeasurementError(must_be(
-                "temperature_C", table.source, f"the same for all blocks, to {SAME_TEMPERATURE_K:g}"
+                "temperature_C", table.source, f"the same for all blocks, to {same_temperature_k:g}"
                 " K, since the study has no temperature coefficient",
                 f"{known.min():g} to {known.max():g} °C", "Add temperature_coefficient_per_K and "
                 "reference_temperature_C to [prior] of the study, or convert the moments."))
@@ -590,6 +584,9 @@ def _block_of_rows(magnet: Magnet, table: BlockTable) -> Ints:
 
 def _check_near(table: BlockTable, deviations: Floats) -> None:
     """Raise a MeasurementError if a block deviates from its nominal magnetization by over `FAR`."""
+    # Angle in degrees within which a moment lies along the nominal one: easy axes of blocks are a
+    # few degrees off, other axes of a block 90.
+    along_deg = 5.0
     ratios = np.linalg.norm(deviations + np.eye(3)[0], axis=1)
     far = np.flatnonzero(np.linalg.norm(deviations, axis=1) > FAR)
     if not len(far):
@@ -600,7 +597,7 @@ def _check_near(table: BlockTable, deviations: Floats) -> None:
     hint = ("Are the moments in the block's own axes as mounted (x radially outward), and is that "
             "its type?")
     if not 0.03 < np.median(ratios) < 30 or (
-            angle < ALONG_DEG and np.ptp(ratios) < FAR * np.median(ratios)):
+            angle < along_deg and np.ptp(ratios) < FAR * np.median(ratios)):
         hint = "Are moments and volumes in A m^2 and m^3?"
     raise MeasurementError(must_be(
         f"moment of block {table.serial[row]}", table.source,

@@ -59,10 +59,6 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import Rows, predict
 from halbach_fe.study.model import Study
 
-LINEAR_ENOUGH = 0.3
-"""Error that the linearization of the iron may cause in a reading, relative to its error bar; a
-larger error causes a warning."""
-
 ROUNDS, AT_REST = 16, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its
 standard deviations up to which they are at rest."""
@@ -512,6 +508,9 @@ def _check_linearization(
     sigma: Floats,
 ) -> None:
     """Warn if the linearization of the iron changes readings of the posterior mean noticeably."""
+    # Error that the linearization of the iron may cause in a reading, relative to its error bar; a
+    # larger error causes a warning.
+    linear_enough = 0.3
     own = replace(session, folder=session.folder / "posterior")
     mean = mean[:len(magnet.parameter_names)]
     if choose_route(magnet, observation.points) == "moments":
@@ -522,7 +521,7 @@ def _check_linearization(
     others = np.zeros(len(model.parameters) - len(mean))
     linear = model.offset + model.matrix @ np.append(mean, others)
     worst = float((np.abs(linear - true) / sigma).max())
-    if worst > LINEAR_ENOUGH:
+    if worst > linear_enough:
         warnings.warn(
             "The iron is linearized about the nominal magnet, which changes a reading of the "
             f"updated magnet by {worst:.2g} of its error bar: study {magnet.name} needs the "

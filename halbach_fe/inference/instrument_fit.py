@@ -191,11 +191,6 @@ def _of_total_field(terms: list[str], sd: Floats) -> tuple[list[str], Floats]:
     return found, sd
 
 
-AMPLITUDE_STEP = 1e-3
-"""Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
-laws are linear to 1e-6 over it."""
-
-
 def amplitude_columns(
     study: Study, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings
 ) -> Floats:
@@ -213,8 +208,11 @@ def amplitude_columns(
     maps : sequence of Map
     readings : Readings
     """
+    # Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
+    # laws are linear to 1e-6 over it.
+    amplitude_step = 1e-3
     uncertain = [one for one in study.uncertain if one.is_of_instrument]
-    sides = [[shifted(study, one, sign * AMPLITUDE_STEP * one.sd) for sign in (1, -1)]
+    sides = [[shifted(study, one, sign * amplitude_step * one.sd) for sign in (1, -1)]
              for one in uncertain]
     found = []
     for number, one in enumerate(maps):
@@ -241,7 +239,7 @@ def amplitude_columns(
             return along * (np.sum(along * shown, axis=1) - np.nan_to_num(
                 total_without_nonlinear_part(own, data)))[:, None]
 
-        found.append(np.array([(off(more) - off(less)) / (2 * AMPLITUDE_STEP)
+        found.append(np.array([(off(more) - off(less)) / (2 * amplitude_step)
                                for more, less in sides]).reshape(-1, len(points), 3))
     return readings.observation.read(np.concatenate(found, axis=1)).T
 

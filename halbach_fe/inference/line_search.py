@@ -36,9 +36,6 @@ MOST_STEPS, DIFFERENCE = 8, 1e-4
 """Largest number of steps of the improvement, and step of its finite differences in units of the
 bore's radius, and of the scale."""
 
-STRETCH_SD = 0.05
-"""Prior standard deviation of the scale of the positions."""
-
 
 def line_of(points: Floats, width_m: float) -> Floats | None:
     """Return the direction (3,) of a line on which points (n, 3) lie, or None if they do not.
@@ -165,6 +162,7 @@ def _improved(
     seen: NDArray[np.bool_], across_m: float,
 ) -> tuple[float | None, Floats]:
     """Return misfit and pose (6,) after least squares over place and scale; None in no air."""
+    stretch_sd = 0.05  # prior standard deviation of the scale of the positions
     size = float(np.sqrt(np.sum(used**2) / seen.sum()))
     scales = np.array([magnet.bore_radius] * 3 + [1.0])
 
@@ -182,7 +180,7 @@ def _improved(
         left = (used - factor * field)[seen] / size
         weight = 0.01 * np.sqrt(seen.sum())  # one sd of the prior is as bad as 1 % of the field
         return np.concatenate([left, weight * np.append(parameters[:2] / across_m,
-                                                        parameters[3] / STRETCH_SD)])
+                                                        parameters[3] / stretch_sd)])
 
     def derivative(scaled: Floats) -> Floats:
         """Return the derivatives (n, 4), with the field at all places computed at once."""
@@ -197,7 +195,7 @@ def _improved(
 
     start = np.append(place, 0.0) / scales
     bound = 0.97 * magnet.bore_radius / np.sqrt(2) / scales[0]
-    low = np.array([-bound, -bound, -np.inf, -4 * STRETCH_SD])
+    low = np.array([-bound, -bound, -np.inf, -4 * stretch_sd])
     found = least_squares(residual, start, derivative, bounds=(low, -low), max_nfev=MOST_STEPS)
     parameters = found.x * scales
     pose = np.concatenate([parameters[:3], Rotation.from_matrix(matrix).as_rotvec()])

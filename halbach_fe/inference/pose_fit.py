@@ -97,10 +97,6 @@ of a reading."""
 LONGEST_SD = 1.0
 """Longest step of an open key, in prior standard deviations."""
 
-RENEWED = 0.7
-"""Change of an open key, in prior standard deviations, after which derivatives by open keys are
-computed anew."""
-
 BLURS = (1.0, 0.1, 0.01)
 """Noise that is added on a line while the fit is on its way, in units of what the nominal blocks
 leave at first."""
@@ -127,10 +123,6 @@ OFFSETS = slice(9, 12)
 
 PART_OF_SD = 0.1
 """Step of the finite differences by open keys, in prior standard deviations."""
-
-NO_EFFECT = 1e-6
-"""Largest change of a reading by a standard deviation of an open key, in units of the noise, that
-counts as none."""
 
 
 @dataclass(frozen=True)
@@ -419,9 +411,12 @@ class PoseFit:
 
     def _check_effects(self, state: _State) -> None:
         """Raise a StudyError if an open key changes no reading that is fitted."""
+        # Largest change of a reading by a standard deviation of an open key, in units of the noise,
+        # that counts as none.
+        no_effect = 1e-6
         for number, each in enumerate(self.open, start=6 + PROBE):
             effect = each.sd * state.by_parameter[..., number][self.training]
-            if np.abs(effect).max(initial=0.0) < NO_EFFECT * self.smallest_sigma:
+            if np.abs(effect).max(initial=0.0) < no_effect * self.smallest_sigma:
                 raise StudyError(must_be(
                     f"`{each.key}`", f"study {self.magnet.name}",
                     "a number on which the readings depend, to be fitted", "one without effect",
@@ -518,9 +513,12 @@ class PoseFit:
 
     def _by_open_keys(self, values: Floats, middle: Floats) -> list[Floats]:
         """Return the derivatives (n, 3) of B at places (n, 3) in m by every key of the magnet."""
+        # Change of an open key, in prior standard deviations, after which derivatives by open keys
+        # are computed anew.
+        renewed = 0.7
         scaled = values[PROBE:] / self.prior_sd()[PROBE:]
         known = self.derivatives.get("at")
-        if known is None or np.abs(scaled - known).max(initial=0.0) > RENEWED:
+        if known is None or np.abs(scaled - known).max(initial=0.0) > renewed:
             self.derivatives["at"] = scaled
             here = self._field(values)(middle) if self.open else middle
             for number, each in enumerate(self.open):

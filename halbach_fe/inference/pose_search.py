@@ -39,9 +39,6 @@ CANDIDATES, WORTH_TRYING = 2, 3.0
 """Largest number of candidates of every rotation that are improved, and multiple of the smallest
 rms residual up to which they are."""
 
-NEARLY_AS_GOOD = 1.5
-"""Candidates are kept whose rms residual is below this multiple of the smallest."""
-
 UNEXPLAINED = 0.5
 """Share of the field, in rms, that the nominal blocks may leave in the best pose."""
 
@@ -53,14 +50,6 @@ leave 0.01 of the field."""
 MIRROR = np.array([1.0, 1.0, -1.0])
 """Factors of the coordinates of a mirror image. A magnetic field is an axial vector: those of its
 components are the opposite."""
-
-MOST_POSES = 4
-"""Largest number of poses that are fitted with the magnet's own model."""
-
-MOST_OF_A_LINE = 8
-"""The same of a map on a line, and of one of |B|, which is the same in twice as many poses. On a
-line a component that is even in x, y and z, as in an ideal dipole, is the same on four lines in two
-directions."""
 
 NARROW = 0.02
 """Width up to which a map lies on a line, in units of the bore's radius."""
@@ -94,6 +83,13 @@ def coarse_poses(
     total : bool
         Whether the map is of |B|, which then stands in place of Bx.
     """
+    # The same of a map on a line, and of one of |B|, which is the same in twice as many poses. On a
+    # line a component that is even in x, y and z, as in an ideal dipole, is the same on four lines
+    # in two directions.
+    most_of_a_line = 8
+    most_poses = 4  # largest number of poses that are fitted with the magnet's own model
+    # Candidates are kept whose rms residual is below this multiple of the smallest.
+    nearly_as_good = 1.5
     rows = np.flatnonzero(training.any(axis=1))
     used = np.where(training, readings, 0.0)
     if not len(rows) or not used.any():
@@ -119,8 +115,8 @@ def coarse_poses(
             "map", "registration", "one that some pose of the magnet explains",
             f"{best / size:.0%} of its field unexplained in the best one",
             _after_no_pose(int(training.any(axis=0).sum()), total)))
-    most = MOST_POSES if line is None and not total else MOST_OF_A_LINE
-    return [pose for misfit, pose in improved if misfit <= NEARLY_AS_GOOD * best][:most]
+    most = most_poses if line is None and not total else most_of_a_line
+    return [pose for misfit, pose in improved if misfit <= nearly_as_good * best][:most]
 
 
 def _after_no_pose(components: int, total: bool) -> str:

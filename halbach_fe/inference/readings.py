@@ -43,10 +43,6 @@ from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
 
-OF_THE_PLANE = 0.05
-"""Largest Bz of a map of a 2D study relative to its other components: that of a probe that is
-turned by 3 degrees, far more than usual."""
-
 BY_CHANCE = 0.15
 """Share of a held-out map's readings that may equal those that update the model: more than readings
 at the same points do by chance."""
@@ -188,10 +184,13 @@ def _check_plane(points: Floats, where: str) -> None:
 
 def _doubt_field_along_z(field: Floats, where: str) -> None:
     """Warn if readings (n, 3) in T have a Bz, which no magnet of a 2D study makes."""
+    # Largest Bz of a map of a 2D study relative to its other components: that of a probe that is
+    # turned by 3 degrees, far more than usual.
+    of_the_plane = 0.05
     read = np.isfinite(field)
     along, across = (np.abs(field[:, part][read[:, part]]).max(initial=0.0)
                      for part in (slice(2, 3), slice(0, 2)))
-    if along > OF_THE_PLANE * across:
+    if along > of_the_plane * across:
         warnings.warn(
             f"The {where} reads Bz up to {along:.3g} T, but a 2D study has no field along z: these "
             "readings say nothing about its blocks. If the field is real, use a 3D study; if its "

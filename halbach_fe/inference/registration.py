@@ -37,10 +37,6 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
-SAME_TURN = 0.1
-"""Angle in rad up to which a map is turned like another on its stage: more than the error of the
-search, and far less than between poses that a symmetric magnet makes equal."""
-
 EQUAL_LOG_EVIDENCE = 0.1
 """Difference in log evidence up to which poses are equally probable: their odds are 1.1 : 1."""
 
@@ -203,10 +199,13 @@ def least_turned_first(found: Sequence[Registration]) -> list[Registration]:
 
 def _on_stage(starts: Sequence[Floats], stage: StagePose) -> list[Floats]:
     """Return the poses (6,) on a stage near those that are turned like another map on it."""
+    # Angle in rad up to which a map is turned like another on its stage: more than the error of the
+    # search, and far less than between poses that a symmetric magnet makes equal.
+    same_turn = 0.1
     apart = [float((Rotation.from_rotvec(each[3:]) * stage.turn.inv()).magnitude())
              for each in starts]
     found = [stage.nearest(each) for each, angle in zip(starts, apart, strict=True)
-             if angle < SAME_TURN]
+             if angle < same_turn]
     if not found:
         raise MeasurementError(must_be(
             "map", "registration", "turned like the one before it on the same stage",

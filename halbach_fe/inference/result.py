@@ -70,10 +70,6 @@ TOO_NEAR = 0.1
 """chi-squared per reading below which the noise or the prior is stated too large, by a factor of
 three. Error bars of the solver that count as noise leave 0.2 in magnets that are known well."""
 
-FAR_FROM_ZERO = 3.0
-"""Size of readings, in units of what prior and noise make of a field that is zero, from which they
-can be compared with the nominal field in shape."""
-
 OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) Run `halbach-fe check` "
              "for the noise of the map.")
 """Advice where the noise is stated too large."""
@@ -250,10 +246,6 @@ class Overlap:
         if self.chi2 < min(TOO_NEAR, 2 - self.limit):
             return f"{where}): the noise of these maps is stated too large."
         return ""
-
-
-WELL = 2.0
-"""rms of a map that was left out, in units of its noise, up to which its magnet is known there."""
 
 
 @dataclass(frozen=True)
@@ -634,12 +626,15 @@ class InferenceResult(ShownInNotebook):
 
         It holds for whatever is computed from the posterior.
         """
+        # rms of a map that was left out, in units of its noise, up to which its magnet is known
+        # there.
+        well = 2.0
         if self.disagreement:
             return Reservation()
         if self.held_back:
             measured = self.measured_blocks is not None
             return Reservation(f"Only in part. {held_back_in_words(self.held_back, measured)}")
-        wide = [one for one in self.regions_left_out if one.name and one.over_noise > WELL]
+        wide = [one for one in self.regions_left_out if one.name and one.over_noise > well]
         if wide:
             return Reservation(f"Only in part. {wide[0].in_words}: where no map lies, the magnet "
                                "is known no better than its error bars say.")
@@ -720,9 +715,12 @@ class InferenceResult(ShownInNotebook):
         """Say that chosen readings, by a mask (n,), are not like the field that the prior predicts
         or, if ``doubted``, a factor times it; nothing if they are neither.
         """
+        # Size of readings, in units of what prior and noise make of a field that is zero, from
+        # which they can be compared with the nominal field in shape.
+        far_from_zero = 3.0
         both = self.readings[chosen], self.prediction_prior.mean[chosen]
         allowed = np.hypot(self.prediction_prior.sd, self.noise.sd)[chosen]
-        far = np.linalg.norm(both[0]) > FAR_FROM_ZERO * np.linalg.norm(allowed)
+        far = np.linalg.norm(both[0]) > far_from_zero * np.linalg.norm(allowed)
         likeness = likeness_of(*both) if far else 1.0
         return factor_in_words(factor_of(*both), likeness) \
             if doubted or abs(likeness) < UNLIKE else ""

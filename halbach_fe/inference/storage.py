@@ -23,12 +23,6 @@ from halbach_fe.inference.same_magnet import check_same_magnet
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.study.model import Study
 
-MAX_SENTENCES = 4000
-"""Number of characters of a file's sentences that are shown."""
-
-WRITTEN_COVARIANCE = 2000
-"""Largest number of parameters for which the full covariance (then 32 MB) is written too."""
-
 
 class StoredPosterior(dict[str, Gaussian]):
     """Distributions of the magnetizations in A/m by name, ``prior`` and ``posterior``, of a file.
@@ -45,6 +39,8 @@ class StoredPosterior(dict[str, Gaussian]):
 
 def write_inference(update: InferenceResult, folder: Path) -> None:
     """Write posterior.h5, prediction.csv and summary.json."""
+    # Largest number of parameters for which the full covariance (then 32 MB) is written too.
+    written_covariance = 2000
     magnetization = update.magnetizations
     magnetization.attrs["study"] = update.study.model_dump_json()
     magnetization.attrs["disagreement"] = update.disagreement
@@ -52,7 +48,7 @@ def write_inference(update: InferenceResult, folder: Path) -> None:
     distributions = {"prior": update.prior, "posterior": update.posterior}
     for name, distribution in distributions.items():
         magnetization.update(_stored_root(name, distribution, update.prior))
-        if len(update.response.parameters) <= WRITTEN_COVARIANCE:
+        if len(update.response.parameters) <= written_covariance:
             magnetization[f"{name}_covariance"] = (
                 ("parameter", "parameter_2"), distribution.covariance, {"units": "A2/m2"})
     write_hdf5(with_checksum(magnetization), folder / "posterior.h5")
@@ -73,13 +69,14 @@ def read_posterior(magnet: Magnet, path: Path) -> StoredPosterior:
     OutputError
         If its content is not what was written.
     """
+    max_sentences = 4000  # number of characters of a file's sentences that are shown
     distributions = StoredPosterior()
     try:
         data = read_hdf5(path)
         own = untrusted.finite_array(data["nominal"], data["nominal"].shape)
         study = Study.model_validate_json(data.attrs["study"])
         if "disagreement" in data.attrs:
-            said, open_ = (printable(str(data.attrs.get(name, "")), MAX_SENTENCES)
+            said, open_ = (printable(str(data.attrs.get(name, "")), max_sentences)
                            for name in ("disagreement", "reservation"))
             distributions.disagreement = said or Reservation(open_)
         for name in ("prior", "posterior"):

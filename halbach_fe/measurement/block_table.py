@@ -25,13 +25,6 @@ MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
 REQUIRED_COLUMNS = ("serial", *MOMENT_COLUMNS, "sigma_A_m2")
 COLUMNS = ("serial", "type", "ring", "slot", *REQUIRED_COLUMNS[1:], "volume_m3", "temperature_C")
 
-MAX_PLACE = 100_000
-"""Largest number of a ring or slot."""
-SMALLEST_SIGMA = 1e-9
-"""Smallest standard deviation of a moment, relative to the moment: no coil is as exact, and the
-square of a far smaller one is zero."""
-MAX_MOMENT = 1e12
-"""Largest moment in A m^2. Larger values are unphysical, and their squares may overflow."""
 COLDEST_C, HOTTEST_C = -200.0, 200.0
 """Range of temperatures at which moments are measured: from liquid nitrogen to far above any
 laboratory, but below room temperature in kelvin."""
@@ -173,15 +166,21 @@ def _whole(
     values: Floats, name: str, lines: Sequence[tuple[int, Mapping[str, str]]], where: str
 ) -> Ints:
     """Return ring or slot numbers as integers from 1, or 0 for an empty cell; check their range."""
+    max_place = 100_000  # largest number of a ring or slot
     for value, (number, row) in zip(values, lines, strict=True):
-        if row.get(name) and not (1 <= value <= MAX_PLACE and value == int(value)):
+        if row.get(name) and not (1 <= value <= max_place and value == int(value)):
             raise MeasurementError(must_be(f"{name} in line {number}", where,
-                                           f"a whole number from 1 to {MAX_PLACE}", row[name]))
+                                           f"a whole number from 1 to {max_place}", row[name]))
     return values.astype(int)
 
 
 def _check(table: BlockTable) -> None:
     """Raise MeasurementError for the first invalid entry of a table."""
+    # Largest moment in A m^2. Larger values are unphysical, and their squares may overflow.
+    max_moment = 1e12
+    # Smallest standard deviation of a moment, relative to the moment: no coil is as exact, and the
+    # square of a far smaller one is zero.
+    smallest_sigma = 1e-9
     if not len(table):
         raise MeasurementError(must_be("content", table.source, "at least one block", "none"))
     for name in ("type", "ring", "slot", "moment", "sigma", "volume", "temperature"):
@@ -194,10 +193,10 @@ def _check(table: BlockTable) -> None:
                                        expected, received, hint))
 
     given = np.abs(np.column_stack([table.moment, table.sigma]))
-    for number in np.flatnonzero(~(given <= MAX_MOMENT).all(axis=1)).tolist():
+    for number in np.flatnonzero(~(given <= max_moment).all(axis=1)).tolist():
         if not np.isfinite(given[number]).all():
             refuse(number, "moment and sigma", "finite numbers", "an infinite or missing value")
-        refuse(number, "moment and sigma", f"below {MAX_MOMENT:g} A m^2",
+        refuse(number, "moment and sigma", f"below {max_moment:g} A m^2",
                f"{given[number].max():g}")
     size = np.linalg.norm(table.moment, axis=1)
     for number in range(len(table)):
@@ -215,8 +214,8 @@ def _check(table: BlockTable) -> None:
                 COLDEST_C <= table.temperature[number] <= HOTTEST_C):
             refuse(number, "temperature_C", f"from {COLDEST_C:g} to {HOTTEST_C:g} °C",
                    f"{table.temperature[number]:g}", "Is it in kelvin?")
-        if table.sigma[number] < SMALLEST_SIGMA * size[number]:
-            refuse(number, "sigma_A_m2", f"at least {SMALLEST_SIGMA:g} of the moment of "
+        if table.sigma[number] < smallest_sigma * size[number]:
+            refuse(number, "sigma_A_m2", f"at least {smallest_sigma:g} of the moment of "
                    f"{size[number]:g} A m^2", f"{table.sigma[number]:g}")
         if not (table.type[number] or table.ring[number]):
             refuse(number, "type", "given, or its ring and slot", "neither")

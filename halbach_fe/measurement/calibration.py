@@ -28,9 +28,6 @@ HEADER = "Bx (T),%err Bx,By (T),%err By,Bz (T),%err Bz"
 BEYOND = 0.05
 """Part of a table's range by which readings may exceed it; they have the error of its end."""
 
-LARGEST_PERCENT = 50.0
-"""Errors above this are no calibration, but another column or unit."""
-
 MAX_NAME = 80
 """Largest number of characters of a file's or column's name in a message."""
 
@@ -93,6 +90,7 @@ def read_calibration(path: Path) -> Calibration:
     MeasurementError
         If the file is no such table.
     """
+    largest_percent = 50.0  # errors above this are no calibration, but another column or unit
     where = printable(path.name, MAX_NAME)
     raw = file_bytes(path, where)
     _, header, rows = csv_table(raw, where, f"A header is {HEADER}.")
@@ -120,9 +118,9 @@ def read_calibration(path: Path) -> Calibration:
             raise MeasurementError(must_be(
                 f"fields of B{axis}", where, "two or more different values", "repeated values"
                 if len(at) > 1 else "a single one"))
-        if np.abs(error).max() > LARGEST_PERCENT:
+        if np.abs(error).max() > largest_percent:
             raise MeasurementError(must_be(
-                f"errors of B{axis}", where, f"at most {LARGEST_PERCENT:g} %",
+                f"errors of B{axis}", where, f"at most {largest_percent:g} %",
                 f"{error[np.abs(error).argmax()]:g} %", "Is this column in per cent?"))
         sensors[axis] = at, error / 100
     return Calibration(where, hashlib.sha256(raw).hexdigest(), sensors)

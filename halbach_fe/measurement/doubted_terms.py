@@ -23,17 +23,9 @@ CHANCE = 2e-3
 limit is 4.0 prior standard deviations for the 27 terms of a map's instrument, and 5.1 for those and
 the 1 728 of 576 blocks."""
 
-FACTOR_OFF = 0.1
-"""Part by which readings must differ in size from the model for their unit to be suspected: blocks
-of another grade are a few per cent off."""
-
 UNLIKE = 0.5
 """Cosine between readings and model below which no factor relates them: that of exchanged
 components is about 0, and blocks at the edge of what is accepted leave 0.9."""
-
-NEAR_FACTOR = 0.05
-"""Part by which a factor may differ from that of a known error: blocks of another batch or
-temperature are a few per cent off."""
 
 FACTORS = {
     1e-4: "as if numbers in T were taken for G", 1e-3: "as if numbers in T were taken for mT",
@@ -339,11 +331,14 @@ def factor_in_words(factor: float, likeness: float = 1.0) -> str:
 
     ``likeness`` is that of `likeness_of`. Nothing is said of a factor near 1.
     """
+    # Part by which readings must differ in size from the model for their unit to be suspected:
+    # blocks of another grade are a few per cent off.
+    factor_off = 0.1
     if abs(likeness) < UNLIKE:
         return ("The readings are not like the field expected of the magnet, by whatever "
                 "factor: look at the names of their components, at their axes, and at the places "
                 "and their unit (mm for m?) in the file first.")
-    if abs(factor - 1) < FACTOR_OFF:
+    if abs(factor - 1) < factor_off:
         return ""
     known = f" ({words})" if (words := known_factor(factor)) else ""
     return (f"The readings are {decimals(factor)} times the field expected of the magnet"
@@ -353,8 +348,11 @@ def factor_in_words(factor: float, likeness: float = 1.0) -> str:
 
 def known_factor(factor: float) -> str:
     """Return what error of a file a factor is near to, in words; nothing if none."""
+    # Part by which a factor may differ from that of a known error: blocks of another batch or
+    # temperature are a few per cent off.
+    near_factor = 0.05
     return next((words for value, words in FACTORS.items()
-                 if abs(factor / value - 1) < NEAR_FACTOR), "")
+                 if abs(factor / value - 1) < near_factor), "")
 
 
 def likeness_of(readings: Floats, field: Floats) -> float:

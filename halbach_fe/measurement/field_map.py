@@ -64,10 +64,6 @@ MAX_FIELD_T = 10.0
 """Largest flux density in T that is accepted. No permanent magnet reaches it; a larger value is
 probably in mT or G."""
 
-LENGTH_OFF = 0.1
-"""Part by which |B| may differ from the length of the components beside it where they are strong:
-gains of two probes differ by a few per cent, units by factors of 10."""
-
 COPIES = 0.1
 """Share of rows from which rows that are alike in all numbers are copies, and no chance."""
 
@@ -598,13 +594,16 @@ def _check_length(data: xr.Dataset, where: str) -> None:
     """Raise MeasurementError if a map's |B| is, where it is strong, not the length of its
     components: one of both is in another unit, or is not what its name says.
     """
+    # Part by which |B| may differ from the length of the components beside it where they are
+    # strong: gains of two probes differ by a few per cent, units by factors of 10.
+    length_off = 0.1
     length, total = np.linalg.norm(data["B_T"].values, axis=1), data[TOTAL_COLUMN].values
     known = np.isfinite(length) & np.isfinite(total) & (length > 0)
     if not known.any():
         return
     strong = known & (length >= np.median(length[known]))
     times = float(np.median(total[strong] / length[strong]))
-    if abs(times - 1) > LENGTH_OFF:
+    if abs(times - 1) > length_off:
         raise MeasurementError(must_be(
             TOTAL_COLUMN, where, "the length of Bx, By, Bz, in their unit",
             f"{decimals(times)} times as much", f"Correct the unit or the columns, or remove "

@@ -22,16 +22,9 @@ from scipy import linalg
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
 
-MOST_CHARGES = 3300
-"""Largest number of charges, which limits memory and time."""
-
 CLOSENESS = 0.6
 """Distance of charges from each other, relative to that from the region: where they are as far from
 each other as from a point, the field there is rough."""
-
-ENOUGH_FOR_A_THREAD = 500_000
-"""Number of pairs of points and charges that a thread computes in some milliseconds, in which many
-could be started."""
 
 AT_ONCE = 4096
 """Number of readings whose remaining noise is computed at a time, which limits the memory."""
@@ -115,12 +108,15 @@ class Charges:
 
     def _compute(self, name: str, points: Floats, *values: Any, out: Floats) -> None:
         """Call a function of `halbach_fe.measurement.charge_kernel` in threads."""
+        # Number of pairs of points and charges that a thread computes in some milliseconds, in
+        # which many could be started.
+        enough_for_a_thread = 500_000
         from halbach_fe.measurement import charge_kernel  # imports numba
 
         points = np.ascontiguousarray(points, float)
         in_threads(lambda first, last: getattr(charge_kernel, name)(
             points, *values, first, last, out), share_out(
-                len(points), 1 + len(points) * len(self.places) // ENOUGH_FOR_A_THREAD))
+                len(points), 1 + len(points) * len(self.places) // enough_for_a_thread))
 
 
 @dataclass(frozen=True)
@@ -157,9 +153,10 @@ def spacing_of(points: Floats, gap: float) -> float:
 
     It is `CLOSENESS` of that distance, or larger if there were too many.
     """
+    most_charges = 3300  # largest number of charges, which limits memory and time
     sides = np.ptp(points, axis=0) + 2 * gap
     area = 2 * float(np.sum(sides * np.roll(sides, 1)))
-    return float(max(CLOSENESS * gap, np.sqrt(area / MOST_CHARGES)))
+    return float(max(CLOSENESS * gap, np.sqrt(area / most_charges)))
 
 
 def _fields(points: Floats, places: Floats) -> Floats:

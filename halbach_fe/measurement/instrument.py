@@ -38,9 +38,6 @@ from halbach_fe.study.types import COMPONENTS, Axes
 ROUNDS = 50
 """Largest number of fixed-point iterations that invert the law of the sensors."""
 
-CONVERGED_T = 1e-12
-"""Largest residual in T at which the iteration stops."""
-
 
 @dataclass(frozen=True)
 class SensorModel:
@@ -265,6 +262,7 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
         If the planar Hall effect needs a component that the map does not hold, or the iteration
         does not converge.
     """
+    converged_t = 1e-12  # largest residual in T at which the iteration stops
     time = map_time(data)
     shown = without_memory(instrument, np.asarray(data["B_T"].values, float), time)
     missing = np.isnan(shown)
@@ -275,7 +273,7 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
         rest = nonlinear_part(instrument, field, time)
         wrong = np.where(missing, 0.0, np.nan_to_num(shown) - field @ matrix.T - rest)
         field = field + wrong  # converges, since the law is nearly the identity
-        if not np.abs(wrong).max() > CONVERGED_T:
+        if not np.abs(wrong).max() > converged_t:
             return shown - rest
     raise MeasurementError(must_be(
         "`instrument`", "study", "a law of the sensors that can be inverted",

@@ -43,10 +43,6 @@ SMALL = 1e-5
 DIFFERENCE_M = 2e-4
 """Step of finite differences for the gradient of the field."""
 
-CLOSE_M = 3e-4
-"""Distance of the sensors from their mean up to which the field is linear between them: in a
-gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT."""
-
 
 def prior_sd(settings: InstrumentSd) -> Floats:
     """Return the prior standard deviations (30,) of all terms.
@@ -98,9 +94,12 @@ def field_at_sensors(
     The axes are point of the map, sensor, component of B, and direction. Between sensors that are
     close together the field is taken for linear.
     """
+    # Distance of the sensors from their mean up to which the field is linear between them: in a
+    # gradient that changes by 1 T/m in 1 mm, the error is 0.05 mT.
+    close_m = 3e-4
     count = len(sensors)
     middle = sensors.mean(axis=1)
-    apart = bool(np.abs(sensors - middle[:, None]).max() > CLOSE_M)
+    apart = bool(np.abs(sensors - middle[:, None]).max() > close_m)
     places = sensors.reshape(-1, 3) if apart else middle
     steps = DIFFERENCE_M * np.eye(3)
     fields = field(np.concatenate([places, *(

@@ -77,9 +77,6 @@ from halbach_fe.measurement.suspect_rows import (
 )
 from halbach_fe.study.types import COMPONENTS
 
-SMALLEST_FIELD_T = 1e-12
-"""Largest field of a map that is no measurement: SQUIDs resolve it, no probe of a magnet does."""
-
 FEWEST_POINTS = 30
 """Smallest number of complete readings that are checked."""
 
@@ -103,9 +100,6 @@ WEIGHTINGS = 2
 millimetres apart, the largest of nine errors of their places was 5 to 19 standard deviations with
 the first weights, 3.3 with these, and 3.3 with more."""
 
-FEWEST_IN_PART = 40
-"""Smallest number of readings of a part of the map that tells of the instrument by itself."""
-
 ROUNDS = 2
 """Number of times that parameters are chosen: weights and linearization are those of the choice
 before."""
@@ -120,19 +114,9 @@ ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
 instrument's parameters leave out are no noise; they shift log probabilities by more than noise."""
 
-NEARLY_ALIKE = 300.0
-"""The same in a linear instrument, from which orientations are no longer tried: errors of usual
-sizes are not quite linear."""
-
 WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
-
-DETERMINED = 0.5
-"""A parameter is determined if its standard deviation is below this part of its prior one."""
-
-ALL_OF_IT = 0.99
-"""Share of a component in the mean square of the field from which its gain is that of |B|."""
 
 SIGNIFICANT = 4.0
 """Standard deviations from which a parameter is reported as found."""
@@ -140,10 +124,6 @@ SIGNIFICANT = 4.0
 ENOUGH = 0.2
 """Smallest share of readings beyond those that determine the field. With fewer, a field obeys any
 map."""
-
-LEAST_LEFT = 0.05
-"""Smallest share of a reading's noise variance that its residual counts to have: where the field
-takes nearly all of it along, what is left tells of the field."""
 
 VIOLATED = 0.02
 """A map whose floor is above this share of the largest field does not obey Maxwell's equations."""
@@ -161,21 +141,11 @@ and 16 to 36 in the outer lines of three maps in steps of 20 mm that end 30 mm f
 SAME_M = 2e-6
 """Difference of places that are the same: points of a ring differ by rounding."""
 
-FEWEST_KEPT = 0.1
-"""Smallest part of the held-out readings that makes a region in which they are well predicted."""
-
-WINDOWS = 6
-"""Number of parts along the longest axis for which the residual is given."""
-
 UNEVEN = 2.0
 """Ratio of the largest to the smallest rms residual of those parts from which the residual is not
 that of a noise which is the same everywhere. Fits take more of the noise along at the ends of a
 map: maps with such a noise had ratios of 1.3 to 1.7, maps whose field the fit cannot follow in the
 middle 2.9 to 7."""
-
-NO_STAGE = 0.2
-"""Noise of positions, in units of the spacing of the points, from which it is none: a stage whose
-readings are that far from where it says does not place them."""
 
 SCATTERED_M = 1e-6
 """Noise of positions from which it is stated. It makes residuals that differ between the parts."""
@@ -375,8 +345,11 @@ class MapCheck:
     @property
     def is_displaced(self) -> bool:
         """Whether readings scatter as if positions were farther off than those of any stage."""
+        # Noise of positions, in units of the spacing of the points, from which it is none: a stage
+        # whose readings are that far from where it says does not place them.
+        no_stage = 0.2
         return not self.position_noise_at_most and (
-            self.position_noise_m > NO_STAGE * self.spacing_m)
+            self.position_noise_m > no_stage * self.spacing_m)
 
     @property
     def is_reoriented(self) -> bool:
@@ -487,6 +460,9 @@ def _remaining(
     ``fitted`` is the fit of the rows that are not held out, ``whole`` that of all that are chosen,
     ``given`` (n, 3) in T are the columns of the map, which ``matrix`` (3, 3) turns.
     """
+    # Smallest share of a reading's noise variance that its residual counts to have: where the field
+    # takes nearly all of it along, what is left tells of the field.
+    least_left = 0.05
     model, points, chosen, held_out = whole.model, whole.model.points, rows.chosen, rows.held_out
     floor = model.field[held_out] - model.readings(fitted.at, held_out)
     unseen = np.full(given.shape, np.nan)
@@ -494,7 +470,7 @@ def _remaining(
     residual = whole.left
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
-        model.noise_left(whole.at, chosen, whole.width2), LEAST_LEFT))
+        model.noise_left(whole.at, chosen, whole.width2), least_left))
     scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
     fields = FreeField(model.charges.fields(points[chosen]).reshape(-1, len(model.charges)), 0.0)
     as_given = fields.most_probable(given[chosen].ravel(), whole.fit.number)
@@ -698,6 +674,8 @@ def scan_of(
 
     MeasurementError if too few are usable, see `check_map`.
     """
+    # Largest field of a map that is no measurement: SQUIDs resolve it, no probe of a magnet does.
+    smallest_field_t = 1e-12
     points, field = points_of(data), np.asarray(data["B_T"].values, float)
     broken = broken_rows(points, field)
     usable = np.isfinite(field).all(axis=1)
@@ -712,9 +690,9 @@ def scan_of(
         raise MeasurementError(must_be(
             _where(data), "Maxwell's check", "of points in a plane or a volume",
             "points on a line", "Along a line any field has div B = 0 and curl B = 0."))
-    if np.abs(field[usable]).max() < SMALLEST_FIELD_T:
+    if np.abs(field[usable]).max() < smallest_field_t:
         raise MeasurementError(must_be(
-            _where(data), "Maxwell's check", f"of a field of at least {SMALLEST_FIELD_T:g} T "
+            _where(data), "Maxwell's check", f"of a field of at least {smallest_field_t:g} T "
             "somewhere", f"{np.abs(field[usable]).max():.3g} T", "Is it in tesla?"))
     rough = rough_rows(points, field, usable)
     if rough.any():
@@ -751,6 +729,9 @@ def _orientation(
     which must be a possible one. The axes are taken as they are given if nothing speaks against
     them.
     """
+    # The same in a linear instrument, from which orientations are no longer tried: errors of usual
+    # sizes are not quite linear.
+    nearly_alike = 300.0
     spacing = point_spacing(scan.points)
     scan = scan.of(_some_points(scan.points))
     given, every = scan.model(Charges.around(scan.points, GAPS[-2] * spacing)), np.ones(
@@ -766,7 +747,7 @@ def _orientation(
     nearly = {number: _linear_against(given.turned(matrices[number]), fits[number])
               for number in left}
     left = [number for number, value in nearly.items()
-            if not number or value <= min(nearly.values()) + NEARLY_ALIKE]
+            if not number or value <= min(nearly.values()) + nearly_alike]
     against = {}
     for number in left:
         fitted = fit_probe(given.turned(matrices[number]), every, fits[number],
@@ -864,6 +845,8 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     ``shares`` (3, 3) is how much each element of the matrix of gains and crosstalk changes |B|, see
     `ProbeModel.shares`.
     """
+    # Share of a component in the mean square of the field from which its gain is that of |B|.
+    all_of_it = 0.99
     found = []
 
     def add(name: str, unit: str, factor: float, weights: dict[int, float],
@@ -882,7 +865,7 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
         add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
             {MIXING.start + 3 + axis: 1.0})
     of_size = np.einsum("mij,ij->m", MATRICES, shares)
-    for own in np.flatnonzero(np.diag(shares) < ALL_OF_IT).tolist():
+    for own in np.flatnonzero(np.diag(shares) < all_of_it).tolist():
         weights = MATRICES[:, own, own] - of_size
         add(f"gain of B{COMPONENTS[own]} relative to that of |B|", "%", 100.0,
             dict(enumerate(weights.tolist(), MIXING.start)), (MIXING.start + 6 + own,))
@@ -951,13 +934,15 @@ def selected(
 
 def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     """Return one half of the map each along x, y and z, and by how steep the field is."""
+    # Smallest number of readings of a part of the map that tells of the instrument by itself.
+    fewest_in_part = 40
     steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
     found: list[NDArray[np.bool_]] = []
     for values in (*model.points.T, steepness):
         middle = (float(np.median(values[rows])) if values is steepness
                   else (values[rows].max() + values[rows].min()) / 2)
         half = rows & (values <= middle)
-        if min(half.sum(), rows.sum() - half.sum()) >= FEWEST_IN_PART:
+        if min(half.sum(), rows.sum() - half.sum()) >= fewest_in_part:
             found.append(half)
     return found
 
@@ -972,6 +957,8 @@ def _term(
     If the halves scatter about the whole by more than their bars, its bar is as much longer. They
     support it if both of a pair could tell whether it is there, and none that could contradicts it.
     """
+    # A parameter is determined if its standard deviation is below this part of its prior one.
+    determined = 0.5
     used = np.flatnonzero(kept | (np.isin(np.arange(len(kept)), parameter.own)))
     row = parameter.row[used]
     estimates = [each.estimate(used) for each in told]
@@ -986,7 +973,7 @@ def _term(
     prior = float(np.linalg.norm(row))
     away = float(np.abs(estimates[0][0][np.isin(used, parameter.own)]).max())
     return InstrumentTerm(
-        parameter.name, parameter.unit, value, beyond * sd, beyond * sd < DETERMINED * prior,
+        parameter.name, parameter.unit, value, beyond * sd, beyond * sd < determined * prior,
         away <= doubted_from(len(kept)),
         supported or abs(value) <= SIGNIFICANT * beyond * sd), away
 
@@ -998,11 +985,12 @@ def _windows(
     points: Floats, residual: Floats
 ) -> tuple[str, tuple[tuple[float, float, tuple[float, float, float]], ...]]:
     """Return the rms residual of each component in parts along the longest axis."""
+    windows = 6  # number of parts along the longest axis for which the residual is given
     axis = int(np.argmax(np.ptp(points, axis=0)))
-    edges = np.linspace(points[:, axis].min(), points[:, axis].max(), WINDOWS + 1)
-    number = np.clip(np.searchsorted(edges, points[:, axis], side="right") - 1, 0, WINDOWS - 1)
+    edges = np.linspace(points[:, axis].min(), points[:, axis].max(), windows + 1)
+    number = np.clip(np.searchsorted(edges, points[:, axis], side="right") - 1, 0, windows - 1)
     found = []
-    for window in range(WINDOWS):
+    for window in range(windows):
         if (number == window).any():
             x, y, z = _rms(residual[number == window]).tolist()
             found.append((float(edges[window]), float(edges[window + 1]), (x, y, z)))
@@ -1018,6 +1006,8 @@ def _reach(
     across x, y or z, or within a distance from the line through the middle, it is the one with the
     most readings; None if that is all of them.
     """
+    # Smallest part of the held-out readings that makes a region in which they are well predicted.
+    fewest_kept = 0.1
     squares = np.mean(floor**2, axis=1)
     limit = (FAR_OFF * noise_T) ** 2
     if not noise_T or squares.mean() <= limit:
@@ -1026,7 +1016,7 @@ def _reach(
     families += [(name, below, column if below else -column) for below in (True, False)
                  for name, column in zip(COMPONENTS, points.T, strict=True)]
     best, most = Reach("r", True, np.nan, np.nan, float(np.sqrt(squares.mean())), noise_T), (
-        FEWEST_KEPT * len(points))
+        fewest_kept * len(points))
     for along, below, place in families:
         place = place.round(6)  # points of a ring differ by rounding
         for end in np.unique(place)[:-1]:

@@ -74,14 +74,8 @@ MARGIN = 0.25
 """Distance outside of the box about a map, in units of its spacing, up to which it knows the field
 as well as inside."""
 
-MOST_CELLS = 30_000
-"""Largest number of points of the grid on which the field of a map is compared with others."""
-
 PLACES = 6
 """Number of shifts of best correlation from which poses are refined."""
-
-COMPARED = 200
-"""Largest number of points by which a pose is refined from the correlation."""
 
 CERTAIN = 30.0
 """Log odds of a place against chance: of some millions of shifts one has 15 by chance."""
@@ -493,10 +487,12 @@ def _match(one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]) -> 
 
 def _step(one: Checked, other: Checked) -> float:
     """Return the step in m of the grids on which two maps are compared."""
+    # Largest number of points of the grid on which the field of a map is compared with others.
+    most_cells = 30_000
     step = min(one.check.spacing_m, other.check.spacing_m)
     for each in (one, other):
         sides = np.maximum(np.ptp(each.points, axis=0), step)
-        step = max(step, float((np.prod(sides) / MOST_CELLS) ** (1 / 3)))
+        step = max(step, float((np.prod(sides) / most_cells) ** (1 / 3)))
     return step
 
 
@@ -552,13 +548,14 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
 
     Readings that are far off count less, by their first power.
     """
+    compared = 200  # largest number of points by which a pose is refined from the correlation
     middle, noise = np.mean(other.box, axis=0), float(np.hypot(one.floor_T, other.floor_T))
     noise = noise or 1e-6 * other.check.size_T
     for _ in range(2):  # with the readings of the overlap that the first pose has, then the second
         rows = np.flatnonzero(one.holds(pose.places(other.points)))
         if len(rows) < _fewest_shared(pose.turn, sign):
             return _Match(pose, sign, np.inf, np.nan, -np.inf)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), COMPARED)).astype(int)]
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), compared)).astype(int)]
         points, read = other.points[rows], sign * other.ideal_T[rows]
 
         def left(values: Floats, start: Pose = pose, at: Floats = points,

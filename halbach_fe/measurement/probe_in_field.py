@@ -36,10 +36,6 @@ AT_REST, NEARLY_AT_REST = 1.0, 10.0
 """Decreases of chi-squared, of thousands of readings, below which the fit is at rest, and below
 which a small step is taken as if they were linear in it."""
 
-STEEPER = 100.0
-"""Ratio of the squared gradients of nine tenths and one tenth of the readings from which the noise
-of positions is told from that of readings."""
-
 WAVES = 4
 """Number of Legendre polynomials of the time by which the probe turns and its gain drifts."""
 
@@ -118,21 +114,19 @@ class ProbeFit:
         """
         return np.einsum("m,mij->ij", (self.instrument * self.prior_sd)[MIXING], MATRICES)
 
-
-LEAST_ERROR = 0.3
-"""Smallest standard deviation by which a reading is weighted, relative to the median one: the
-flattest readings of a small map may be fitted by chance."""
-
 LEAST_OWN = 0.05
 """Smallest share of a reading that the fit counts to leave: beyond, its residual is rounding."""
 
 
 def weights_of(scatter: Floats) -> Floats:
     """Return weights (n, 3), whose median is 1, of readings that scatter by as much (n,) in T."""
+    # Smallest standard deviation by which a reading is weighted, relative to the median one: the
+    # flattest readings of a small map may be fitted by chance.
+    least_error = 0.3
     median = float(np.median(scatter))
     if not median:
         return np.ones((len(scatter), 3))
-    return np.repeat(median / np.maximum(scatter, LEAST_ERROR * median)[:, None], 3, axis=1)
+    return np.repeat(median / np.maximum(scatter, least_error * median)[:, None], 3, axis=1)
 
 
 class ProbeModel:
@@ -500,24 +494,16 @@ def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:
     A position noise s makes an error of s |grad B_c| in component c, for a gradient (n, 3, 3). It
     is 0 if the gradient is about the same everywhere, so that nothing tells the two noises apart.
     """
+    # Ratio of the squared gradients of nine tenths and one tenth of the readings from which the
+    # noise of positions is told from that of readings.
+    steeper = 100.0
     steepness = np.sum(gradient**2, axis=2).ravel()
     flat, steep = np.quantile(steepness, [0.1, 0.9])
     squares = residual.ravel()**2
-    if steep < STEEPER * flat:
+    if steep < steeper * flat:
         return float(np.sqrt(squares.mean())), 0.0
     constant = float(squares[steepness <= flat].mean())
     return np.sqrt(constant), np.sqrt(max(squares.mean() - constant, 0.0) / steepness.mean())
-
-
-GROUPS_OF_STEEPNESS = 6
-"""Number of groups of readings, by the steepness of the field, whose scatter is compared."""
-
-NO_LINE = 4.0
-"""Standard deviations by which a group may be off a line of scatter over steepness: of six groups
-one is beyond by chance in one of 3 000 maps."""
-
-UPPER = 2.0
-"""Standard deviations above a scatter up to which its true value is taken to lie."""
 
 
 @dataclass(frozen=True)
@@ -546,11 +532,17 @@ def scatter_of(gradient: Floats, residual: Floats) -> Scatter:
     do not follow, near edges of magnets, grows faster. Then the group of readings in which the
     least is left for each T/m tells what positions may be at most: everything else only adds.
     """
+    upper = 2.0  # standard deviations above a scatter up to which its true value is taken to lie
+    # Standard deviations by which a group may be off a line of scatter over steepness: of six
+    # groups one is beyond by chance in one of 3 000 maps.
+    no_line = 4.0
+    # Number of groups of readings, by the steepness of the field, whose scatter is compared.
+    groups_of_steepness = 6
     noise, displaced = map(float, noise_of(gradient, residual))
     if not displaced:
         return Scatter(noise, 0.0)
     steepness, squares = np.sum(gradient**2, axis=2).ravel(), residual.ravel()**2
-    groups = np.array_split(np.argsort(steepness), GROUPS_OF_STEEPNESS)
+    groups = np.array_split(np.argsort(steepness), groups_of_steepness)
     steep, mean = (np.array([values[group].mean() for group in groups])
                    for values in (steepness, squares))
     # a mean of n squares of normal numbers has a relative error of sqrt(2 / n)
@@ -560,12 +552,12 @@ def scatter_of(gradient: Floats, residual: Floats) -> Scatter:
     constant = max(0.0, float(np.sum((mean - slope * steep) / sd**2) / np.sum(sd**-2.0)))
     slope = float(np.sum((mean - constant) * steep / sd**2) / np.sum(steep**2 / sd**2))
     off = np.abs(mean - constant - slope * steep) / sd
-    if slope <= 0 or off.max() > NO_LINE:
-        return Scatter(noise, float(np.sqrt(np.min((mean + UPPER * sd) / steep))), at_most=True)
+    if slope <= 0 or off.max() > no_line:
+        return Scatter(noise, float(np.sqrt(np.min((mean + upper * sd) / steep))), at_most=True)
     slope_sd = float(np.linalg.inv(design.T @ design)[1, 1]**0.5 * max(1.0, np.sqrt(
-        np.sum(off**2) / (GROUPS_OF_STEEPNESS - 2))))
+        np.sum(off**2) / (groups_of_steepness - 2))))
     position = float(np.sqrt(slope))
     flat = steepness <= np.quantile(steepness, 0.1)
-    least = UPPER * noise**2 * np.sqrt(2 / flat.sum())  # the error of what is subtracted from
+    least = upper * noise**2 * np.sqrt(2 / flat.sum())  # the error of what is subtracted from
     alone = np.sqrt(max(noise**2 - slope * steepness[flat].mean(), least))
     return Scatter(float(min(alone, noise)), position, slope_sd / (2 * position))

@@ -12,10 +12,6 @@ from halbach_fe.core.arrays import Floats, Ints
 HELD_OUT_EVERY = 5
 """Every so many scan lines one is held out by default."""
 
-JUMP = 5.0
-"""Length of a step, relative to the next one along its line, beyond which it is a jump: some rows
-of a line may be missing, and points are farther apart where the field is smooth."""
-
 STRAIGHT = 0.5
 """Cosine of the angle between two steps from which they are of one line, or of one circle."""
 
@@ -83,6 +79,9 @@ def motion(points: Floats) -> Floats:
     The points are in the order of the scan. The vectors are 0 for the first point of a line, where
     the stage has stopped. Repeated readings at a point have that of the first one.
     """
+    # Length of a step, relative to the next one along its line, beyond which it is a jump: some
+    # rows of a line may be missing, and points are farther apart where the field is smooth.
+    jump = 5.0
     new = np.append(True, (points[1:] != points[:-1]).any(axis=1))
     places = points[new]
     step = np.diff(places, axis=0, prepend=places[:1])
@@ -91,8 +90,8 @@ def motion(points: Floats) -> Floats:
     ratio = size[1:] / np.where(size[:-1] > 0, size[:-1], np.inf)
     goes_on = np.sum(way[1:] * way[:-1], axis=1) > STRAIGHT
     on_a_line = np.zeros(len(places), bool)
-    on_a_line[1:] |= goes_on & (ratio <= JUMP)
-    on_a_line[:-1] |= goes_on & (ratio >= 1 / JUMP)
+    on_a_line[1:] |= goes_on & (ratio <= jump)
+    on_a_line[:-1] |= goes_on & (ratio >= 1 / jump)
     return np.asarray((way * on_a_line[:, None])[np.cumsum(new) - 1])
 
 

@@ -26,20 +26,6 @@ ROUGH = 1.8
 """Multiple of the largest residual around a row that is far off a function through its neighbours.
 A single spike is 2 to 4 times as far off its own as off theirs."""
 
-OF_RANGE = 0.2
-"""Smallest residual of such a row, relative to the range of its neighbours' field. At the corner of
-a map that ends 6 mm from the edges of magnets a quadratic function is off by 0.1 of it. Smaller
-spikes are left to the fit of a field without sources. A row at the map's border has neighbours on
-one side only: there it is 1, as quadratic functions were off by up to 0.65 in clean maps that end
-12 mm from magnets."""
-
-CONTRADICTION = 1e-4
-"""Smallest difference of |B| from that of the components that is a contradiction, in units of the
-largest |B|: below that of most probes, above what rounding to four digits leaves of it."""
-
-ROUGH_ROUNDS = 10
-"""Number of times that spikes are looked for among the rows that are left."""
-
 
 def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
     """Return the rows that are zero, or repeat the row before them at another position.
@@ -67,6 +53,9 @@ def contradicted_rows(data: xr.Dataset) -> tuple[int, ...]:
     Gains make both differ everywhere: a row is named if it differs otherwise than most rows do. It
     is then not known which of the two is wrong.
     """
+    # Smallest difference of |B| from that of the components that is a contradiction, in units of
+    # the largest |B|: below that of most probes, above what rounding to four digits leaves of it.
+    contradiction = 1e-4
     if TOTAL_COLUMN not in data:
         return ()
     total = data[TOTAL_COLUMN].values
@@ -76,7 +65,7 @@ def contradicted_rows(data: xr.Dataset) -> tuple[int, ...]:
         return ()
     off = off - np.median(off[known])
     limit = max(SPIKE * 1.4826 * float(np.median(np.abs(off[known]))),
-                CONTRADICTION * float(total[known].max()))
+                contradiction * float(total[known].max()))
     return tuple((1 + np.flatnonzero(known & (np.abs(off) > limit))).tolist())
 
 
@@ -99,8 +88,15 @@ def rough_rows(
     A row that is far off spoils the functions of its neighbours, but less than its own. A field
     that is steeper than a quadratic function spoils those of neighbours alike.
     """
+    rough_rounds = 10  # number of times that spikes are looked for among the rows that are left
+    # Smallest residual of such a row, relative to the range of its neighbours' field. At the corner
+    # of a map that ends 6 mm from the edges of magnets a quadratic function is off by 0.1 of it.
+    # Smaller spikes are left to the fit of a field without sources. A row at the map's border has
+    # neighbours on one side only: there it is 1, as quadratic functions were off by up to 0.65 in
+    # clean maps that end 12 mm from magnets.
+    of_range = 0.2
     found = np.zeros(len(points), bool)
-    for _ in range(ROUGH_ROUNDS):
+    for _ in range(rough_rounds):
         rows = np.flatnonzero(usable & ~found)
         near = neighbours(points[rows])
         residual = np.full_like(field, np.nan)
@@ -108,7 +104,7 @@ def rough_rows(
         size = np.linalg.norm(residual[rows], axis=1)
         worst = spikes(points, residual, usable & ~found, 1.0)
         around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
-        limit = np.where(at_border(points[rows], near), 1.0, OF_RANGE)
+        limit = np.where(at_border(points[rows], near), 1.0, of_range)
         worst[rows] &= (size > ROUGH * size[near].max(axis=1)) & (size > limit * around)
         if not worst.any():
             break

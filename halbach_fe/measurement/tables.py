@@ -165,8 +165,7 @@ def finite(cell: str, what: str, where: str, hint: str = "") -> float:
 
 
 DAY_S = 86_400.0
-LEAST_CLOCK = 10_000
-"""Smallest number that is taken for a time of day, 1:00:00: counters of seconds begin below."""
+
 TIME_OF_DAY = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:[.,]\d{1,9})?))?")
 
 
@@ -177,9 +176,11 @@ def look_like_clock(values: Floats) -> bool:
     more than one minute: within a minute both are the same. A counter of seconds that passes from
     one hundred to the next in steps of up to 40 s has a number that ends on more than 59.
     """
+    # Smallest number that is taken for a time of day, 1:00:00: counters of seconds begin below.
+    least_clock = 10_000
     known = values[np.isfinite(values)]
     whole = known == np.floor(known)
-    if not whole.all() or not known.size or known.min() < LEAST_CLOCK:
+    if not whole.all() or not known.size or known.min() < least_clock:
         return False
     minutes = known // 100
     return len(np.unique(minutes)) > 1 and bool(

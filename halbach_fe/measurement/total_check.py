@@ -17,9 +17,6 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, check_magnitudes, checked_map, points_of
 from halbach_fe.measurement.suspect_rows import quadratic_residual, rough_rows
 
-FEWEST_ROWS = 30
-"""Rows from which a row can be compared with a function through its neighbours."""
-
 FEWEST_REPEATS = 3
 """Places that were read again from which the noise follows."""
 
@@ -69,6 +66,7 @@ def check_total(data: xr.Dataset) -> TotalCheck:
     MeasurementError
         If it holds what no map in m and T does.
     """
+    fewest_rows = 30  # rows from which a row can be compared with a function through its neighbours
     data = checked_map(data, "`data`")
     check_magnitudes(data)
     points, total = points_of(data), np.asarray(data[TOTAL_COLUMN].values, float)
@@ -81,7 +79,7 @@ def check_total(data: xr.Dataset) -> TotalCheck:
         repeated[:] = False
     usable = ~zero & ~repeated
     spike, noise = np.zeros(len(total), bool), float("nan")
-    if usable.sum() >= FEWEST_ROWS and (np.ptp(points[usable], axis=0) > 0).sum() > 1:
+    if usable.sum() >= fewest_rows and (np.ptp(points[usable], axis=0) > 0).sum() > 1:
         spike = rough_rows(points, total[:, None], usable)
         usable &= ~spike
         residual, size = quadratic_residual(points[usable], total[usable, None])

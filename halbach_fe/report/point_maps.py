@@ -20,9 +20,6 @@ from halbach_fe.report.page import figure_of
 SAME = 1e-3
 """Part of the size of a map within which lengths count as equal."""
 
-FEWEST = 12
-"""Fewest points in a slice; with fewer all points are drawn by angle and z."""
-
 NOTHING = 1e-9
 """Part of the largest value of all components below which a component is zero, and not drawn."""
 
@@ -76,6 +73,7 @@ def curve(points: Floats) -> tuple[Floats, str] | None:
 
 def panels(points: Floats) -> list[Panel]:
     """Return the planes in which points (n, 3) in m are drawn, which lie on no `curve`."""
+    fewest = 12  # fewest points in a slice; with fewer all points are drawn by angle and z
     few_radii = 3  # largest number of radii for which points count as circles about the axis
     every, z = np.arange(len(points)), 1e3 * points[:, 2]
     size = float(np.ptp(points, axis=0).max())
@@ -99,7 +97,7 @@ def panels(points: Floats) -> list[Panel]:
     for axis in (1, 2):  # from the side, and from the end
         middle = points[np.argmin(np.abs(points[:, axis] - np.median(points[:, axis]))), axis]
         chosen = np.flatnonzero(np.abs(points[:, axis] - middle) <= spacing / 2)
-        if len(chosen) >= FEWEST:
+        if len(chosen) >= fewest:
             found.append(_slice(points, chosen, axis))
     return found or [unrolled("all points", every)]
 

@@ -32,9 +32,6 @@ LEAST_BYTES = {2: 7200, 3: 2000}
 """Fewest bytes that the solve needs per element, by dimension: in a plane GetDP's 3600 for each of
 two unknowns (`halbach_fe.response.resource_estimate`), in space those of this program alone."""
 
-FAR_IRON = 10.0
-"""Times the radius of the blocks, beyond which iron is rather in another unit than a shield."""
-
 # Dimension of a cell by meshio's name of its type.
 _DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle6": 2, "quad": 2, "tetra10": 3}
 # By meshio's name of the cell type: number of corners (nodes in the middle of edges do not count),
@@ -168,6 +165,8 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
 
 def _check_memory(magnet: Magnet) -> None:
     """Refuse a mesh for which all memory of this machine is too little, before Gmsh begins it."""
+    # Times the radius of the blocks, beyond which iron is rather in another unit than a shield.
+    far_iron = 10.0
     from halbach_fe import geo
 
     kind = "cross_section" if magnet.dimension == 2 else "extruded"
@@ -179,7 +178,7 @@ def _check_memory(magnet: Magnet) -> None:
         return
     times = max((body.radius for body in magnet.iron), default=0.0) / magnet.array.outer_radius_m
     hint = "Enlarge mesh.block_size_m or mesh.growth."
-    if times > FAR_IRON:
+    if times > far_iron:
         hint = (f"The iron reaches {times:.0f} times as far out as the blocks: is it in another "
                 f"unit? If it is not, e{hint[1:]}")
     raise MeshError(must_be(

@@ -27,9 +27,6 @@ from halbach_fe.study.materials import MU_0
 
 FAMILIES = ("NdFeB", "SmCo5", "Sm2Co17", "ferrite")
 
-REFERENCE_TEMPERATURE_C = 20.0
-"""Temperature of the values of data sheets in °C."""
-
 LIMITS = {
     "remanence_T": (0.15, 1.55),
     "normal_coercivity_A_per_m": (1e5, 1.2e6),
@@ -48,10 +45,6 @@ ENERGY_TOLERANCE = 0.05
 """Accepted excess of the middle of (BH)_max over B_r^2 / (4 mu_0 mu_rec), which a straight B(H) has
 at the middle of B_r. Sheets round B_r to 0.01 T, at most 1 % of its square, and (BH)_max to 1 MGOe,
 at most 4 % of a SmCo5 of 13 MGOe."""
-
-COERCIVITY_TOLERANCE = 0.02
-"""Accepted excess of the smallest H_cB over B_r / (mu_0 mu_rec) at the largest B_r: mu_rec is given
-to 0.05, and is 1.03 to 1.05 for rare-earth magnets."""
 
 SUGGESTIONS, SIMILARITY = 3, 0.6
 """Largest number of names that an unknown name is compared with, and their least similarity (that
@@ -128,11 +121,12 @@ class Grade:
         Keys that no source gives are missing. The coercivity is the smallest that the data sheet
         promises.
         """
+        reference_temperature_c = 20.0  # temperature of the values of data sheets in °C
         values = {
             "intrinsic_coercivity_A_per_m": self.intrinsic_coercivity_A_per_m,
             "remanence_coefficient_per_K": self.remanence_coefficient_per_K,
             "coercivity_coefficient_per_K": self.coercivity_coefficient_per_K,
-            "reference_temperature_C": REFERENCE_TEMPERATURE_C,
+            "reference_temperature_C": reference_temperature_c,
         }
         return {key: value for key, value in values.items() if value is not None}
 
@@ -254,6 +248,9 @@ def check_grade(one: Grade) -> None:
         a straight B(H) permits, (BH)_max is larger than a straight B(H) permits, the coercivity of
         another family than ferrite rises with temperature, or there is no source.
     """
+    # Accepted excess of the smallest H_cB over B_r / (mu_0 mu_rec) at the largest B_r: mu_rec is
+    # given to 0.05, and is 1.03 to 1.05 for rare-earth magnets.
+    coercivity_tolerance = 0.02
     def refuse(reason: str) -> NoReturn:
         raise ValueError(f"grade {one.name}: {reason}")
 
@@ -275,7 +272,7 @@ def check_grade(one: Grade) -> None:
     if one.normal_coercivity_A_per_m > one.intrinsic_coercivity_A_per_m:
         refuse("H_cB must not be larger than H_cJ")
     permeability = MU_0 * one.recoil_permeability
-    if one.normal_coercivity_A_per_m > (1 + COERCIVITY_TOLERANCE) * high / permeability:
+    if one.normal_coercivity_A_per_m > (1 + coercivity_tolerance) * high / permeability:
         refuse(f"H_cB must not be larger than B_r / (mu_0 mu_rec) = {high / permeability:.3g} A/m")
     straight = one.nominal_remanence**2 / (4 * permeability)
     if sum(one.energy_product_J_per_m3) / 2 > (1 + ENERGY_TOLERANCE) * straight:

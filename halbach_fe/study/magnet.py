@@ -30,10 +30,6 @@ MOST_SQUARE = 0.99
 """Largest squareness for which irreversible losses are computed."""
 
 
-CLOSEST_M = 1e-6
-"""Smallest distance of a reading from a point dipole: nearer than any probe can be."""
-
-
 class Neighbour(StudyModel):
     """Another magnet with the same blocks, in vacuum, on the same axis.
 
@@ -73,13 +69,15 @@ def check_apart(external: External, points: Floats, study: str) -> None:
     ------
     StudyError
     """
+    # Smallest distance of a reading from a point dipole: nearer than any probe can be.
+    closest_m = 1e-6
     for number, dipole in enumerate(external.dipoles):
         distance = np.linalg.norm(points - np.array(dipole.position_m), axis=1)
-        if len(points) and distance.min() < CLOSEST_M:
+        if len(points) and distance.min() < closest_m:
             x, y, z = points[np.argmin(distance)]
             raise StudyError(must_be(
                 f"`external.dipoles[{number}].position_m`", f"study {study}",
-                f"at least {1e6 * CLOSEST_M:g} µm from the readings",
+                f"at least {1e6 * closest_m:g} µm from the readings",
                 f"the place of the reading at ({x:g}, {y:g}, {z:g}) m",
                 "An object that near is no point; leave it or the reading out."))
 

@@ -41,14 +41,6 @@ reaches 1e6, but from 1.5 T on even grain-oriented steel has less than some 1e5.
 MIN_RELATIVE_PERMEABILITY = 1.5
 """A material whose largest relative permeability is smaller is not iron."""
 
-MAX_FALL = 0.02
-"""Accepted fall of the polarization along a table, relative to the largest B: tables are rounded.
-"""
-
-MIN_STEP = 1e-6
-"""Smallest step of B between two points, relative to the largest B: between closer points the slope
-is lost to rounding."""
-
 SUBDIVISION = 16
 """Intervals of a constitutive law between two points of the table. With 16, the law agrees with the
 monotone cubic interpolation of the table within 1e-3, and so do the two laws with one another; the
@@ -60,9 +52,6 @@ LEAST_START = 0.5
 
 _CLOSED_FORM_POINTS = 800
 """Points at which a closed form is evaluated to make a curve."""
-
-_WIDEST_FIELD = 1e7
-"""Largest H in A/m at which a closed form is evaluated."""
 
 
 @dataclass(frozen=True)
@@ -202,8 +191,9 @@ def froehlich_kennelly(initial: float, saturation: float) -> Curve:
     saturation : float
         Saturation polarization J_s in T.
     """
+    widest_field = 1e7  # largest H in A/m at which a closed form is evaluated
     half = saturation / (MU_0 * (initial - 1))
-    field = np.concatenate([[0.0], np.geomspace(half * 1e-4, _WIDEST_FIELD, _CLOSED_FORM_POINTS)])
+    field = np.concatenate([[0.0], np.geomspace(half * 1e-4, widest_field, _CLOSED_FORM_POINTS)])
     return _checked(Curve(field, MU_0 * field + saturation * field / (half + field), initial))
 
 
@@ -251,6 +241,9 @@ def check_table(field: Floats, flux_density: Floats) -> tuple[Floats, Floats]:
         negative, exchanged, in another unit, or not increasing. H in Oe (1/80 of its value in A/m)
         is found only if the table goes far into saturation: below, it looks like good iron.
     """
+    # Smallest step of B between two points, relative to the largest B: between closer points the
+    # slope is lost to rounding.
+    min_step = 1e-6
     h, b = np.asarray(field, float), np.asarray(flux_density, float)
     if h.shape != b.shape or h.ndim != 1:
         raise ValueError(f"H and B must be lists of equal length, but H has {h.size} values and B "
@@ -262,7 +255,7 @@ def check_table(field: Floats, flux_density: Floats) -> tuple[Floats, Floats]:
     if len(h) < MIN_POINTS or len(h) > MAX_POINTS:
         raise ValueError(f"a curve needs {MIN_POINTS} to {MAX_POINTS} points besides the origin, "
                          f"not {len(h)}; give {'more' if len(h) < MIN_POINTS else 'fewer'}")
-    for name, values, least in (("H", h, 0.0), ("B", b, MIN_STEP * b[-1])):
+    for name, values, least in (("H", h, 0.0), ("B", b, min_step * b[-1])):
         steps = np.diff(values, prepend=0.0)
         if (steps <= least).any():
             worst = int(np.argmax(steps <= least))
@@ -284,6 +277,9 @@ def _check_points(bad: NDArray[np.bool_], h: Floats, b: Floats, problem: str) ->
 
 def _check_units(h: Floats, b: Floats) -> None:
     """Raise ValueError if no iron has such a curve: a unit is wrong, or H and B are exchanged."""
+    # Accepted fall of the polarization along a table, relative to the largest B: tables are
+    # rounded.
+    max_fall = 0.02
     if b[-1] > MAX_FLUX_DENSITY:
         if h[-1] < MAX_FLUX_DENSITY:
             raise ValueError(f"H and B look exchanged: B goes up to {b[-1]:g} T, and H only to "
@@ -304,7 +300,7 @@ def _check_units(h: Floats, b: Floats) -> None:
     # the polarization of iron does not fall; a small fall is accepted because tables are rounded
     polarization = b - MU_0 * h
     fall = float((np.maximum.accumulate(np.append(0.0, polarization))[1:] - polarization).max())
-    if fall > MAX_FALL * b[-1]:
+    if fall > max_fall * b[-1]:
         raise ValueError(f"the polarization B - mu_0 H falls by {fall:.3g} T, and in iron it "
                          "rises; is H in another unit than A/m, or the polarization given for B?")
     if polarization.max() > MAX_POLARIZATION:

@@ -31,9 +31,6 @@ LARGE_TURN_RAD, OFF_STEP = 0.3, 0.05
 """Angle above which no mapper is turned by mistake, and the distance, in steps of 15 degrees, from
 the next one beyond which it is not turned on purpose."""
 
-LARGE_BLOCK_M = 1.0
-"""Size of no block of a magnet: it would weigh some tons."""
-
 
 @typed
 def read_study(path: str | Path) -> Study:
@@ -113,6 +110,7 @@ def _syntax_hint(text: str, error: str) -> str:
 
 def _doubted_units(study: Study) -> list[str]:
     """Return sentences about numbers that are possible, but rather in another unit."""
+    large_block_m = 1.0  # size of no block of a magnet: it would weigh some tons
     found = []
     for instrument in (study.instrument, *(one.instrument for one in study.maps)):
         for turn in instrument.rotation_rad if instrument else ():
@@ -123,7 +121,7 @@ def _doubted_units(study: Study) -> list[str]:
                              f"Were degrees meant? Then write {np.radians(turn):.3g} for "
                              f"{turn:.4g}.")
     thick = study.array.outer_radius_m - study.array.inner_radius_m
-    if study.array.rings and thick > LARGE_BLOCK_M:
+    if study.array.rings and thick > large_block_m:
         found.append(f"its blocks are {thick:.3g} m thick. Were other units than metres meant?")
     return found
 

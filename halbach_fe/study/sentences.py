@@ -67,10 +67,6 @@ def did_you_mean(near: str, given: str) -> str:
     other = unit in UNITS and stem == given.rpartition("_")[0]
     return f"Did you mean `{near}`?" + (f" Then convert its values to {unit}." if other else "")
 
-
-MAX_WRONG_UNIT = 1e12
-"""Values from this size on are not explained by a wrong unit."""
-
 KILOOERSTED, MOST_KILOOERSTED = 1e6 / (4 * math.pi), 45.0
 """In A/m, and the largest intrinsic coercivity of magnets: a larger number is in kA/m."""
 
@@ -90,13 +86,7 @@ WRONG_UNITS = (
 DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius_scale")
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
-MOST_DEVIATION = 0.5
-"""From 1, up to which a number is taken for a whole factor."""
-
 ZERO_C_IN_K = 273.15
-
-MOST_PER_K = 0.02
-"""Largest temperature coefficient of any material: what is larger is in per cent."""
 
 
 def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
@@ -105,14 +95,17 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     ``limits`` are those of pydantic that the value violates, by their names: ge, gt, le or lt. The
     hint is empty if no unit fits.
     """
+    # Largest temperature coefficient of any material: what is larger is in per cent.
+    most_per_k = 0.02
+    max_wrong_unit = 1e12  # values from this size on are not explained by a wrong unit
     key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
-    if not abs(value) < MAX_WRONG_UNIT:  # an integer may be beyond floats
+    if not abs(value) < max_wrong_unit:  # an integer may be beyond floats
         return ""
     if key.endswith(DEVIATIONS_FROM_1) and abs(value - 1) <= limits.get("le", 0.0):
         return (f"It is the deviation from 1: if {value:.6g} is the whole factor, write "
                 f"{value - 1:.6g}; if per cent, {value / 100:.6g}.")
     for suffix, unit, factor in WRONG_UNITS:
-        if suffix == "coefficient_per_K" and (abs(factor) < 1) != (abs(value) > MOST_PER_K):
+        if suffix == "coefficient_per_K" and (abs(factor) < 1) != (abs(value) > most_per_k):
             continue
         if factor == KILOOERSTED and value > MOST_KILOOERSTED:
             continue
@@ -134,6 +127,7 @@ CURVE = ('Name a steel, { kind = "steel", name = "aisi_1010" }, or a file of pai
 
 def hint(key: str, error: ErrorDetails) -> str:
     """Return what to do about a value, of another type, unit or size; empty if nobody knows."""
+    most_deviation = 0.5  # from 1, up to which a number is taken for a whole factor
     value, kind = error.get("input"), error["type"]
     if key.endswith(".curve"):
         return CURVE
@@ -141,7 +135,7 @@ def hint(key: str, error: ErrorDetails) -> str:
         return ""
     if kind != "tuple_type":
         return wrong_unit(key, value, error.get("ctx", {})) or "Correct the value."
-    deviation = wrong_unit(key, value, {"le": MOST_DEVIATION})
+    deviation = wrong_unit(key, value, {"le": most_deviation})
     return f"Write it in brackets, an element for each axis or part. {deviation}".strip()
 
 

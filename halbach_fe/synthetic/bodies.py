@@ -30,9 +30,6 @@ from halbach_fe.synthetic.shapes import (
 )
 from halbach_fe.synthetic.true_magnet import Body, BodyPart, TrueMagnet, VacuumNeighbour, vector
 
-ON_AXIS = 1e-9
-"""Distance in m from the magnet's axis within which a block has no angle about it."""
-
 
 def free_bodies(array: Array, dimension: int) -> tuple[Body, ...]:
     """Return the nominal bodies of an array's free blocks, in the order of their table.
@@ -48,6 +45,8 @@ def free_bodies(array: Array, dimension: int) -> tuple[Body, ...]:
 
 
 def _free_body(array: Array, table: FreeBlocks, number: int, dimension: int) -> Body:
+    # Distance in m from the magnet's axis within which a block has no angle about it.
+    on_axis = 1e-9
     def given(column: str, default: Any) -> Any:
         """Return the cell of a column, or a default where it is empty."""
         value = table.value(column, number)
@@ -68,7 +67,7 @@ def _free_body(array: Array, table: FreeBlocks, number: int, dimension: int) -> 
     pose = Rotation.from_rotvec(turn)
     centre = place + pose.apply([seat.real, seat.imag, 0.0])
     x, y, _ = centre + pose.apply([shape.pivot.real, shape.pivot.imag, 0.0])
-    angle = float(np.arctan2(y, x)) if np.hypot(x, y) >= ON_AXIS else 0.0
+    angle = float(np.arctan2(y, x)) if np.hypot(x, y) >= on_axis else 0.0
     own = Rotation.from_euler("z", -angle)
     strength = given("remanence_T", None)
     easy = pose.apply([1.0, 0.0, 0.0])

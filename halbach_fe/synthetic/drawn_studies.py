@@ -31,9 +31,6 @@ QUARTER = np.pi / 2
 SAME_M = 1e-9
 """Difference of two edges in m below which they are equal."""
 
-LEAST_TURN = 0.9
-"""Cosine of the angle below which a block that was put in wrongly is magnetized otherwise."""
-
 
 def _ring_array(generator: Generator, order: int, rings: tuple[int, int], blocks: int,
                 shape: str, size: float) -> Keys:
@@ -244,6 +241,8 @@ def _turns(body: Body) -> list[Floats]:
     """Return rotation vectors in rad along a block's own axes after which it fits its slot, and is
     magnetized otherwise.
     """
+    # Cosine of the angle below which a block that was put in wrongly is magnetized otherwise.
+    least_turn = 0.9
     shape, axes = body.shape, body.face_orientation.as_matrix().T
     found = [np.pi * axis for axis in axes]
     if isinstance(shape, PrismBody) and shape.is_cuboid:
@@ -254,4 +253,4 @@ def _turns(body: Body) -> list[Floats]:
         found = found[:1]  # about the radius
     easy = np.array(body.easy_axis)
     return [turn for turn in found
-            if Rotation.from_rotvec(turn).apply(easy) @ easy < LEAST_TURN]
+            if Rotation.from_rotvec(turn).apply(easy) @ easy < least_turn]

@@ -36,15 +36,6 @@ Complex = NDArray[np.complex128]
 Arc = tuple[complex, float, float, float]
 """Centre in m, radius in m, and angles in rad of start and end."""
 
-SERIES_WITHIN = 0.5
-"""Distance from the centre, relative to the radius, within which an arc's integral is a series.
-
-The closed form loses two digits there, and all at the centre.
-"""
-
-SERIES_TERMS = 56
-"""Number of terms: 0.5^56 is 1e-17."""
-
 
 def plane_field(
     shape: Shape, u: Fractions, v: Fractions, polarization: Floats, points: Floats
@@ -96,11 +87,15 @@ def _arc(centre: complex, radius: float, start: float, end: float, z: Complex) -
     The logarithm follows the chord. Between chord and arc the arc passes on the other side of the
     point, which makes a difference of a full turn.
     """
+    series_terms = 56  # number of terms: 0.5^56 is 1e-17
+    # Distance from the centre, relative to the radius, within which an arc's integral is a series.
+    # The closed form loses two digits there, and all at the centre.
+    series_within = 0.5
     y = z - centre
     first, last = radius * np.exp(1j * start), radius * np.exp(1j * end)
     result = np.empty(len(z), complex)
-    near = np.abs(y) < SERIES_WITHIN * radius
-    order = np.arange(2, SERIES_TERMS + 2)
+    near = np.abs(y) < series_within * radius
+    order = np.arange(2, series_terms + 2)
     step = (last**-order.astype(float) - first**-order.astype(float)) / order
     result[near] = -radius**2 * np.polynomial.polynomial.polyval(y[near], step)
     y = y[~near]
@@ -124,9 +119,6 @@ by at most 1e-7 T.
 
 AT_ONCE = 10_000
 """Number of points for which magpylib is called at once."""
-
-SEARCHED = 1_000_000
-"""Largest number of bodies times points that are searched for equal positions: 24 MB."""
 
 Piece = tuple[Shape, Fractions, Fractions]
 """A shape, and the fractions of its thickness and half width that limit a part of it.
@@ -191,6 +183,8 @@ def tasks_of(bodies: Sequence[Body], points: Floats) -> Iterator[_Task]:
     Where pieces of the same shape share enough points, one task computes the fields of three unit
     polarizations for all of them; otherwise each piece has a task with its own polarization.
     """
+    # Largest number of bodies times points that are searched for equal positions: 24 MB.
+    searched = 1_000_000
     if not len(points):
         return
     groups: dict[Piece, list[tuple[int, Floats]]] = {}
@@ -200,7 +194,7 @@ def tasks_of(bodies: Sequence[Body], points: Floats) -> Iterator[_Task]:
         for part in body.parts:  # deviation of the part from the body
             groups.setdefault((body.shape, part.u, part.v), []).append(
                 (number, (part.factor - 1) * remanence))
-    at_once = max(1, SEARCHED // len(points))
+    at_once = max(1, searched // len(points))
     for piece, members in groups.items():
         for first in range(0, len(members), at_once):
             yield from _tasks(piece, members[first:first + at_once], bodies, points)

@@ -47,13 +47,6 @@ second in three. The boundary therefore changes the reaction by (1/100)^2 or (1/
 field, and Halbach arrays have a very small dipole moment.
 """
 
-TABLE_POINTS = 4000
-"""Number of points at which an H(B) table is interpolated."""
-
-ON_END = 1e-6
-"""Distance from an end of a tube, relative to its radius, within which an edge lies there."""
-
-
 END_SIZE = 1 / 8
 """Smallest size of elements at the ends of tubes and plates of iron, relative to that elsewhere;
 above it they are as large as the iron is thick. The field is singular at these edges. Around a
@@ -275,9 +268,11 @@ def _iron(body: Tube | Pole, flat: bool) -> Any:
 
 def _refine_ends(body: Tube, solid: Any, size: float) -> None:
     """Make elements small at the ends of a tube or plate, elsewhere of at most ``size`` in m."""
+    # Distance from an end of a tube, relative to its radius, within which an edge lies there.
+    on_end = 1e-6
     thickness = min(body.outer - body.inner, 2 * body.half_length)
     for edge in solid.edges:
-        if abs(abs(edge.center.z - body.middle) - body.half_length) < ON_END * body.outer:
+        if abs(abs(edge.center.z - body.middle) - body.half_length) < on_end * body.outer:
             edge.maxh = min(size, max(thickness, END_SIZE * size))
 
 
@@ -322,10 +317,11 @@ def _polarization(table: TableLaw) -> Any:
 
     It is piecewise linear between many points of a monotone interpolation of the table.
     """
+    table_points = 4000  # number of points at which an H(B) table is interpolated
     from scipy.interpolate import PchipInterpolator
 
     h, b = MU_0 * np.array(table.field), np.array(table.flux_density)
-    fine_b = np.linspace(0, b[-1], TABLE_POINTS)
+    fine_b = np.linspace(0, b[-1], table_points)
     fine_h = PchipInterpolator(b, h)(fine_b)
     j = fine_b - fine_h
     knots = [0.0, *fine_h.tolist(), 1e4]

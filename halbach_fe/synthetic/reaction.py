@@ -51,14 +51,6 @@ closed forms are used. Beyond it the eight dipoles of a cube are good to 1e-3 of
 NODES = {100: 6, 400: 4, 1500: 3}
 """Gauss points along a side of a block, by the largest number of blocks; 2 for more blocks."""
 
-LONE_NODES = 6
-"""Gauss points along a side of a block that is measured alone. With 12 the moment of a sector of
-permeability 1.05 changes by 2e-5."""
-
-PRECISION = 1e-8
-"""Relative residual of the linear system. The method's own error was measured to be 3e-3 of the
-reaction at 0.6 times the size of a block from its face, for permeabilities of 1.06 and 1.15."""
-
 
 @dataclass(frozen=True)
 class _Block:
@@ -126,9 +118,12 @@ def lone_moment_matrix(shape: Shape, permeability: Floats) -> Floats:
 
     ``permeability`` (3, 3) is the relative recoil permeability in the shape's axes.
     """
+    # Gauss points along a side of a block that is measured alone. With 12 the moment of a sector of
+    # permeability 1.05 changes by 2e-5.
+    lone_nodes = 6
     if np.array_equal(permeability, np.eye(3)):
         return shape.volume / MU_0 * np.eye(3)
-    nodes, volumes = shape.nodes(LONE_NODES)
+    nodes, volumes = shape.nodes(lone_nodes)
     fields = np.stack([piece_field((shape, *WHOLE), axis, nodes) for axis in np.eye(3)], axis=2)
     share, chi = volumes / volumes.sum(), permeability - np.eye(3)
     mean = np.tensordot(share, fields, axes=1)
@@ -211,6 +206,9 @@ def _solve_means(
 
     ``extra`` (blocks, 3) in T is added to the field ``first`` at the nodes.
     """
+    # Relative residual of the linear system. The method's own error was measured to be 3e-3 of the
+    # reaction at 0.6 times the size of a block from its face, for permeabilities of 1.06 and 1.15.
+    precision = 1e-8
     coupling = [{column: block.answer @ block.mean(tensor) for column, tensor in own.items()}
                 for block, own in zip(blocks, tensors, strict=True)]
     right = np.array([block.answer @ (block.mean(field) + more)
@@ -228,7 +226,7 @@ def _solve_means(
 
     size = 3 * len(blocks)
     solution, failed = gmres(LinearOperator((size, size), matvec=apply, dtype=float),
-                             right.ravel(), x0=right.ravel(), rtol=PRECISION, restart=50)
+                             right.ravel(), x0=right.ravel(), rtol=precision, restart=50)
     if failed:
         raise CheckFailedError("The answers of separate blocks to one another do not converge.")
     return np.asarray(solution.reshape(-1, 3))
@@ -285,11 +283,6 @@ def _far_of_means(
     return far
 
 
-MOST_IN_IRON = 400
-"""Largest number of separate blocks that are meshed together with iron, in three dimensions. Each
-has some 1000 elements of order 3, which is some 3 GB for all."""
-
-
 def reaction_field(
     magnet: TrueMagnet, points: Floats, elements: Elements | None = None,
     progress: Progress = no_progress,
@@ -322,6 +315,9 @@ def by_elements(magnet: TrueMagnet) -> bool:
     StudyError
         If the magnet has iron and more separate blocks than can be meshed with it.
     """
+    # Largest number of separate blocks that are meshed together with iron, in three dimensions.
+    # Each has some 1000 elements of order 3, which is some 3 GB for all.
+    most_in_iron = 400
     bodies = magnet.all_bodies
     separate = sum(bool(body.name) or (isinstance(body.shape, PrismBody) and body.shape.is_cuboid)
                    for body in bodies)
@@ -329,9 +325,9 @@ def by_elements(magnet: TrueMagnet) -> bool:
         return True
     if magnet.iron is None:
         return False
-    if separate > MOST_IN_IRON:
+    if separate > most_in_iron:
         raise StudyError(must_be(
-            "`array` with iron", "the study", f"of at most {MOST_IN_IRON} cuboids and free blocks "
+            "`array` with iron", "the study", f"of at most {most_in_iron} cuboids and free blocks "
             "for a simulated measurement in 3D", str(separate),
             "Leave the iron out, or use fewer blocks."))
     return True

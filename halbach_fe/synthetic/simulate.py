@@ -71,10 +71,6 @@ SECONDS = 1.0
 
 IDEAL = Instrument()
 
-SURFACE_M = 1e-9
-"""Distance in m from a surface up to which a point is on it: rounding errors of the coordinates of
-turned bodies are less, and magpylib's field jumps by the remanence within them."""
-
 LARGEST_CSV = 5e6 / 20
 """Count of numbers in a map, of some 20 characters each, from which it is written as HDF5."""
 
@@ -361,8 +357,11 @@ def real_places(study: Study, points: Floats, generator: np.random.Generator) ->
 
 def check_air(magnet: TrueMagnet, points: Floats) -> None:
     """Raise a StudyError if a point (n, 3) in m is inside a block or iron, or on its surface."""
+    # Distance in m from a surface up to which a point is on it: rounding errors of the coordinates
+    # of turned bodies are less, and magpylib's field jumps by the remanence within them.
+    surface_m = 1e-9
     inside = magnet.holds(points)
-    for beside in np.vstack([np.eye(3), -np.eye(3)]) * SURFACE_M:
+    for beside in np.vstack([np.eye(3), -np.eye(3)]) * surface_m:
         inside |= magnet.holds(points + beside)
     if inside.any():
         x, y, z = points[int(np.argmax(inside))]

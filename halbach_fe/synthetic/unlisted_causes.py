@@ -46,12 +46,6 @@ angles)."""
 SIZES = (5.0, 50.0)
 """Rms change of the readings that a cause acts on, in units of their noise."""
 
-LARGEST_DISPLACEMENT_M = 2e-3
-"""Largest rms displacement of the probe; larger ones would be seen by eye."""
-
-TRIAL_DISPLACEMENT_M = 1e-4
-"""Displacement by which the change of the readings per displacement is found."""
-
 FieldAt = Callable[[Floats], Floats]
 """Function of points (n, 3) in m that returns the true field (n, 3) in T."""
 
@@ -109,6 +103,10 @@ def simulate_unlisted(
     family : tuple, optional
         One of `families`; drawn if left out.
     """
+    # Displacement by which the change of the readings per displacement is found.
+    trial_displacement_m = 1e-4
+    # Largest rms displacement of the probe; larger ones would be seen by eye.
+    largest_displacement_m = 2e-3
     magnet_part, cause_part, noise_part = np.random.SeedSequence(seed).spawn(3)
     generator = np.random.default_rng(cause_part)
     nominal = magnet_of(study)
@@ -142,9 +140,9 @@ def simulate_unlisted(
         if chosen[0] == "readings":
             change = functions * strength(generator) * np.nanmean(sigma)
         else:
-            per_trial = field_at(points + TRIAL_DISPLACEMENT_M * functions) - ideal
-            wanted = strength(generator) / rms(per_trial / sigma) * TRIAL_DISPLACEMENT_M
-            change = field_at(points + min(wanted, LARGEST_DISPLACEMENT_M) * functions) - ideal
+            per_trial = field_at(points + trial_displacement_m * functions) - ideal
+            wanted = strength(generator) / rms(per_trial / sigma) * trial_displacement_m
+            change = field_at(points + min(wanted, largest_displacement_m) * functions) - ideal
     readings = ideal + change
     noise = np.random.default_rng(noise_part).standard_normal(points.shape)
     data = field_map(points, readings + np.nan_to_num(sigma) * noise).assign(

@@ -25,9 +25,6 @@ SHORTLIST = 40
 """Number of places whose signatures are compared; all of them are ranked by an estimate of their
 evidence."""
 
-NO_CHANGE = 1e-5
-"""Difference of magnetizations below which there is none, as a fraction of the largest one."""
-
 Sources = Sequence[tuple[int, int, Floats]]
 """Number from 0 of every slot that changes, and of the slot from which the block that is there
 comes; and the rotation (3, 3) of this block."""
@@ -96,7 +93,9 @@ def _change(sources: Sources, magnetizations: Floats) -> dict[int, Floats]:
 
 def _rounded(change: dict[int, Floats], vectors: Floats) -> tuple[tuple[int, ...], ...]:
     """Return the blocks that change, and their changes in units of what counts as none."""
-    unit = NO_CHANGE * float(np.abs(vectors).max())
+    # Difference of magnetizations below which there is none, as a fraction of the largest one.
+    no_change = 1e-5
+    unit = no_change * float(np.abs(vectors).max())
     whole = {number: np.rint(value / unit).astype(int) for number, value in change.items()}
     return tuple((number, *value.tolist()) for number, value in sorted(whole.items())
                  if np.abs(value).max() > 1)

@@ -196,9 +196,6 @@ It is typical of iron that is not saturated. No other value is tried, because a 
 the product of permeability and thickness, and the thickness is varied.
 """
 
-CLEARANCE_M = 2e-4
-"""Smallest distance between blocks and iron."""
-
 THINNEST_M = 5e-4
 """Smallest thickness of a ring."""
 
@@ -254,10 +251,11 @@ class IronRingEffect(Effect):
             values, STEP_M * step).tolist())) - here) / STEP_M for step in np.eye(3)[1:]])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        clearance_m = 2e-4  # smallest distance between blocks and iron
         inner, outer = place.at_m
         farther, thicker = values[1:] or (0.0, 0.0)
         thickness = max(outer - inner + thicker, THINNEST_M)
-        inner = max(inner + farther, build_magnet(study).array_outer_radius + CLEARANCE_M)
+        inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
         return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness,
             relative_permeability=PERMEABILITY))

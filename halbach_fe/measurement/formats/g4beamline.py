@@ -47,8 +47,7 @@ KNOWN = {"param": ("maxline", "current", "gradient", "normE", "normB"), "grid": 
 COLUMNS = {"grid": ("x", "y", "z", "Bx", "By", "Bz"), "cylinder": ("r", "z", "Br", "Bz")}
 ELECTRIC = {"grid": ("Ex", "Ey", "Ez"), "cylinder": ("Er", "Ez")}
 LENGTH_UNIT, FIELD_UNIT = "mm", "T"
-TOLERANCE_MM = 0.01
-"""Distance of a point from the grid up to which G4beamline uses it."""
+
 MAX_LINE = 300
 """Number of characters of a line of the header that are searched."""
 
@@ -149,7 +148,8 @@ def _number(text: str, name: str, where: str) -> float:
 
 def _check_grid(given: dict[str, str], values: Floats, kind: str, where: str) -> None:
     """Raise MeasurementError if a point is not of the grid, of which G4beamline ignores it."""
-    tolerance = _number(given.get("tolerance", str(TOLERANCE_MM)), "tolerance", where)
+    tolerance_mm = 0.01  # distance of a point from the grid up to which G4beamline uses it
+    tolerance = _number(given.get("tolerance", str(tolerance_mm)), "tolerance", where)
     for column, axis in enumerate("XYZ" if kind == "grid" else "RZ"):
         start = _number(given.get(f"{axis}0", "0"), f"{axis}0", where)
         step = _number(given.get(f"d{axis}", "1"), f"d{axis}", where)

@@ -56,8 +56,7 @@ WORDS = {
     "radians": "rad"}
 EXACT = {"T": "T", "mT": "mT", "uT": "uT", "µT": "uT", "μT": "uT", "nT": "nT", "G": "G",
          "kG": "kG", "mG": "mG"}
-MAX_UNIT = 40
-"""Largest number of characters of a unit."""
+
 MARKS = re.compile(r"[\s.*·⋅^_{}]|\*\*")
 """What spellings of one unit differ in: V.s/m^2, V*s/m2, Vs/m²."""
 SCALED = re.compile(r"(\d{1,20}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,2})?)\s*[*x·]?\s*([^\d\s].*)")
@@ -73,8 +72,9 @@ def unit_symbol(text: str) -> str:
     The symbols are the keys of `LENGTHS` and `FIELDS`, deg and rad; a factor precedes its unit,
     as in ``1e-07 T``.
     """
+    max_unit = 40  # largest number of characters of a unit
     text = text.strip()
-    if len(text) > MAX_UNIT:
+    if len(text) > max_unit:
         return ""
     if scaled := SCALED.fullmatch(text):
         unit, factor = unit_symbol(scaled[2]), float(scaled[1])

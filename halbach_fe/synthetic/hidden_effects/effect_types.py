@@ -123,9 +123,6 @@ LARGEST = {"m": 1.0, "rad": np.pi, "T": 10.0, "K": 500.0, "1/K": 0.1, "1/T": 10.
            "A/m": 1e8, "m^3": 1.0}
 """Largest absolute value of a parameter by its unit: what is beyond was meant in another unit."""
 
-NO_UNIT_LARGEST = 1e3
-"""The same of a count, a fraction or a factor."""
-
 
 @dataclass(frozen=True)
 class HiddenParameter:
@@ -147,7 +144,8 @@ class HiddenParameter:
     @property
     def limits(self) -> tuple[float, float]:
         """Smallest and largest value."""
-        largest = LARGEST.get(self.unit, NO_UNIT_LARGEST)
+        no_unit_largest = 1e3  # the same of a count, a fraction or a factor
+        largest = LARGEST.get(self.unit, no_unit_largest)
         return (-largest if self.least is None else self.least,
                 largest if self.most is None else self.most)
 
