@@ -193,7 +193,8 @@ def design_of(study: Study) -> Design:
     if study.design is None:
         raise StudyError(must_be(
             "`design`", f"study {study.name}", "a table with the rings to choose from", "nothing",
-            "Add [design], see docs/design.md."))
+            "Add a table [design] with, for example, rings = 5, spacing_m = 0.022, least_field_T = "
+            "0.05 and layer = [{ radii_m = [0.15, 0.155], sizes_m = [0.012] }]."))
     return study.design
 
 

@@ -152,8 +152,11 @@ def shim_tray(
     """
     tray = magnet.study.shim_tray
     if tray is None:
-        raise StudyError(must_be("`shim_tray`", f"study {magnet.name}", "a tray with its magnets",
-                                 "nothing", "Add [shim_tray], see docs/design.md."))
+        raise StudyError(must_be(
+            "`shim_tray`", f"study {magnet.name}", "a tray with its magnets", "nothing",
+            "Add a table [shim_tray] with, for example, rings = [{ radius_m = 0.08, count = 24 }] "
+            'and magnets = [{ name = "cube", size_m = [0.005, 0.005, 0.005], remanence_T = 1.2, '
+            "count = 100 }]."))
     if isinstance(posterior, InferenceResult):
         posterior = distributions_of(magnet, posterior)["posterior"]
     posterior = distribution_of(magnet, posterior, "posterior")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import tomllib
 from itertools import product
 
 import magpylib
@@ -189,9 +190,12 @@ def test_trays_that_are_wrong(changes, said):
 
 
 def test_a_study_without_a_tray(measured, tmp_path):
+    """The table that the message gives is one."""
     study, _, _, posterior = measured
-    with pytest.raises(StudyError, match=r"Add \[shim_tray\]"):
+    with pytest.raises(StudyError, match=r"Add a table \[shim_tray\]") as refused:
         shim_tray(build_magnet(study.with_(shim_tray=None)), Session.open(tmp_path), posterior)
+    keys = str(refused.value).partition("for example, ")[2].removesuffix(".").split(" and ")
+    assert study.with_(shim_tray=tomllib.loads("\n".join(keys))).shim_tray is not None
 
 
 def test_command(measured, tmp_path, capsys):
