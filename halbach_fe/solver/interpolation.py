@@ -168,7 +168,7 @@ def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
         m points.
     weights : ndarray, shape (m,), in m^d
     """
-    reference, weights = _RULES[mesh.cell_type]
+    reference, weights = QUADRATURE[mesh.cell_type]
     count = len(reference)
     located = Located(np.repeat(cells, count), np.tile(reference, (len(cells), 1)),
                       sparse.eye_array(len(cells) * count, format="csr"))
@@ -198,7 +198,7 @@ def _orbit(*coordinates_: float) -> set[tuple[float, ...]]:
 
 _ROOT = np.sqrt(15)
 _A, _B, _C = (7 - _ROOT) / 34, (7 + _ROOT) / 34, (10 - 2 * _ROOT) / 40
-_RULES = {
+QUADRATURE = {
     "triangle6": _rule([(9 / 40, 1 / 2, _orbit(1 / 3, 1 / 3, 1 / 3))] + [
         ((155 + sign * _ROOT) / 1200, 1 / 2,
          _orbit(a := (6 + sign * _ROOT) / 21, a, 1 - 2 * a)) for sign in (-1, 1)]),
@@ -208,6 +208,7 @@ _RULES = {
         ((2665 - 14 * _ROOT) / 37800, 1 / 6, _orbit(_B, _B, _B, 1 - 3 * _B)),
         (10 / 189, 1 / 6, _orbit(_C, _C, 1 / 2 - _C, 1 / 2 - _C))]),
 }
+"""Points and weights in the reference element, of the fifth degree, by the type of its cells."""
 
 
 def coordinates(mesh: VerifiedMesh, located: Located) -> Floats:

@@ -42,7 +42,7 @@ from halbach_fe.solver.axisymmetric_iron import Source, conjugate_gradients, new
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.dofs import read_matrix, read_solutions, read_unknowns
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
-from halbach_fe.solver.interpolation import quadrature, shape_functions
+from halbach_fe.solver.interpolation import QUADRATURE, quadrature, shape_functions
 from halbach_fe.solver.iron_modes import MESH
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
@@ -284,17 +284,14 @@ class BodiesReaction:
 
 def _reference() -> Floats:
     """Return the reference coordinates (15, 3) of the Gauss points."""
-    from halbach_fe.solver.interpolation import _RULES
-
-    return _RULES["tetra10"][0]
+    return QUADRATURE["tetra10"][0]
 
 
 def _field_of(problem: Problem, polarization: Floats, points: Floats) -> Floats:
     """Return B (n, 3) in T at points (n, 3) in m outside of a polarization (e, 15, 3) in T."""
-    from halbach_fe.solver.interpolation import _RULES
     from halbach_fe.solver.tetrahedra import add_field
 
-    reference, weights = _RULES["tetra10"]
+    reference, weights = QUADRATURE["tetra10"]
     values, _ = shape_functions("tetra10", reference)
     # the polarization in an element as a polynomial of second degree
     by_node = np.einsum("aq,eqi->eai", np.linalg.pinv(values), polarization)
