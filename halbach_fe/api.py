@@ -126,7 +126,7 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
 
 @typed
 def import_blocks(path: str | Path, **declared: object) -> BlockTable | FreeBlocks:
-    """Read a table of blocks in own columns and units.
+    r"""Read a table of blocks in own columns and units.
 
     Parameters
     ----------
@@ -147,6 +147,16 @@ def import_blocks(path: str | Path, **declared: object) -> BlockTable | FreeBloc
         If an option has another name.
     MeasurementError
         If the table cannot be read; the message says what to add.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> with open("blocks.txt", "w") as file:
+    ...     _ = file.write("name,type,moment_x[mA m^2],moment_y[mA m^2],moment_z[mA m^2]\n"
+    ...                    "a,1,500,0,0\n")
+    >>> table = hf.import_blocks("blocks.txt", fixed={"volume": "500 mm^3", "sigma": "0.2 %"})
+    >>> float(table.moment[0, 0])
+    0.5
     """
     refuse_unknown(declared, [one.name for one in fields(DeclaredBlocks)], "hf.import_blocks")
     if "columns" in declared:
@@ -420,6 +430,10 @@ def field(
         By default the bars are those of the study's prior of an assembled magnet.
     inside : bool
         Whether points may lie inside blocks.
+
+    Returns
+    -------
+    FieldOnLines
 
     Raises
     ------
