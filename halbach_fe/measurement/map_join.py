@@ -365,7 +365,8 @@ def _contradiction(name: str, off_T: float, noise_T: float) -> MeasurementError:
     if not np.isfinite(off_T):
         return MeasurementError(must_be(
             f"map '{name}'", "the maps that are joined",
-            f"one that shares {FEWEST_SHARED // 2} points or more with another one", "fewer, in every place, of those that obey Maxwell's "
+            f"one that shares {FEWEST_SHARED // 2} points or more with another one",
+            "fewer, in every place, of those that obey Maxwell's "
             "equations by themselves", "Measure more of the overlap, or with a smaller spacing "
             "(`halbach-fe check` of each map names the part that obeys), or find the map's place "
             "in the magnet by `halbach-fe register`."))
