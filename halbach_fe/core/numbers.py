@@ -13,6 +13,9 @@ MU_0 = 4e-7 * math.pi
 """Vacuum permeability in T m/A. The value before 2019; it differs from the measured value by
 1.3e-10 (relative)."""
 
+MAD_TO_SD = 1.4826
+"""Standard deviation of normal numbers over the median of their magnitudes."""
+
 LIMIT_UNITS = 1e-6, 1e6
 """Smallest and largest limit of unwanted multipoles in units of 1e-4 of the main one: from 1e-10 of
 it, below all errors, to a hundred times it."""

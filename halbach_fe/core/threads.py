@@ -1,11 +1,10 @@
-"""Threads for compiled work that releases Python's lock, and the memory of the machine."""
+"""Threads for compiled work that releases Python's lock, and the memory that is left."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,14 +25,6 @@ def share_out(count: int, parts: int = 16) -> list[tuple[int, int]]:
     """Return ranges of about the same size."""
     limits = np.unique(np.linspace(0, count, parts + 1).astype(int)).tolist()
     return list(pairwise(limits))
-
-
-def machine_memory() -> float:
-    """Return the memory in bytes of the machine, or of the container if that is less."""
-    there = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    with suppress(OSError, ValueError):  # no container, or one without a limit ("max")
-        there = min(there, float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    return there
 
 
 def available_memory() -> float | None:

@@ -20,6 +20,7 @@ from scipy import special
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
@@ -34,9 +35,6 @@ NEIGHBOURS = 24
 
 CROWD_PROBABILITY = 1e-4
 """Probability of as many neighbouring outliers by chance, below which they are not outliers."""
-
-MAD_TO_SD = 1.4826
-"""Ratio of the standard deviation to the median magnitude of normal numbers."""
 
 
 @dataclass(frozen=True)

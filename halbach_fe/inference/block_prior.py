@@ -25,6 +25,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
+from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
@@ -61,9 +62,6 @@ NDFEB_PER_K = -0.0012
 
 NAMED = 3
 """Number of blocks far from the others that a sentence names."""
-
-MAD_TO_SD = 1.4826
-"""Standard deviation of normal numbers over the median of their absolute values."""
 
 MANY_SD = 5.0
 """Number of the study's standard deviations by which no mean of its own blocks is off by chance."""

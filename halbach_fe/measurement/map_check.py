@@ -26,6 +26,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.doubted_terms import doubted_from
 from halbach_fe.measurement.field_map import (
@@ -483,7 +484,7 @@ def _remaining(
         "position_noise_sd_m": scatter.position_sd_m, "position_noise_at_most": scatter.at_most,
         "structure": _structure(points[chosen], (residual * model.weights)[chosen]),
         "reach": _reach(points[held_out], floor, points[chosen],
-                        float(1.4826 * np.median(np.abs(left)))),
+                        float(MAD_TO_SD * np.median(np.abs(left)))),
         "redundancy": 1 - whole.at.used / (3 * int(chosen.sum())),
         "residual_T": residual @ matrix, "unseen_T": unseen @ matrix}
 

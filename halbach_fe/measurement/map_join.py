@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
@@ -575,7 +576,7 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
                               max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
         pose = pose.moved(middle, found.x[:3], found.x[3:])
     # at the edge of the other map its field is not known as well as the noise is
-    off = float(1.4826 * np.median(np.abs(found.fun)))
+    off = float(MAD_TO_SD * np.median(np.abs(found.fun)))
     size = float(np.sqrt(np.mean(read**2))) / noise
     odds = float(3 * len(rows) * np.log(np.hypot(size, 1) / np.hypot(off, 1)))
     if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:]).max() > 0.3:
@@ -863,9 +864,8 @@ def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
     for number, one in enumerate(maps):
         for parameter in all_parameters(np.array(PRIOR_SD), np.eye(3) / 3):
             if any(term.found and term.name == parameter.name for term in one.check.terms):
-                mask = np.zeros(TERMS, bool)
-                mask[list(parameter.own)] = True
-                kept[:TERMS] |= mask & COMMON
+                own = list(parameter.own)
+                kept[own] |= COMMON[own]
         if number:
             kept[np.arange(len(kept))[model.placed(number)][:6]] = True
     return kept

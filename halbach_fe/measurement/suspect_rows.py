@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from scipy.special import gammainc
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.measurement.field_map import TOTAL_COLUMN
 from halbach_fe.measurement.scan_lines import point_spacing
 
@@ -64,7 +65,7 @@ def contradicted_rows(data: xr.Dataset) -> tuple[int, ...]:
     if not known.any():
         return ()
     off = off - np.median(off[known])
-    limit = max(SPIKE * 1.4826 * float(np.median(np.abs(off[known]))),
+    limit = max(SPIKE * MAD_TO_SD * float(np.median(np.abs(off[known]))),
                 contradiction * float(total[known].max()))
     return tuple((1 + np.flatnonzero(known & (np.abs(off) > limit))).tolist())
 
@@ -149,7 +150,7 @@ def spikes(
     size = np.abs(residual[rows])
     near = neighbours(points[rows])
     around = np.sort(size[near], axis=1)
-    least = np.maximum(1.4826 * np.maximum(over_neighbours * np.median(around, axis=1),
+    least = np.maximum(MAD_TO_SD * np.maximum(over_neighbours * np.median(around, axis=1),
                                            SPIKE * np.median(size, axis=0)),
                        ROUGH * around[:, -min(3, around.shape[1])])
     found = np.zeros(len(points), bool)
@@ -163,7 +164,7 @@ def scatter_around(points: Floats, known: Floats, residual: Floats) -> Floats:
     It is that of the median, which single rows that are far off do not change.
     """
     near = KDTree(known).query(points, np.arange(1, min(NEIGHBOURS + 1, len(known)) + 1))[1]
-    return np.asarray(1.4826 * np.median(np.abs(residual[near]), axis=(1, 2)))
+    return np.asarray(MAD_TO_SD * np.median(np.abs(residual[near]), axis=(1, 2)))
 
 
 def neighbours(points: Floats) -> Ints:

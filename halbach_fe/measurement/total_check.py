@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, check_magnitudes, checked_map, points_of
 from halbach_fe.measurement.suspect_rows import quadratic_residual, rough_rows
 
@@ -83,7 +84,7 @@ def check_total(data: xr.Dataset) -> TotalCheck:
         spike = rough_rows(points, total[:, None], usable)
         usable &= ~spike
         residual, size = quadratic_residual(points[usable], total[usable, None])
-        noise = float(1.4826 * np.median(np.abs(residual[:, 0]) / size))
+        noise = float(MAD_TO_SD * np.median(np.abs(residual[:, 0]) / size))
     repeats, repeatability = _repeated(points[usable], total[usable])
     broken = {name: (1 + np.flatnonzero(rows)).tolist() for name, rows in (
         ("zero", zero), ("repeated", repeated), ("spike", spike)) if rows.any()}

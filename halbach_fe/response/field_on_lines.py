@@ -223,8 +223,8 @@ def _through_blocks(
     """Return mean (n, 3), root (n, 3, q) and bar (n, 3) of B in T, and J (n, 3, 1 + q) in T.
 
     ``number`` (n,) is the block that a point is in, -1 in air. Permeability and iron answer to the
-    nominal magnet only: what they add to the field of deviations, a few per cent of it, is an
-    error bar.
+    nominal magnet only. What they add to the field of deviations is an error bar: chi times that
+    field, and beside iron as much as that field.
 
     Raises
     ------
@@ -236,8 +236,8 @@ def _through_blocks(
     if not uniform or magnet.has_losses or not applies(magnet):
         raise StudyError(must_be(
             "points inside blocks", magnet.name, "of a 3D magnet of uniform blocks without "
-            "irreversible losses, and with no other iron than coaxial tubes and discs",
-            "another magnet", "Leave the points out, or the key that says so of the magnet."))
+            "irreversible losses, and of the method reaction", "another magnet",
+            "End the line before the blocks."))
     outside = number < 0
     points = points.copy()
     points[outside] = check_points(magnet, points[outside], OF_LINES)
@@ -251,8 +251,8 @@ def _through_blocks(
     remanence = MU_0 * tensors @ change
     of_change = sum((field @ remanence[block] for block, field in enumerate(
         unit_fields(blocks, points))), np.zeros((*points.shape, change.shape[2])))
-    largest = np.abs(tensors - np.eye(3)).max(initial=0.0) if not magnet.iron else 1.0
-    error = error + largest * np.abs(of_change[..., 0])
+    answer = 1.0 if magnet.iron else np.abs(tensors - np.eye(3)).max(initial=0.0)
+    error = error + answer * np.abs(of_change[..., 0])
     of_change[..., 0] += strength
     polarization = np.zeros_like(of_change)
     nominal = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
@@ -277,8 +277,10 @@ def _reaction(
 
     solved = solve_separate(magnet, session)
     present = present_blocks(magnet.blocks)
-    place = np.array([present.index(magnet.blocks[block]) if block >= 0 and (
-        magnet.blocks[block] in present) else -1 for block in number])
+    place = np.full(len(points), -1)  # number of the block of a point among those that are there
+    for block in set(number[number >= 0]):
+        if magnet.blocks[block] in present:
+            place[number == block] = present.index(magnet.blocks[block])
 
     def sources(places: Floats) -> Floats:
         iron = solved.iron.field(places) if solved.iron is not None else 0.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError, must_be
-from halbach_fe.core.threads import machine_memory
+from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.domain import Regions, boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.model import Study
@@ -173,8 +173,8 @@ def _check_memory(magnet: Magnet) -> None:
     elements = geo.fewest_triangles(magnet, boundary_radius(magnet, kind))
     if magnet.dimension == 3:
         elements *= 3 * (len(geo.layers(magnet)) - 1)
-    needed, there = elements * LEAST_BYTES[magnet.dimension], machine_memory()
-    if needed <= there:
+    needed, left = elements * LEAST_BYTES[magnet.dimension] / 2**30, available_memory()
+    if left is None or needed <= left:
         return
     times = max((body.radius for body in magnet.iron), default=0.0) / magnet.array.outer_radius_m
     hint = "Enlarge mesh.block_size_m or mesh.growth."
@@ -182,9 +182,9 @@ def _check_memory(magnet: Magnet) -> None:
         hint = (f"The iron reaches {times:.0f} times as far out as the blocks: is it in another "
                 f"unit? If it is not, e{hint[1:]}")
     raise MeshError(must_be(
-        "mesh", f"study {magnet.name}", f"small enough for the {there / 2**30:.0f} GiB of memory "
-        "of this machine", f"some {elements / 1e6:.3g} million elements, which need more than "
-        f"{needed / 2**30:.0f} GiB", hint))
+        "mesh", f"study {magnet.name}", f"small enough for the {left:.3g} GiB of memory "
+        "that are left", f"some {elements / 1e6:.3g} million elements, which need more than "
+        f"{needed:.0f} GiB", hint))
 
 
 def meridian_size(magnet: Magnet) -> float:
