@@ -178,9 +178,11 @@ class Answer:
 
 
 def _first_sentence(text: str) -> str:
-    """Return the first sentence of a text, or two if the first is a mere verdict, as "Passed."."""
+    """Return the first sentence of a text, or two if the first is a mere verdict of up to three
+    words, as "Passed." and "Only in part.".
+    """
     first, *others = re.split(r"(?<=[.!?]) (?=[A-Z])", text)
-    return first if " " in first else " ".join([first, *others[:1]])
+    return first if len(first.split(" ")) > 3 else " ".join([first, *others[:1]])
 
 
 def agreement(disagreement: str | None) -> str:

@@ -212,6 +212,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
         verdict = ("No" if wrong else "Only in part" if doubtful else
                    "Yes, but what is suspected is not in the model" if diagnosis.suspected else
                    "Yes")
+        if verdict == "Only in part":
+            doubts.insert(0, doubts.pop())  # the reason comes before how well the model fits
         doubts[0] = f"{verdict}. {doubts[0]}"
     if exchanged := _also_possible(diagnosis):
         doubts.append(exchanged)

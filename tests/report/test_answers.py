@@ -393,6 +393,13 @@ def check(found, numbers):
     assert parser(words[:1]).parse_args(words).verb == words[0]
 
 
+def test_a_mere_verdict_stands_with_its_reason():
+    for trust, short in (("Only in part. A block is open. More.", "Only in part. A block is open."),
+                         ("No. It is off. More.", "No. It is off."),
+                         ("The fit is good. More.", "The fit is good.")):
+        assert Answer("?", "Said.", trust, "Step.").short_trust == short
+
+
 def test_every_page_has_an_answer():
     found = {path.stem: answers_in(path.read_text())
              for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
