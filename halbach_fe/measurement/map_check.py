@@ -75,6 +75,7 @@ from halbach_fe.measurement.suspect_rows import (
     rough_rows,
     scatter_around,
     spikes,
+    stands_out,
 )
 from halbach_fe.study.types import COMPONENTS
 
@@ -630,15 +631,19 @@ def _without_spikes(
 ) -> tuple[_Fitted, _Fitted, _Rows]:
     """Return the fits of all chosen rows and of those that are not held out, and the rows.
 
-    Spikes among the rows are added to ``broken`` and left out. Lines at the border of a large map
-    that are not fitted are extrapolated, whole edges by 1 mT in a map near a magnet: what is far
-    off there is no spike.
+    Spikes among the rows are added to ``broken`` and left out. At the border of a map near a magnet
+    a row that is far off is none where it is not fitted but extrapolated, and where another one
+    is nearly as far off at which the field is as steep: the field is what was not fitted there, as
+    at three corners 6 mm from edges of magnets.
     """
     whole = fitted.by(rows.chosen)
-    points, known = whole.model.points, rows.chosen.copy()
-    inside = points[rows.usable]
-    known[rows.usable] |= ~at_border(inside, neighbours(inside))
-    spike = known & spikes(points, whole.left / whole.model.scatter[:, None], rows.usable)
+    points, left = whole.model.points, whole.left / whole.model.scatter[:, None]
+    border = np.zeros(len(points), bool)
+    border[rows.usable] = at_border(points[rows.usable], neighbours(points[rows.usable]))
+    spike = (rows.chosen | ~border) & spikes(points, left, rows.usable)
+    steepness = np.linalg.norm(
+        whole.model.charges.gradient(points, whole.at.amplitudes), axis=(1, 2))
+    spike[border] &= stands_out(np.linalg.norm(left[border], axis=1), steepness[border])
     if not spike.any():
         return whole, fitted, rows
     broken["spike"] = sorted([*broken.get("spike", ()), *(1 + np.flatnonzero(spike)).tolist()])

@@ -158,6 +158,20 @@ def spikes(
     return found
 
 
+def stands_out(size: Floats, steepness: Floats) -> NDArray[np.bool_]:
+    """Tell which residuals (n,) are far larger than those at which the field is about as steep.
+
+    The steepness is (n,) in any unit; as many rows are compared as a row has neighbours.
+    """
+    order = np.argsort(steepness)
+    ahead = np.pad(size[order], NEIGHBOURS // 2)
+    windows = np.lib.stride_tricks.sliding_window_view(ahead, 2 * (NEIGHBOURS // 2) + 1)
+    second = np.sort(windows, axis=1)[:, -2]  # the largest of the others, if it is not the largest
+    found = np.empty(len(size), bool)
+    found[order] = size[order] > ROUGH * second
+    return found
+
+
 def scatter_around(points: Floats, known: Floats, residual: Floats) -> Floats:
     """Return the standard deviation (n,) around points (n, 3) of residuals (k, c) at known ones.
 

@@ -24,7 +24,7 @@ from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_har
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
 from halbach_fe.measurement.scan_lines import held_out_lines
-from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows
+from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows, stands_out
 from halbach_fe.report.map_check import (
     OPEN_SIGN,
     answer,
@@ -303,6 +303,19 @@ def test_edges_of_magnets_are_no_errors_of_the_probe(generator):
     check = check_map(field_map(FRINGE, field))
     assert check.broken == {}
     assert not any(term.found for term in check.terms)
+
+
+def test_what_is_as_far_off_where_the_field_is_as_steep_is_no_spike(generator):
+    """Rounding, by the number of threads, chose the fit in which three corners of the map above
+    were off by 100 standard deviations. A row that is off alone, the control, is a spike.
+    """
+    size, steepness = np.abs(generator.standard_normal((2, 200)))
+    steepest = np.argsort(steepness)[-3:]
+    alone, corners = size.copy(), size.copy()
+    alone[steepest[0]] = 100
+    corners[steepest] = 100, 90, 110
+    assert np.flatnonzero(stands_out(alone, steepness)).tolist() == [steepest[0]]
+    assert not stands_out(corners, steepness).any()
 
 
 @pytest.mark.parametrize("spoiled", ["shuffled lines", "curl"])
