@@ -1,33 +1,21 @@
-"""The verbs of the command line and their parser."""
+"""The parser of the command line, of all verbs that its modules declare."""
 
 from __future__ import annotations
 
 import argparse
-import ast
-import importlib
 import sys
 from collections.abc import Collection, Sequence
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from halbach_fe.cli import common, streams
+import shtab
+
+from halbach_fe.cli import common, files, measured, questions, shell, streams
+from halbach_fe.cli.options import VERBS, option, together, verb
 from halbach_fe.core.errors import EXIT_CODES
 from halbach_fe.core.versions import version
 
-VERBS = {
-    "new": "new", "explain": "explain", "solve": "solve", "infer": "infer",
-    "diagnose": "diagnose", "verify": "verify",
-    "multipoles": "multipoles", "homogeneity": "homogeneity",
-    "forces": "forces", "design": "design", "cad": "cad", "plan": "plan", "prior": "prior",
-    "shim": "shim", "shim-tray": "shim_tray", "sort": "sort",
-    "tolerance": "tolerance", "demagnetization": "demagnetization",
-    "simulate-measurement": "simulate_measurement", "import-map": "import_map",
-    "import-blocks": "import_blocks", "check": "check",
-    "register": "register", "report": "report",
-    "export": "export", "field": "field",
-    "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
-"""Name of the module of each verb."""
+DECLARING = (questions, measured, files, shell)
+"""Modules that declare the verbs."""
 
 LISTS = ("--columns", "--origin-m", "--axes")
 """Options whose values are lists that may begin with a minus."""
@@ -62,16 +50,10 @@ class Parser(argparse.ArgumentParser):
             streams.say(message.removesuffix("\n"))
 
 
-def module_of(verb: str) -> ModuleType:
-    """Import the module of a verb."""
-    return importlib.import_module(f"halbach_fe.cli.{VERBS[verb]}")
-
-
-def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
+def parser(verbs: Collection[str] = VERBS) -> argparse.ArgumentParser:
     """Return the parser of the command line, with the options of some verbs.
 
-    Of all other verbs it has only the help text. Only the modules of ``verbs`` are imported,
-    because some of them import large libraries.
+    Of all other verbs it has only the help text: some options import large libraries.
     """
     codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
     top = Parser(
@@ -79,23 +61,12 @@ def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
         epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
     top.add_argument("--version", action="version", version=version("halbach-fe"))
     subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, module in VERBS.items():
-        text = _docstring(module)
-        verb = subparsers.add_parser(name, help=text.splitlines()[0], description=text,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, one in VERBS.items():
+        added = subparsers.add_parser(name, help=one.text.splitlines()[0], description=one.text,
+                                      formatter_class=argparse.RawDescriptionHelpFormatter)
         if name in verbs:
-            module_of(name).add_arguments(verb)
+            together(*one.options)(added)
     return top
-
-
-def _docstring(module: str) -> str:
-    """Return the docstring of a verb's module, without importing the module.
-
-    A docstring stands first in its file, so that the rest need not be parsed.
-    """
-    source = Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8")
-    first = source[:source.index('"""', 3) + 3]
-    return ast.get_docstring(ast.parse(first)) or ""
 
 
 def with_values(words: Sequence[str]) -> list[str]:
@@ -112,8 +83,21 @@ def with_values(words: Sequence[str]) -> list[str]:
     return joined
 
 
+@verb(option("shell", choices=("bash", "zsh", "tcsh"),
+             help="shell for which the script is printed"))
+def completion(arguments: argparse.Namespace) -> int:
+    """Print a script that completes halbach-fe's commands and options in a shell.
+
+    For bash:
+
+        halbach-fe completion bash > ~/.local/share/bash-completion/completions/halbach-fe
+    """
+    streams.show(shtab.complete(parser(), shell=arguments.shell) + "\n")
+    return 0
+
+
 def run(words: Sequence[str]) -> int:
     """Run the verb of a command line; return its exit code."""
     words = with_values(words)
     arguments = parser([word for word in words if word in VERBS][:1]).parse_args(words)
-    return common.with_folder(module_of(arguments.verb).run, arguments)
+    return common.with_folder(VERBS[arguments.verb].run, arguments)

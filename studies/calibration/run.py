@@ -26,6 +26,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.cli import common
+from halbach_fe.cli.options import positive, positive_number
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.files import write_text
@@ -348,10 +349,10 @@ def nominal_magnetizations(magnet: Magnet) -> Floats:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--repeats", type=common.positive, default=500, metavar="N",
+    parser.add_argument("--repeats", type=positive, default=500, metavar="N",
                         help="truths drawn (default: %(default)s)")
-    parser.add_argument("--seed", type=common.positive, default=5, metavar="N")
-    parser.add_argument("--block-size-m", type=common.positive_number, default=0.01,
+    parser.add_argument("--seed", type=positive, default=5, metavar="N")
+    parser.add_argument("--block-size-m", type=positive_number, default=0.01,
                         help="of the mesh (default: %(default)s)")
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.cli.options import positive
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import build_magnet
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--samples", type=common.positive, default=1500,
+    parser.add_argument("--samples", type=positive, default=1500,
                         help="draws of each chain (default: %(default)s)")
 
 
