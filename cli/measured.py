@@ -33,6 +33,7 @@ from halbach_fe.cli.options import (
     input_file,
     map_format,
     option,
+    parser,
     path,
     positive,
     positive_number,
@@ -493,7 +494,6 @@ class _Explanation:
         """Run a command into a folder, with the options of this one that it has, and return what
         its page says.
         """
-        from halbach_fe.cli.verbs import parser
         from halbach_fe.report.page_record import PAGE_RECORD, PageRecord
 
         output = self.arguments.output / folder

@@ -10,15 +10,18 @@ import argparse
 import inspect
 import math
 import os
+import sys
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from halbach_fe.core.errors import MAX_QUOTED, printable
+from halbach_fe.cli.streams import say, show
+from halbach_fe.core.errors import EXIT_CODES, MAX_QUOTED, printable
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import HIGHEST_ORDER, LIMIT_PPM, LIMIT_UNITS
+from halbach_fe.core.versions import version
 from halbach_fe.measurement.formats.declared import DELIMITERS, FORMATS, UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.units import (
     ANGLES,
@@ -74,6 +77,54 @@ def option(*names: str, **settings: Any) -> Options:
 def together(*options: Options) -> Options:
     """Return several options as one."""
     return lambda parser: [each(parser) for each in options]
+
+
+class Once(argparse.Action):
+    """An option with a value. It is refused if it is given twice, as only the last would count."""
+
+    given = False
+
+    def __call__(
+        self, parser: object, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        """Store the value."""
+        if self.given:
+            raise argparse.ArgumentError(self, "is given twice; leave one out")
+        self.given = True
+        setattr(namespace, self.dest, values)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose help says so if it cannot be printed, and whose options are given once."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.register("action", None, Once)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        if file is sys.stdout:
+            show(message)
+        else:
+            say(message.removesuffix("\n"))
+
+
+def parser(verbs: Collection[str] = VERBS) -> argparse.ArgumentParser:
+    """Return the parser of the command line, with the options of some verbs.
+
+    Of all other verbs it has only the help text: some options import large libraries.
+    """
+    codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
+    top = Parser(
+        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
+        epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
+    top.add_argument("--version", action="version", version=version("halbach-fe"))
+    subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for name, one in VERBS.items():
+        added = subparsers.add_parser(name, help=one.text.splitlines()[0], description=one.text,
+                                      formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name in verbs:
+            together(*one.options)(added)
+    return top
 
 
 def orders(text: str) -> tuple[int, ...]:

@@ -10,8 +10,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import shtab
+
 from halbach_fe.cli import common
-from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, option, path, verb
+from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, option, parser, path, verb
+from halbach_fe.cli.streams import show
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
 from halbach_fe.core.versions import version
 
@@ -156,4 +159,17 @@ def schema(arguments: argparse.Namespace) -> int:
     from halbach_fe.study.model import Study
 
     common.print_json(Study.model_json_schema())
+    return 0
+
+
+@verb(option("shell", choices=("bash", "zsh", "tcsh"),
+             help="shell for which the script is printed"))
+def completion(arguments: argparse.Namespace) -> int:
+    """Print a script that completes halbach-fe's commands and options in a shell.
+
+    For bash:
+
+        halbach-fe completion bash > ~/.local/share/bash-completion/completions/halbach-fe
+    """
+    show(shtab.complete(parser(), shell=arguments.shell) + "\n")
     return 0

@@ -1,72 +1,18 @@
-"""The parser of the command line, of all verbs that its modules declare."""
+"""All verbs of the command line, and how one is run."""
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import shtab
-
-from halbach_fe.cli import common, files, measured, questions, shell, streams
-from halbach_fe.cli.options import VERBS, option, together, verb
-from halbach_fe.core.errors import EXIT_CODES
-from halbach_fe.core.versions import version
+from halbach_fe.cli import common, files, measured, questions, shell
+from halbach_fe.cli.options import VERBS as VERBS
+from halbach_fe.cli.options import parser as parser
 
 DECLARING = (questions, measured, files, shell)
 """Modules that declare the verbs."""
 
 LISTS = ("--columns", "--origin-m", "--axes")
 """Options whose values are lists that may begin with a minus."""
-
-
-class Once(argparse.Action):
-    """An option with a value. It is refused if it is given twice, as only the last would count."""
-
-    given = False
-
-    def __call__(
-        self, parser: object, namespace: argparse.Namespace, values: Any, option: str | None = None
-    ) -> None:
-        """Store the value."""
-        if self.given:
-            raise argparse.ArgumentError(self, "is given twice; leave one out")
-        self.given = True
-        setattr(namespace, self.dest, values)
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose help says so if it cannot be printed, and whose options are given once."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.register("action", None, Once)
-
-    def _print_message(self, message: str, file: Any = None) -> None:
-        if file is sys.stdout:
-            streams.show(message)
-        else:
-            streams.say(message.removesuffix("\n"))
-
-
-def parser(verbs: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of the command line, with the options of some verbs.
-
-    Of all other verbs it has only the help text: some options import large libraries.
-    """
-    codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
-    top = Parser(
-        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
-        epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
-    top.add_argument("--version", action="version", version=version("halbach-fe"))
-    subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, one in VERBS.items():
-        added = subparsers.add_parser(name, help=one.text.splitlines()[0], description=one.text,
-                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-        if name in verbs:
-            together(*one.options)(added)
-    return top
 
 
 def with_values(words: Sequence[str]) -> list[str]:
@@ -81,19 +27,6 @@ def with_values(words: Sequence[str]) -> list[str]:
         else:
             joined.append(word)
     return joined
-
-
-@verb(option("shell", choices=("bash", "zsh", "tcsh"),
-             help="shell for which the script is printed"))
-def completion(arguments: argparse.Namespace) -> int:
-    """Print a script that completes halbach-fe's commands and options in a shell.
-
-    For bash:
-
-        halbach-fe completion bash > ~/.local/share/bash-completion/completions/halbach-fe
-    """
-    streams.show(shtab.complete(parser(), shell=arguments.shell) + "\n")
-    return 0
 
 
 def run(words: Sequence[str]) -> int:
