@@ -20,7 +20,7 @@ from halbach_fe.report.registration import answer, by_hypothesis, sentences
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.support.short_dipole import TEXT as CIRCLES
-from tests.support.short_dipole import polarization_of, truth
+from tests.support.short_dipole import sectors, truth
 
 TEXT = CIRCLES.replace("scan_lines_every = 5", "every = 5").replace(
     'shape = "cuboid"\nwidth_m = 0.016', 'shape = "sector"').replace(
@@ -37,18 +37,6 @@ SMALL_TURNS = PosePrior(turn_rad=0.01)
 @pytest.fixture(scope="module")
 def magnet():
     return build_magnet(parse_study(tomllib.loads(TEXT)))
-
-
-def sectors(generator):
-    """The blocks of `truth` as sectors: beside the cuboids a search takes twice the time."""
-    sources = []
-    for cuboid in truth(generator, 0.003).sources:
-        x, y, z = cuboid.position
-        angle = np.degrees(np.arctan2(y, x))
-        sources.append(magpylib.magnet.CylinderSegment(
-            dimension=(0.02, 0.04, 0.03, angle - 22.5, angle + 22.5), position=(0.0, 0.0, z),
-            polarization=polarization_of(cuboid)))
-    return magpylib.Collection(*sources)
 
 
 def profile(source, generator, place=PLACE, components=(0,)):
@@ -71,7 +59,7 @@ def test_a_line_is_told_from_a_map(generator):
 
 
 def test_a_profile_beside_the_axis_with_a_wrong_step(magnet, generator, tmp_path):
-    data = profile(sectors(generator), generator)
+    data = profile(sectors(truth(generator, 0.003)), generator)
     found = register(magnet, data, Session.open(tmp_path), open_keys=[STEP],
                      alternatives=[()], pose=SMALL_TURNS)
     best = found[0]
@@ -126,7 +114,7 @@ def test_a_profile_of_another_magnet_is_not_explained(magnet, generator, tmp_pat
 
 def test_the_command_compares_what_may_be_open(generator, tmp_path, capsys):
     (tmp_path / "study.toml").write_text(TEXT)
-    write_map(profile(sectors(generator), generator), tmp_path / "map.csv")
+    write_map(profile(sectors(truth(generator, 0.003)), generator), tmp_path / "map.csv")
     arguments = ["register", str(tmp_path / "study.toml"), "--measurements",
                  str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--turn-rad", "0.01"]
     assert main([*arguments, "--fit", "instrument.z_scale=0.03",

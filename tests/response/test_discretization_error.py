@@ -70,7 +70,8 @@ def test_dual_formulations_bracket_the_modes(short_dipole, session):
     parts = finite_element_part(build_magnet(study), points, session, columns=False)
     part, stated = parts.nominal, reading_errors(build_magnet(study), observation, parts, session)
     truth = finite_element_part(build_magnet(short_dipole(
-        array__rings=1, array__blocks_per_ring=8, mesh__meridian_size_m=0.01)), points, session, columns=False).nominal
+        array__rings=1, array__blocks_per_ring=8, mesh__meridian_size_m=0.01)), points, session,
+        columns=False).nominal
     assert np.mean(np.abs(part - truth).ravel() <= stated) > 0.95
     assert stated.max() < 0.3 * np.abs(part).max()
 

@@ -84,6 +84,18 @@ def polarization_of(source: magpylib.magnet.Cuboid) -> Floats:
     return source.orientation.apply(source.polarization)
 
 
+def sectors(cuboids: magpylib.Collection) -> magpylib.Collection:
+    """The blocks of `truth` as sectors that touch: a smoother field, and one that is larger."""
+    found = []
+    for source in cuboids.sources:
+        x, y, z = source.position
+        angle = np.degrees(np.arctan2(y, x))
+        found.append(magpylib.magnet.CylinderSegment(
+            dimension=(0.02, 0.04, 0.03, angle - 22.5, angle + 22.5), position=(0.0, 0.0, z),
+            polarization=polarization_of(source)))
+    return magpylib.Collection(*found)
+
+
 def measured(
     magnet_of: magpylib.Collection, generator: np.random.Generator, turn: Rotation, shift: Floats,
     mixing: Floats | None = None, noise: float = NOISE_T,
