@@ -56,6 +56,8 @@ angles = 10
 name = "bore"
 sigma_T = 1e-4
 """
+IN_VACUUM = STUDY.replace("recoil_permeability = 1.05", "recoil_permeability = 1.0")
+"""For what needs no finite elements."""
 
 
 @pytest.fixture
@@ -134,6 +136,7 @@ def test_infer_writes_everything(study, measured, tmp_path, capsys):
 
 def test_infer_with_a_second_map(study, measured, tmp_path, capsys):
     """Which is only predicted; its errors name its file."""
+    study.write_text(IN_VACUUM)
     out, other = tmp_path / "out", tmp_path / "other.csv"
     write_map(field_map(circle(0.02, 6), np.tile([0.55, 0.0, np.nan], (6, 1))), other)
     arguments = ["infer", str(study), "--measurements", str(measured), "--held-out", str(other),
@@ -151,7 +154,8 @@ def test_infer_with_a_second_map(study, measured, tmp_path, capsys):
 @pytest.fixture
 def table(study, tmp_path):
     """Three blocks of every slot, 1 % too weak, and different."""
-    study.write_text(STUDY.replace("dimension = 2", "dimension = 2\nprior.common_mode_sd = 0.01"))
+    study.write_text(
+        IN_VACUUM.replace("dimension = 2", "dimension = 2\nprior.common_mode_sd = 0.01"))
     blocks = build_magnet(read_study(study)).blocks
     volume = 0.05 * blocks[0].area
     rows = ["serial,type,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2,volume_m3"]
