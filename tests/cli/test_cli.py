@@ -154,8 +154,7 @@ def test_infer_with_a_second_map(study, measured, tmp_path, capsys):
 @pytest.fixture
 def table(study, tmp_path):
     """Three blocks of every slot, 1 % too weak, and different."""
-    study.write_text(
-        IN_VACUUM.replace("dimension = 2", "dimension = 2\nprior.common_mode_sd = 0.01"))
+    study.write_text(STUDY.replace("dimension = 2", "dimension = 2\nprior.common_mode_sd = 0.01"))
     blocks = build_magnet(read_study(study)).blocks
     volume = 0.05 * blocks[0].area
     rows = ["serial,type,mx_A_m2,my_A_m2,mz_A_m2,sigma_A_m2,volume_m3"]
@@ -184,6 +183,7 @@ def test_prior_of_measured_blocks(study, table, tmp_path, capsys):
 
 
 def test_infer_with_measured_blocks(study, table, measured, tmp_path, capsys):
+    study.write_text(IN_VACUUM)
     out = tmp_path / "out"
     arguments = ["infer", str(study), "--measurements", str(measured), "-o", str(out), "--json"]
     assert main([*arguments, "--blocks", str(table)]) == 0
