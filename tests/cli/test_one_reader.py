@@ -18,7 +18,10 @@ POINTS = np.column_stack([0.03 * np.cos(ANGLE), 0.03 * np.sin(ANGLE), 0 * ANGLE]
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A study without permeability, and the map of a uniform field with ten times the study's noise in a column."""
+    """A study without permeability, and the map of a uniform field.
+
+    A column has ten times the study's noise.
+    """
     folder = tmp_path_factory.mktemp("files")
     (folder / "study.toml").write_text(IN_VACUUM)
     field = np.column_stack([0 * ANGLE + 0.55, 0 * ANGLE, 0 * ANGLE])
