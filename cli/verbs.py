@@ -27,7 +27,7 @@ VERBS = {
     "register": "register", "report": "report",
     "export": "export", "field": "field",
     "cache": "cache", "doctor": "doctor", "schema": "schema", "completion": "completion"}
-"""Name of the module of each verb."""
+"""Name of the module of each verb; the first five are those that most people need."""
 
 LISTS = ("--columns", "--origin-m", "--axes")
 """Options whose values are lists that may begin with a minus."""
@@ -73,9 +73,11 @@ def parser(verbs: Collection[str] = tuple(VERBS)) -> argparse.ArgumentParser:
     Of all other verbs it has only the help text. Only the modules of ``verbs`` are imported,
     because some of them import large libraries.
     """
+    most = list(VERBS)[:5]
     codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
     top = Parser(
-        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
+        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays."
+        f"\n\nMost people need {', '.join(most[:-1])} and {most[-1]}.",
         epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
     top.add_argument("--version", action="version", version=version("halbach-fe"))
     subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
