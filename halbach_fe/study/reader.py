@@ -184,7 +184,9 @@ def _read_curve(curve: IronCurve | None, key: str, folder: Path, where: str) -> 
 
 
 def _sentence(error: ValidationError, where: str) -> str:
-    """Return one sentence about the first of pydantic's errors, and the number of the others."""
+    """Return one sentence about the first of pydantic's errors, or all keys that are missing, and
+    the number of the others.
+    """
     errors = error.errors(include_url=False)
     # An unknown key is the likeliest cause of the others: a misspelt key is also a missing key.
     errors.sort(key=lambda e: e["type"] != "extra_forbidden")
@@ -205,7 +207,10 @@ def _sentence(error: ValidationError, where: str) -> str:
             hint = f"`{name}` stands at the top of the file, above the first table."
         received = f"`{name}`"
     elif kind == "missing":
-        received, hint = "nothing", "Add the key."
+        missing = [f"`{_locate(one['loc'])[0]}`" for one in errors if one["type"] == "missing"]
+        errors = [first, *(one for one in errors if one["type"] != "missing")]
+        return must_be(", ".join(missing), where, expected, "nothing",
+                       f"Add the {'keys' if len(missing) > 1 else 'key'}.") + _more(errors)
     elif kind.startswith("union_tag"):  # pydantic locates the table, of which one key says its kind
         name = first["ctx"]["discriminator"].strip("'")
         key, received = f"{key}.{name}", sentences.received(value.get(name))

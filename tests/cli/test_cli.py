@@ -615,6 +615,7 @@ def is_running(process):
 
 def test_every_exit_code_is_documented():
     text = parser().format_help()
+    assert "Most people need new, explain, solve, infer and diagnose." in text
     page = (ROOT / "docs" / "reliability.md").read_text()
     for code, meaning in EXIT_CODES.items():
         assert f"{code:3d}  {meaning}" in text
