@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from halbach_fe.cli import common
-from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import InputFile
 
 if TYPE_CHECKING:
@@ -129,7 +129,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run what is needed, and join the pages."""
     from halbach_fe.cli import report
     from halbach_fe.explanation import follow
+    from halbach_fe.study.reader import read_study
 
+    if read_study(arguments.study).maps:
+        raise StudyError(must_be(
+            "`maps`", f"study {arguments.study}", "left out for explain, which takes one map",
+            "a list of maps", "Of maps that a study lists, run halbach-fe check, register, infer "
+            "and diagnose; they take all of them."))
     steps = _Explanation(arguments, arguments.study, arguments.map)
     follow(steps)
     common.say("")

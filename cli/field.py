@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import write_text
 from halbach_fe.core.tables import csv_text
 from halbach_fe.study.types import COMPONENTS
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--across-m", type=common.finite_number, nargs=2, default=(0.0, 0.0),
                         metavar=("U", "V"), help="half widths of a grid of parallel lines: of a "
                         "line along z those along x and y")
-    parser.add_argument("--lines", type=common.positive, default=5, metavar="N",
+    parser.add_argument("--lines", type=common.positive, metavar="N",
                         help="number of lines along each half width (default: 5)")
     parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
@@ -54,7 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.reader import read_study
 
-    offsets = tuple(np.linspace(-half, half, arguments.lines) if half else np.zeros(1)
+    if arguments.lines and not any(arguments.across_m):
+        raise StudyError(must_be("--lines", "the command line", "beside --across-m, the half "
+                                 "widths of the grid of lines", "given alone", "Add --across-m "
+                                 "U V, or leave it out."))
+    number = arguments.lines or 5
+    offsets = tuple(np.linspace(-half, half, number) if half else np.zeros(1)
                     for half in arguments.across_m)
     lines = Lines(np.array(arguments.from_m), np.array(arguments.to_m), (offsets[0], offsets[1]),
                   arguments.count)
@@ -95,7 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
         for axis in COMPONENTS], "Integrals of B along the middle line")
     if doubt:
         common.say(doubt)
-    common.say(f"Wrote {lines.points.shape[0]} lines of {lines.count} points: {folder}")
+    several = "1 line" if len(lines.points) == 1 else f"{len(lines.points)} lines"
+    common.say(f"Wrote {several} of {lines.count} points: {folder}")
     return 0
 
 

@@ -35,7 +35,7 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
     "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
     "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
-    "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"} | {
+    "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B", "b0": "B"} | {
     spelling.format(axis): name for axis, name in zip("xyz", FIELDS[:3], strict=True)
     for spelling in ("b0{}", "b{}re", "reb{}", "b{}real", "field{}", "{}field", "bfield{}", "mag{}",
                      "magneticfield{}", "fluxdensity{}", "magneticfluxdensity{}", "b{}mean",

@@ -430,7 +430,8 @@ def _missing(
                        "(--component abs), or that nobody knows (--component unknown: halbach-fe "
                        "register then tries all three)")
     elif not {*names.FIELDS, names.TOTAL} & set(used):
-        missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns)")
+        missing.append("which columns are Bx, By or Bz, Babs for |B|, or B for a component that "
+                       "nobody knows (--columns, in the last case with --component unknown)")
     half = {"Br", "Bphi"} - set(used)
     if len(half) == 1:
         missing.append(f"{half.pop()}, without which the other is no Bx or By (--columns)")
