@@ -107,6 +107,11 @@ class MapConvention:
         return tuple(found)
 
     @property
+    def is_only_elsewhere(self) -> bool:
+        """Whether it changes nothing but the radius of the points, or their place."""
+        return replace(self, radius=1.0, offset_m=0.0, shift_m=(0.0, 0.0, 0.0)).errors == ()
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Standard names of the errors."""
         return tuple(name for name, _ in self.errors)

@@ -221,7 +221,8 @@ def answer(diagnosis: Diagnosis) -> Answer:
         doubts.insert(0, _trust(diagnosis, sound))
     remedies = _remedies(diagnosis) if sound else []
     step = _next(diagnosis)
-    if (not sound or _unusual(diagnosis)) and (factor := diagnosis.before.common_factor):
+    factor = "" if diagnosis.gross_errors else diagnosis.before.common_factor
+    if factor and (not sound or _unusual(diagnosis)):
         found.insert(0, factor)
         step = ("Look at the unit, the sign and the factor of the readings and at the remanence "
                 "first, correct the map or the study, and diagnose again.", _again(diagnosis))
