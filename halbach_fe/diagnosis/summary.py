@@ -285,7 +285,8 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
         found.append(OtherFinding(
             " and ".join(error.names), error.convention.text, "gross error",
             f"misfit {100 * error.misfit_before:.3g} % → {100 * error.misfit_after:.2g} %",
-            f"Gross error: {error.text}.{_or_a_factor(error)}", EMPTY_CELL if error.map is None else f"map {error.map}",
+            f"Gross error: {error.text}.{_or_a_factor(error)}",
+            EMPTY_CELL if error.map is None else f"map {error.map}",
             instead=", ".join(dict.fromkeys(instead)) or EMPTY_CELL))
     for pose in diagnosis.poses:
         others = "" if not pose.others else (
