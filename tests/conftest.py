@@ -116,6 +116,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("quick")
 
 
+def pytest_collection_finish() -> None:
+    """Leave what was imported and collected out of garbage collections, which took 7 % of the time,
+    and collect after ten thousand new objects in place of 700.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000)
+
+
 def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """A copy with some keys changed; ``array__rings=2`` goes one level down."""
     result = copy.deepcopy(document)
