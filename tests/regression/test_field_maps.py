@@ -17,8 +17,8 @@ CHANGES = (
     {"array__first_magnetization_angle_deg": 183.0}, {"array__inner_radius_m": 0.108},
     {"array__multipole_order": 2}, {"array__block": {"shape": "sector", "angular_gap_deg": 1.0}})
 TRIED = {"dipole_3d_direct": (), "dipole_3d_reaction": CHANGES[1:5]}
-"""Of the changes. Those of the direct field are told by the reaction, gaps, slow in 3D, by sections,
-and a remanence, to which both are proportional, without another solve."""
+"""Of the changes. Those of the direct field are told by the reaction, gaps, slow in 3D, by
+sections, and a remanence, to which both are proportional, without another solve."""
 
 
 def stored(name):
