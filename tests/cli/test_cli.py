@@ -226,7 +226,7 @@ def test_doctor(capsys):
 
 
 def test_doctor_can_fail(monkeypatch, capsys):
-    monkeypatch.setattr("halbach_fe.cli.doctor.TOLERANCE", {"reaction": 1e-9})
+    monkeypatch.setattr("halbach_fe.cli.shell.TOLERANCE", {"reaction": 1e-9})
     assert main(["doctor"]) == 9
     assert "differs from the closed form" in capsys.readouterr().err
 
@@ -615,6 +615,7 @@ def is_running(process):
 
 def test_every_exit_code_is_documented():
     text = parser().format_help()
+    assert "Most people need new, explain, solve, infer and diagnose." in text
     page = (ROOT / "docs" / "reliability.md").read_text()
     for code, meaning in EXIT_CODES.items():
         assert f"{code:3d}  {meaning}" in text
