@@ -165,6 +165,7 @@ def own_folder(
     # a map that needs options is not known by its path alone
     named = {word: path for word, path in _given(arguments).items() if path in inputs
              and not (word == "MAP" and describes_a_format(arguments))}
+    arguments.owns_folder = True
     arguments.at_end.enter_context(result_folder(
         arguments.output, command or f"halbach-fe {arguments.verb}", study, inputs, named, solving))
     arguments.at_end.enter_context(known_paths({
@@ -457,9 +458,14 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def finish(arguments: argparse.Namespace, page: Page) -> int:
-    """Write the files of a result, and print it as JSON, or its tables and its answer; return 0."""
+    """Write the files of a result, and print it as JSON, or its tables and its answer; return 0.
+
+    A verb that has not taken its folder yet does so now, by `own_folder`.
+    """
     from halbach_fe.report.page import write_files
 
+    if arguments.output is not None and not getattr(arguments, "owns_folder", False):
+        own_folder(arguments, page.study.name if page.study is not None else "")
     path = None if arguments.output is None else write_files(
         page, arguments.output, getattr(arguments, "study", None))
     if arguments.json:

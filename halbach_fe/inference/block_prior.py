@@ -22,6 +22,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import poisson
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
@@ -622,7 +623,9 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
     of_type = np.flatnonzero(np.array(table.type) == label)
     moments = table.moment[of_type]
     _, first = np.unique(moments, axis=0, return_index=True)
-    if len(first) < len(moments):
+    rare = 1e-3  # probability of as many equal moments by rounding alone
+    if len(first) < len(moments) and poisson.sf(
+            len(moments) - len(first) - 1, _equal_by_rounding(moments, table.moment)) < rare:
         again = int(np.setdiff1d(np.arange(len(moments)), first)[0])
         same = int(np.flatnonzero((moments == moments[again]).all(axis=1))[0])
         raise MeasurementError(must_be(
@@ -630,6 +633,20 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
             f"{len(moments) - len(first)} with the moment of another one, digit for digit, such as "
             f"{table.serial[of_type[again]]} and {table.serial[of_type[same]]}",
             "Leave the copies out."))
+
+
+def _equal_by_rounding(moments: Floats, every: Floats) -> float:
+    """Return how many pairs of different samples (n, 3) are expected to have the same moment.
+
+    Two normal samples that are rounded to steps q agree with a probability q / (2 sqrt(pi) sd). The
+    steps are the smallest differences between the moments (m, 3) of ``every`` type.
+    """
+    probability = 1.0
+    for values, others in zip(moments.T, every.T, strict=True):
+        distinct = np.unique(others)
+        step = float(np.diff(distinct).min()) if len(distinct) > 1 else np.inf
+        probability *= min(1.0, step / (2 * np.sqrt(np.pi) * max(values.std(), 1e-300)))
+    return probability * len(moments) * (len(moments) - 1) / 2
 
 
 OF_OTHER_RINGS = (

@@ -636,6 +636,15 @@ def test_copies_of_a_sample_are_none(vacuum_dipole, generator):
     moment[second] = moment[first]
     with pytest.raises(MeasurementError, match="1 with the moment of another one"):
         prior_from_blocks(build_magnet(study), replace(table, moment=moment))
+    # of a coil that shows few digits, many blocks have equal moments
+    slots, _, truth = blocks_and_truth(study, generator, copies=50)
+    table = table_of(study, slots, truth)
+    coarse = table.moment[:, 2].std() / 3
+    rounded = replace(table, moment=np.round(table.moment / coarse) * coarse)
+    assert len(np.unique(rounded.moment, axis=0)) < len(rounded.moment)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # steps are no normal distribution
+        prior_from_blocks(build_magnet(study), rounded)
 
 
 def test_a_component_that_was_not_measured(vacuum_dipole, generator):
