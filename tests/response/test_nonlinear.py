@@ -272,7 +272,7 @@ def test_saturating_ring_in_3d_against_ngsolve(getdp, tmp_path):
     study = parse_study(changed(
         DIPOLE, **alike(0.0, 8), dimension=3, array__blocks_per_ring=8, array__ring_length_m=0.1,
         iron_ring={**THIN, "outer_radius_m": 0.205}, solver={"route": "scalar_potential"},
-        mesh={"block_size_m": 0.07, "layers_per_ring": 2, "growth": 2.0},
+        mesh={"block_size_m": 0.07, "layers_per_ring": 2, "growth": 1.7},
         open_boundary={"radius_m": 1.0, "half_length_m": 1.0}))
     points = np.vstack([circle(0.06, 8, z, 0.2 + z) for z in (0.0, 0.04, 0.09)])
     session = Session(getdp, tmp_path, jobs=2)
