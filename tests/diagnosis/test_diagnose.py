@@ -180,6 +180,7 @@ def test_whole_blocks_beside_a_wrong_calibration_of_the_coil(session, generator,
     found = diagnose(STUDY, data, session, table, effects=some)
     (named,) = found.identified
     assert named.hypothesis.effect.name == name
+    assert found.unknown is None
     block = blocks[number]
     assert (block.ring, block.slot) in [
         (named.hypothesis.place.ring, named.hypothesis.place.slot), named.hypothesis.place.other]

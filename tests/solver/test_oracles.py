@@ -65,7 +65,7 @@ RINGS = {"iron_ring": IRON, "mesh": {"block_size_m": 0.04, "layers_per_ring": 3,
 """As coarse as the caps of the routes allow; smaller elements halve no error here, but take twice
 the time."""
 NUMBER = 21
-POINTS = np.vstack([circle(0.035, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
+POINTS = np.vstack([circle(0.05, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
 
 
 @pytest.fixture(scope="module")

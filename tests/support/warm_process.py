@@ -7,6 +7,7 @@ changes or exports reaches another.
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import sys
@@ -57,6 +58,8 @@ def run_warm(code: str | list[str], folder: Path, environment: Mapping[str, str]
 def _run(code: str | list[str], folder: Path, environment: dict[str, str], stdout: Path,
          stderr: Path) -> None:
     """Become a process as the shell would start it, and run; never return."""
+    gc.freeze()  # as in `tests.conftest`
+    gc.set_threshold(10_000)
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)

@@ -394,7 +394,7 @@ def arrays(draw):
     return array
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(array=arrays())
 def test_fields_of_random_magnets(array):
     """In vacuum, to 1e-9 of the main field or magpylib's rounding; the remanence is some 1 T.
