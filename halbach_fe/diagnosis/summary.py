@@ -402,7 +402,8 @@ def diagnosis_summary(
         "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
         "vibration": _vibration_entry(diagnosis.position_noise),
         "suspected": [_suspicion(one) for one in diagnosis.suspected],
-        "imitated": asdict(diagnosis.imitated) if diagnosis.imitated else None,
+        "imitated": {key: getattr(diagnosis.imitated, key) for key in (
+            "probability", "effects", "shares")} if diagnosis.imitated else None,
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
         "groups": {"before": _groups(diagnosis.groups_before),

@@ -109,7 +109,7 @@ def _trust(check: MapCheck) -> str:
             f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
             "either the field is steeper there than the lines show, as near edges of magnets, or "
             "these readings are wrong. An update of the magnet tells which."
-            + (" DIR/inner_map.csv is the map without them."
+            + (" inner_map.csv beside this page is the map without them."
                if np.isfinite(reach.limit_m) else ""))
     return trust
 
