@@ -374,7 +374,7 @@ def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path
     assert wrong[0].doubts
     assert not said.sound
     assert said.trust.startswith("No")
-    assert "times the field" not in said.trust  # a factor in a place where the map is not
+    assert "times the field" not in said.trust  # that of another component elsewhere
     assert "--component unknown" in said.step
     # a better chi-squared would not make it right
     pretended = [replace(each, chi2=1.0, at_rest=True) for each in wrong]
