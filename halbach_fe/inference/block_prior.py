@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import poisson
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD, decimals
@@ -129,6 +130,7 @@ class MeasuredPrior:
         return sum(len(samples.deviations) for samples in self.types)
 
 
+@typed
 def prior_from_blocks(magnet: Magnet, table: BlockTable) -> MeasuredPrior:
     """Turn a table of measured blocks into the prior of a study.
 

@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD
-from halbach_fe.core.pace import Pace, Progress
+from halbach_fe.core.pace import Pace, Progress, duration
 from halbach_fe.measurement.doubted_terms import doubted_from
 from halbach_fe.measurement.field_map import (
     check_magnitudes,
@@ -410,7 +410,11 @@ def check_map(
     >>> hf.check_map(field_map(points, field)).suffices
     True
     """
+    many_rows = 20_000  # whose neighbours are compared in some seconds
     data = _checkable(data)
+    if data.sizes["point"] > many_rows:
+        say(f"comparing each of {data.sizes['point']} rows with its neighbours: some "
+            f"{duration(data.sizes['point'] / many_rows * 5)}")
     scan, usable, broken = scan_of(data)
     lines = scan_lines(scan.points)
     rows = _Rows(lines, usable, usable & some_lines(lines, usable))

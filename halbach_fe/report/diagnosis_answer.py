@@ -223,9 +223,10 @@ def answer(diagnosis: Diagnosis) -> Answer:
         doubts.insert(0, _trust(diagnosis, sound))
     remedies = _remedies(diagnosis) if sound else []
     step = _next(diagnosis)
-    factor = "" if diagnosis.gross_errors else diagnosis.before.common_factor
-    if factor and (not sound or _unusual(diagnosis)):
-        found.insert(0, factor)
+    gross = diagnosis.gross_errors  # which says itself whether a factor explains the map as well
+    factor = "" if gross else diagnosis.before.common_factor
+    if (factor or any(one.factor for one in gross)) and (not sound or _unusual(diagnosis)):
+        found = [factor] * bool(factor) + found
         step = ("Look at the unit, the sign and the factor of the readings and at the remanence "
                 "first, correct the map or the study, and diagnose again.", _again(diagnosis))
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(

@@ -74,6 +74,8 @@ def answer(found: HomogeneityResult) -> Answer:
         f" (95 %: {low} to {high})")
     text = (f"The mean of |B| is {_field(best)}; |B| deviates from it by {ppm(best.rms_ppm)} ppm "
             f"rms{likely} and {ppm(best.peak_to_peak_ppm)} ppm peak to peak")
+    if name == "prior" and not _cancels(best):
+        text += " if all blocks are as ordered"
     text += _of_map(found)
     if _cancels(best):
         return Answer(
@@ -102,7 +104,7 @@ def answer(found: HomogeneityResult) -> Answer:
                "and the posterior.h5 that this command writes into its DIR:",
                "halbach-fe infer STUDY --measurements MAP -o DIR")
     return Answer(
-        question, f"{text} if all blocks are as ordered. Of magnets whose blocks vary as the study "
+        question, f"{text}. Of magnets whose blocks vary as the study "
         f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
         f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
         *(better or measure), small, numbers=numbers)

@@ -183,9 +183,18 @@ def _doubts(best: Registration) -> list[str]:
     if not best.doubts:
         return []
     factor = factor_in_words(best.factor, best.likeness)
-    if _are_alike(best) and not (best.explains or known_factor(best.factor)):
+    if _are_alike(best) and not _is_a_factor(best):
         factor = ""  # where no pose explains the map, a factor is that of a wrong place
     return [each for each in (doubts_in_words(best.doubts), factor) if each]
+
+
+def _is_a_factor(best: Registration) -> bool:
+    """Tell whether readings are those of the nominal magnet but for a factor.
+
+    A single component under a wrong name is like some other one in some other place.
+    """
+    return best.explains or (_are_alike(best) and len(_measured(best)) > 1
+                             and bool(known_factor(best.factor)))
 
 
 def _are_alike(best: Registration) -> bool:
@@ -195,8 +204,7 @@ def _are_alike(best: Registration) -> bool:
 
 def _is_of_the_file(best: Registration) -> bool:
     """Tell whether doubts are about what the file says of its numbers, not about the magnet."""
-    of_a_factor = _are_alike(best) and bool(known_factor(best.factor))
-    return bool(best.doubts) and (best.explains or of_a_factor or len(_measured(best)) == 1)
+    return bool(best.doubts) and (_is_a_factor(best) or len(_measured(best)) == 1)
 
 
 def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
@@ -206,8 +214,7 @@ def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
         return (f"Is the component really B{_measured(best)[0]}, along the map's own axes? If that "
                 f"is not certain, name its column {UNDIRECTED_COLUMN} (import-map: --component "
                 "unknown), and register finds which one it is.", again)
-    if _are_alike(best) and factor_in_words(best.factor) and (
-            best.explains or known_factor(best.factor)):
+    if _are_alike(best) and factor_in_words(best.factor) and _is_a_factor(best):
         return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
                 "instrument.flux_density_unit_T in the study), and register it again.", again)
     return ("Look whether rows, axes, components and units of the map are what its columns say "

@@ -227,11 +227,13 @@ def test_half_a_field_weakens_the_blocks(generator, tmp_path):
     right = infer(magnet, quadrupole_map(generator, 1.0), Session.open(tmp_path / "j"))
     assert right.doubts == ()
     assert "ordered" not in inference_answer(right).trust
-    # so does diagnose, first of all, though one sensor's gain is all that is looked for
+    assert "(half)" in result.common_factor
+    assert right.common_factor == ""
+    # so does diagnose beside a smaller radius, though one sensor's gain is all that is looked for
     of_half, of_all = (diagnosis_answer(diagnose(
         magnet, quadrupole_map(generator, factor), Session.open(tmp_path / f"d{factor}"),
         effects=["gain_x"])) for factor in (0.5, 1.0))
-    assert of_half.said.startswith("The readings are 0.5")
+    assert "Or, as well: the readings are" in of_half.said
     assert "times the field expected of the magnet (half)" in of_half.said
     assert "unit, the sign and the factor" in of_half.step
     assert not of_half.sound
@@ -372,7 +374,7 @@ def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path
     assert wrong[0].doubts
     assert not said.sound
     assert said.trust.startswith("No")
-    assert "times the field" not in said.trust  # a factor in a place where the map is not
+    assert "times the field" not in said.trust  # that of another component elsewhere
     assert "--component unknown" in said.step
     # a better chi-squared would not make it right
     pretended = [replace(each, chi2=1.0, at_rest=True) for each in wrong]
