@@ -222,8 +222,14 @@ def answer(diagnosis: Diagnosis) -> Answer:
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
     remedies = _remedies(diagnosis) if sound else []
+    step = _next(diagnosis)
+    factor = "" if diagnosis.gross_errors else diagnosis.before.common_factor
+    if factor and (not sound or _unusual(diagnosis)):
+        found.insert(0, factor)
+        step = ("Look at the unit, the sign and the factor of the readings and at the remanence "
+                "first, correct the map or the study, and diagnose again.", _again(diagnosis))
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(
-        diagnosis, sound), *_next(diagnosis), sound, "" if not remedies else (
+        diagnosis, sound), *step, sound, "" if not remedies else (
             f"The magnet was not assembled as designed: {in_a_row(remedies)}, or use "
             f"{STUDY_FILE}, which describes it with these errors."),
         diagnosis.found_anything, numbers=distances(diagnosis.before, diagnosis.after))
@@ -251,12 +257,18 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     return f"No: {chi2}."
 
 
+def _again(diagnosis: Diagnosis) -> str:
+    """Return the command that diagnoses again."""
+    maps = "" if diagnosis.before.is_campaign else " --measurements MAP"
+    return f"halbach-fe diagnose STUDY{maps} -o DIR"
+
+
 def _next(diagnosis: Diagnosis) -> tuple[str, str]:
     """Return the next step, and its command."""
     campaign = diagnosis.before.is_campaign
     maps = "" if campaign else " --measurements MAP"
     infer = f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR"
-    again = f"halbach-fe diagnose STUDY{maps} -o DIR"
+    again = _again(diagnosis)
     if diagnosis.solver_error:
         return "Refine `mesh` or move `open_boundary` outwards, and diagnose again.", again
     if diagnosis.unknown is not None:
@@ -472,9 +484,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
         sentences.append(
             f"{in_a_row(sources).capitalize()} may be how the neighbouring magnet differs from a "
             "copy of this one, which its model is.")
-    unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
-               for effect in diagnosis.identified
-               if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
+    unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} "
+               f"({_over_prior_sd(effect):.0f} times)" for effect in _unusual(diagnosis)]
     if unusual:
         sentences.append(
             "Far larger than usual (relative to the prior's standard deviation): "
@@ -527,6 +538,11 @@ def _over_prior_sd(identified: IdentifiedEffect) -> float:
     first = int(effect.is_binary or effect.applied_in_full)
     return max((abs(value) / parameter.sd for value, parameter in zip(
         identified.values[first:], identified.parameters[first:], strict=True)), default=0.0)
+
+
+def _unusual(diagnosis: Diagnosis) -> list[IdentifiedEffect]:
+    """Return the effects that are far larger than their priors expect."""
+    return [each for each in diagnosis.identified if _over_prior_sd(each) > UNUSUAL_AMPLITUDE]
 
 
 def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:
