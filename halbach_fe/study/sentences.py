@@ -223,7 +223,7 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
             advice = f"Add the key, as one of {', '.join(map(repr, tags))}."
     elif kind == "model_type" and isinstance(value, list) and all(
             isinstance(one, dict) for one in value):
-        hint = f"Write [{key}] for [[{key}]], and all keys in that one table."
+        advice = f"Write [{key}] for [[{key}]], and all keys in that one table."
     elif kind == "tuple_type" and isinstance(value, dict) and _holds_tables(model, first["loc"]):
         advice = f"Write [[{key}]] for [{key}], and once more for each further one."
     else:
