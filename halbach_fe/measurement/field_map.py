@@ -446,8 +446,9 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
     except MeasurementError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
-                                       f"'{error}'")) from None
+        raise MeasurementError(must_be(
+            "content", where, "a VTU file with point data `B_T` (n, 3)", f"'{error}'",
+            "Save files of other programs as CSV, in ParaView by Save Data.")) from None
     return data
 
 

@@ -182,8 +182,10 @@ def _doubts(best: Registration) -> list[str]:
     """Say what lies far from its prior, and what a common factor of the readings tells."""
     if not best.doubts:
         return []
-    return [each for each in (doubts_in_words(best.doubts),
-                              factor_in_words(best.factor, best.likeness)) if each]
+    factor = factor_in_words(best.factor, best.likeness)
+    if _are_alike(best) and not (best.explains or known_factor(best.factor)):
+        factor = ""  # where no pose explains the map, a factor is that of a wrong place
+    return [each for each in (doubts_in_words(best.doubts), factor) if each]
 
 
 def _are_alike(best: Registration) -> bool:
@@ -204,7 +206,8 @@ def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
         return (f"Is the component really B{_measured(best)[0]}, along the map's own axes? If that "
                 f"is not certain, name its column {UNDIRECTED_COLUMN} (import-map: --component "
                 "unknown), and register finds which one it is.", again)
-    if _are_alike(best) and factor_in_words(best.factor):
+    if _are_alike(best) and factor_in_words(best.factor) and (
+            best.explains or known_factor(best.factor)):
         return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
                 "instrument.flux_density_unit_T in the study), and register it again.", again)
     return ("Look whether rows, axes, components and units of the map are what its columns say "

@@ -44,11 +44,12 @@ class _OfKeys(type(StudyModel)):  # type: ignore[misc]
 
     def __call__(cls, *arguments: Any, **keys: Any) -> Any:
         """Return the study of keys and tables; raise StudyError if there is no such study."""
-        from halbach_fe.study.reader import parse_study  # which imports this module
-
         if arguments:
             raise StudyError(must_be("arguments", "Study", "keys of a study by name", "others"))
-        return parse_study(keys)
+        try:
+            return super().__call__(**keys)
+        except ValidationError as error:
+            raise StudyError(sentences.sentence(error, "study", cls)) from None
 
 
 class Study(StudyModel, metaclass=_OfKeys):

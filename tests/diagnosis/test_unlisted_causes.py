@@ -33,7 +33,7 @@ SLOW = ("iron_ring", "iron_saturation", "neighbour_magnet")
 """Effects whose signatures take long, and which no test here needs."""
 
 SOME = [effect for effect in catalogue() if effect.name not in SLOW]
-UNLISTED = {1: ("readings", "z", "smooth"), 2: ("positions", "angle", "rough"),
+UNLISTED = {2: ("positions", "angle", "rough"),
             3: ("readings", "field", "smooth"), 4: ("source", "loop", "smooth")}
 """Seeds, and the family of the cause."""
 

@@ -37,24 +37,21 @@ def in_vacuum():
     mesh = oracle.eighth(dipole_of(study), 0.04)
     with ngsolve.TaskManager():
         return InVacuum(study, points, mesh, oracle.vector_potential_field(
-            dipole_of(study), mesh, 3, points, real=False, residual=1e-7))
+            dipole_of(study), mesh, 3, points, real=False, residual=1e-5))
 
 
-@pytest.mark.parametrize("with_iron", [True, False], ids=["iron", "air"])
-def test_full_array_against_the_vector_potential_in_3d(session, in_vacuum, with_iron):
+def test_full_array_against_the_vector_potential_in_3d(session, in_vacuum):
     """The whole FASER dipole, fringe included, with mu_r = 1.05 and an iron tube, in units of its
-    main field of 0.57 T. Coarse here: 2.6e-4 with iron, 2.3e-4 without, rms 4e-5 and 3e-5;
-    NGSolve's finer meshes and orders bring it down to 3.3e-5 (`make benchmark`).
+    main field of 0.57 T. Coarse here: 2.6e-4, rms 4e-5; NGSolve's finer meshes and orders bring it
+    down to 3.3e-5 (`make benchmark`). `tests/synthetic/test_fields.py` has magnets without iron.
     """
     study, points = in_vacuum.study, in_vacuum.points
-    if not with_iron:
-        study = study.with_(iron_ring=None)
     shifted = points + np.array([0, 0, 0.01])
     ours, moved = np.split(finite_element_part(
         build_magnet(study), np.vstack([points, shifted]), session, columns=False).nominal, 2)
     with ngsolve.TaskManager():
         theirs = oracle.vector_potential_field(
-            dipole_of(study), in_vacuum.mesh, 3, points, residual=1e-7) - in_vacuum.field
+            dipole_of(study), in_vacuum.mesh, 3, points, residual=1e-5) - in_vacuum.field
     main_field = 0.57
     assert np.linalg.norm(ours - theirs, axis=1).max() < 7e-4 * main_field
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < 1e-4 * main_field
@@ -68,7 +65,7 @@ RINGS = {"iron_ring": IRON, "mesh": {"block_size_m": 0.04, "layers_per_ring": 3,
 """As coarse as the caps of the routes allow; smaller elements halve no error here, but take twice
 the time."""
 NUMBER = 21
-POINTS = np.vstack([circle(0.05, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
+POINTS = np.vstack([circle(0.035, 9, z, 0.2 + z) for z in (-0.12, -0.03, 0.05, 0.11)])
 
 
 @pytest.fixture(scope="module")
