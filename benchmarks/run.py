@@ -19,6 +19,7 @@ from benchmarks import (
     campaign_kinds,
     design,
     diagnosis,
+    front,
     inference,
     iron3d,
     moments,
@@ -44,13 +45,15 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "suspicion": suspicion.run,
          "campaign_kinds": campaign_kinds.run, "campaign_knee": campaign_kinds.run_knee,
          "real": real.emphatic, "overlap": real.overlap, "real_mri": real.mri, "faser": real.faser,
-         "design": design.run, "mri": mri.run, "speed": speed.run, "speed_small": speed.small,
+         "design": design.run, "mri": mri.run, "first_field": front.first_field,
+         "no_root": front.no_root, "speed": speed.run, "speed_small": speed.small,
          "speed_full": speed.full, "speed_permeability": speed.permeability,
          "speed_solvers": speed.solvers, "speed_waiting": speed.waiting}
 ALONE = ("recovery", "scaling", "moments", "iron3d", "calibration", "check", "joined", "overlap",
          "unknown", "suspicion",
          "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
-         "design", "mri", "speed", "speed_small", "speed_full", "speed_permeability",
+         "design", "mri", "first_field", "no_root", "speed", "speed_small", "speed_full",
+         "speed_permeability",
          "speed_solvers", "speed_waiting")
 """Parts that are measured only when they are named: they take long."""
 

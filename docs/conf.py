@@ -1,7 +1,8 @@
 """Sphinx settings.
 
-The reference is written from the code before every build. The table of contents stands here and not
-in index.md, which is read on GitHub too, where a directive would be shown as text.
+The reference is written from the code before every build, and the examples as notebooks after it.
+The table of contents stands here and not in index.md, which is read on GitHub too,
+where a directive would be shown as text.
 """
 
 import re
@@ -12,7 +13,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 from docutils import nodes
-from generate import write_reference
+from generate import write_notebooks, write_reference
 from latex2mathml.converter import convert
 
 project = "halbach-fe"
@@ -42,8 +43,9 @@ CONTENTS = {
         "ring", "quadrupole", "mri", "magpylib", "iron", "undulator", "check", "register", "infer",
         "diagnose", "forces", "corner", "tolerance", "shim"))),
     "Gallery": ("gallery", *(f"gallery/{study}" for study in (
-        "faser", "linear-3d", "nonlinear-2d", "quadrupole", "cubes", "mri", "mandhala", "mri4all",
-        "mri-large", "emphatic", "hybrid-quadrupole", "sensitivity", "calibration", "diagnosis"))),
+        "paper", "faser", "linear-3d", "nonlinear-2d", "quadrupole", "cubes", "mri", "mandhala",
+        "mri4all", "mri-large", "emphatic", "hybrid-quadrupole", "sensitivity", "calibration",
+        "diagnosis"))),
     "How to": ("how-to/describe-your-magnet", "how-to/own-geometry", "how-to/own-steel",
                "how-to/own-effect", "how-to/own-map", "how-to/next-magnet", "how-to/many-cores",
                "how-to/cluster"),
@@ -73,6 +75,13 @@ def add_contents(app, page, source):
             for caption, pages in CONTENTS.items())
 
 
+def offer_notebook(app, page, source):
+    """Let a page that is a notebook end with a link to it, see `write_notebooks`."""
+    if page.startswith("examples/"):
+        name = f"{page.partition('/')[2]}.ipynb"
+        source[0] += f'\n\n<a href="{name}" download>Download this page as a notebook</a>\n'
+
+
 def escape_bars(app, what, name, obj, options, lines):
     """Keep reStructuredText from taking the bars of an absolute value for a substitution."""
     lines[:] = [line if line.lstrip().startswith((">>>", "...")) else "".join(
@@ -84,5 +93,8 @@ def setup(app):
     """Connect what writes the reference, adds the table of contents and draws formulas."""
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("source-read", add_contents)
+    app.connect("source-read", offer_notebook)
+    app.connect("build-finished", lambda app, error: write_notebooks(
+        Path(app.srcdir) / "examples", Path(app.outdir) / "examples"))
     app.connect("autodoc-process-docstring", escape_bars, priority=900)  # after napoleon
     app.connect("builder-inited", lambda app: write_reference(Path(app.srcdir) / "reference"))

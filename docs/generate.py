@@ -1,4 +1,4 @@
-"""Write the reference from the code: keys of a study, commands, the Python API."""
+"""Write the reference from the code: keys of a study, commands, the Python API. Write notebooks."""
 
 from __future__ import annotations
 
@@ -20,6 +20,18 @@ MODULES = (
     "diagnosis.diagnose", "diagnosis.result", "diagnosis.evidence", "diagnosis.model_selection",
     "diagnosis.effects.base")
 """Modules documented after the API, in the order of the rooms."""
+
+
+def write_notebooks(source: Path, folder: Path) -> None:
+    """Write the pages of a folder that are notebooks in text as files of Jupyter."""
+    import nbformat  # of the extra docs
+    from myst_nb.core.read import read_myst_markdown_notebook
+    from myst_parser.config.main import MdParserConfig
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for page in source.glob("*.md"):
+        notebook = read_myst_markdown_notebook(page.read_text(encoding="utf-8"), MdParserConfig())
+        nbformat.write(notebook, folder / f"{page.stem}.ipynb")
 
 
 def write_reference(folder: Path) -> None:

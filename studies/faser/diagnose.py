@@ -266,8 +266,9 @@ def answer_page(best: Answer, found: list[str], published: PublishedErrors,
                 quick: bool) -> PageAnswer:
     """Return the answer of the page; ``found`` is what `sentences` says."""
     asked, said = "What does the published profile of the FASER dipole show?", found[0]
-    step = ("For your own map, describe its magnet in the file that halbach-fe new writes, and run:"
-            if quick else "Read what is left, and the further pages below.")
+    step = ("For a map of your own: `halbach-fe new study.toml` writes a file in which to describe "
+            "its magnet, then:" if quick else "Read what is left, and the further pages below.")
+    own = "halbach-fe explain study.toml map.csv -o results"  # no STUDY, which is this one
     if best.hypothesis.pose is ON_THE_AXIS:
         return PageAnswer(asked, said, " ".join(found[1:]), step)
     array = best.registration.study.array
@@ -284,12 +285,12 @@ def answer_page(best: Answer, found: list[str], published: PublishedErrors,
         trust.append("The search for the line ended before it came to rest, so that the line may "
                      "lie farther from the place given here than the error bars say.")
     return PageAnswer(
-        asked, said, " ".join(trust), step, "halbach-fe explain STUDY MAP -o DIR" if quick else "",
+        asked, said, " ".join(trust), step, own if quick else "",
         sound=sound,
         gist="It is not that of the axis, as published: it is that of a line "
         f"{1e3 * radius:.0f} mm beside the axis of a magnet "
         f"{array.rings * array.ring_length_m:.3g} m long.",
-        numbers=(("median error in the fringe, in the paper and here",
+        numbers=(("median relative error in the fringe, in the paper and here",
                   f"{paper:.2f} → {here:.3f}"),))
 
 

@@ -153,6 +153,18 @@ def built(tmp_path_factory):
     return folder
 
 
+def test_examples_are_offered_as_notebooks(built):
+    """With the cells that `test_every_example_runs` runs."""
+    for example in EXAMPLES:
+        assert f'href="{example.stem}.ipynb"' in (
+            built / "examples" / f"{example.stem}.html").read_text(encoding="utf-8")
+        notebook = json.loads((built / "examples" / f"{example.stem}.ipynb").read_text())
+        cells = ["".join(cell["source"]).strip() for cell in notebook["cells"]
+                 if cell["cell_type"] == "code"]
+        assert cells == [cell.strip() for cell in CELL.findall(
+            example.read_text(encoding="utf-8"))]
+
+
 def test_reference_has_all_keys_and_verbs(built):
     study = (built / "reference" / "study.html").read_text(encoding="utf-8")
     assert all(f">{key}<" in study for key in Study.model_fields)
