@@ -79,7 +79,7 @@ def floor_of(path: Path, data: xr.Dataset) -> dict[str, float]:
 
     try:
         found = json.loads(path.read_text("utf-8"))
-        floor = [float(value) for value in found["floor_T"]]
+        floor = [0.0 if value is None else float(value) for value in found["floor_T"]]
         maps = set(found["maps_sha256"].values())
     except OSError as error:
         raise MeasurementError(must_be("file --check", str(path), "a readable file",
@@ -94,7 +94,8 @@ def floor_of(path: Path, data: xr.Dataset) -> dict[str, float]:
         raise MeasurementError(must_be(
             "file --check", str(path), "that of the map that is diagnosed", "that of another map",
             "Run `halbach-fe check` with this map."))
-    return {f"B{name}": value for name, value in zip(COMPONENTS, floor, strict=True)}
+    return {f"B{name}": value for name, value, own in zip(
+        COMPONENTS, floor, found["floor_T"], strict=True) if own is not None}
 
 
 def floors_of(
