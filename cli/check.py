@@ -8,7 +8,8 @@ check.csv (the residual of every reading), check.html and its figures, oriented_
 map without broken rows and with its components along the right axes, inner_map.csv, its region that
 a field without sources describes, if it is not all, and corrected_map.csv, what a probe without
 errors would have read. A map of one or two components is judged by what these show. Of a map of
-|B| alone only rows that are broken, repeated places and noise are checked, and the folder has check.json and check.html.
+|B| alone only rows that are broken, repeated places and noise are checked, and the folder has
+check.json and check.html.
 
 Several maps of one magnet are checked one by one and then joined: their relative poses follow from
 where they overlap and from one field without sources for all, no magnet is assumed. Maps that
