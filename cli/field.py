@@ -2,8 +2,9 @@
 
 The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With --posterior
 the bars are those of the measured magnet, otherwise those of the study's prior. With --inside
-points may lie inside blocks. Writes field.csv and integrals.csv, and for a grid of lines
-kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
+points may lie inside blocks and iron. Writes field.csv, field_map.csv (B as a map, which halbach-fe
+export turns into other formats) and integrals.csv, and for a grid of lines kick_map.txt in the text
+format of Radia, with kicks in T^2 m^2.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--posterior", type=common.input_file, metavar="H5",
                         help="posterior.h5 that halbach-fe infer wrote for this study")
     parser.add_argument("--inside", action="store_true",
-                        help="points may lie inside blocks")
+                        help="points may lie inside blocks and iron")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.same_magnet import disagreement_of
     from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.measurement.field_map import field_map, write_map
     from halbach_fe.report.words import with_error
     from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.reader import read_study
@@ -64,6 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
         found = field(magnet, lines, session, read, arguments.inside)
     folder = arguments.output
     write_text(folder / "field.csv", csv_text(_points(found)))
+    write_map(field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
+        "study": magnet.name}), folder / "field_map.csv")
     grid = np.meshgrid(*offsets, indexing="ij")
     columns: dict[str, Floats] = {"u_m": grid[0].ravel(), "v_m": grid[1].ravel()}
     for order, unit in ((1, "T_m"), (2, "T_m2")):

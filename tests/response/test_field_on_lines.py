@@ -238,6 +238,9 @@ def test_command(tmp_path, capsys):
     assert float(row["sd_Bx_T"]) > 0
     text = (tmp_path / "out/kick_map.txt").read_text()
     assert text.count("START") == 2
+    assert main(["export", str(tmp_path / "out/field_map.csv"), "--format", "bdsim", "-o",
+                 str(tmp_path / "map.dat")]) == 0
+    assert "nz> 51" in (tmp_path / "map.dat").read_text()
     capsys.readouterr()
     assert main([*words, "--count", "51", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
