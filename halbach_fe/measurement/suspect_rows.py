@@ -141,6 +141,8 @@ def quadratic_residual(
     near = neighbours(points)
     residual, sd = np.empty_like(field), np.empty(len(points))
     parts = np.array_split(np.arange(len(points)), max(1, len(points) // 1000))
+    if pace is not None:
+        pace.advance(0, len(parts))  # the search of neighbours is no measure of what is left
     for number, part in enumerate(parts, 1):
         away = points[near[part]] - points[part, None]
         away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
