@@ -1,8 +1,4 @@
-"""Functions that all verbs share: options, exit codes, sessions, progress bars, tables.
-
-Modules of the command line import little at their top, so that help and completion appear without
-delay. Functions that compute something import the modules that they need themselves.
-"""
+"""Functions that all verbs share: input files, folders, sessions, progress bars, tables."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import argparse
 import hashlib
 import io
 import json
-import math
 import multiprocessing
 import os
 import re
@@ -21,10 +16,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from halbach_fe.cli.guard import claim_buffers, guarded
+from halbach_fe.cli.options import (
+    SOLVER,
+    Options,
+    Run,
+    declared,
+    describes_a_format,
+    format_words,
+    path,
+    together,
+    verb,
+)
 from halbach_fe.cli.streams import say as say
 from halbach_fe.cli.streams import show
 from halbach_fe.core.errors import (
@@ -36,53 +43,41 @@ from halbach_fe.core.errors import (
     printable,
 )
 from halbach_fe.core.files import InputFile
-from halbach_fe.core.numbers import HIGHEST_ORDER, LIMIT_PPM, LIMIT_UNITS
+from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from halbach_fe.geometry.magnet import Magnet
+    from halbach_fe.inference.storage import StoredPosterior
     from halbach_fe.measurement.block_table import BlockTable
     from halbach_fe.report.answer import Answer
     from halbach_fe.report.page import Page
+    from halbach_fe.response.homogeneity import Region
     from halbach_fe.response.multipoles import MultipoleReference
     from halbach_fe.response.resource_estimate import Estimate
     from halbach_fe.solver.getdp_cache import Cache
     from halbach_fe.solver.session import Session
     from halbach_fe.study.model import Study
 
-GETDP_LIMIT_S = 3600.0
-"""Time limit of each GetDP process, unless another is asked for."""
-
-MOST_NAME_BYTES, MOST_PATH_BYTES = 255, 4095
-"""Longest name of a file or folder, and longest path, that Linux allows."""
-
-Number = TypeVar("Number", int, float)
-
-
-def add_study_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
-    """Add STUDY, -o, --json, and the options of every verb that solves.
-
-    ``time_limit`` tells whether --time-limit is that of each GetDP process.
+def question(
+    *options: Options,
+) -> Callable[[Callable[[Magnet, argparse.Namespace], Page | int]], Run]:
+    """Declare a verb that asks something of the magnet of STUDY: its function gets the magnet, and
+    returns the page of the answer, or an exit code if there is none.
     """
-    add_study_and_output(parser)
-    add_solver_arguments(parser, time_limit)
-    add_json_argument(parser)
+    def declared(ask: Callable[[Magnet, argparse.Namespace], Page | int]) -> Run:
+        @wraps(ask)
+        def run(arguments: argparse.Namespace) -> int:
+            from halbach_fe.geometry.magnet import build_magnet
+            from halbach_fe.study.reader import read_study
 
+            answer = ask(build_magnet(read_study(arguments.study)), arguments)
+            return answer if isinstance(answer, int) else finish(arguments, answer)
 
-def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --dry-run."""
-    output = next(action for action in parser._actions if action.dest == "output")
+        return verb(*options)(run)
 
-    class DryRun(argparse.Action):
-        """The option, with which no folder for results is needed."""
-
-        def __call__(self, parser: object, namespace: argparse.Namespace, *_: object) -> None:
-            output.required = False
-            namespace.dry_run = True
-
-    parser.add_argument("--dry-run", action=DryRun, nargs=0, default=False,
-                        help="estimate memory, time and disk; nothing is solved or written, and -o "
-                        "is not needed")
+    return declared
 
 
 def print_estimate(estimate: Estimate, as_json: bool) -> int:
@@ -113,40 +108,9 @@ def print_estimate(estimate: Estimate, as_json: bool) -> int:
     return 0
 
 
-def add_solver_arguments(parser: argparse.ArgumentParser, time_limit: bool = True) -> None:
-    """Add the options of GetDP's runs: --jobs, --mpi, --scheduler, --cache, --getdp and so on."""
-    most_mpi = 1024  # largest number of MPI processes of a run
-    parser.add_argument("--jobs", type=positive, metavar="N",
-                        help="number of GetDP runs at a time (default: 2, or with --scheduler the "
-                        "number of cores of its workers)")
-    parser.add_argument("--mpi", type=within(whole, 1, most_mpi), default=1, metavar="N",
-                        help="number of MPI processes that share each run, for solves that are too "
-                        "large for a single process (default: %(default)s)")
-    parser.add_argument("--scheduler", metavar="ADDRESS",
-                        help="Dask scheduler whose workers run GetDP instead of this machine")
-    answers = parser.add_mutually_exclusive_group()
-    answers.add_argument("--cache", type=path, metavar="DIR",
-                         help="folder of the cache of GetDP's answers (default: "
-                         "$HALBACH_FE_CACHE, then ~/.cache/halbach-fe)")
-    answers.add_argument("--no-cache", action="store_true",
-                         help="neither read nor write the cache of GetDP's answers")
-    if time_limit:
-        parser.add_argument("--time-limit", type=positive_number, default=GETDP_LIMIT_S,
-                            metavar="SECONDS",
-                            help="time limit of each GetDP process in s (default: %(default)g)")
-    add_getdp_argument(parser)
-
-
-def add_study_and_output(parser: argparse.ArgumentParser) -> None:
-    """Add STUDY and -o."""
-    parser.add_argument("study", type=input_file, metavar="STUDY", help="study file (TOML)")
-    parser.add_argument("-o", "--output", type=path, required=True, metavar="DIR",
-                        help="folder for results; made if it does not exist")
-
-
 def run_study(
     description: str, study: Path, output: str, run: Callable[[argparse.Namespace], int],
-    options: Callable[[argparse.ArgumentParser], object] = lambda parser: None,
+    *options: Options,
 ) -> int:
     """Parse the command line of a shipped study and run it; return the exit code.
 
@@ -156,12 +120,11 @@ def run_study(
     parser.set_defaults(study=InputFile(study))
     parser.add_argument("-o", "--output", type=path, default=Path("results", output),
                         metavar="DIR", help="folder for results (default: %(default)s)")
-    add_solver_arguments(parser)
-    options(parser)
+    together(SOLVER, *options)(parser)
     arguments = parser.parse_args()
 
     def whole(arguments: argparse.Namespace) -> int:
-        own_folder(arguments, f"study {output}", solving=True)
+        own_folder(arguments, command=f"study {output}", solving=True)
         return run(arguments)
 
     return guarded(lambda: with_folder(whole, arguments))
@@ -182,9 +145,11 @@ from the latter."""
 
 
 def own_folder(
-    arguments: argparse.Namespace, command: str, study: str = "", solving: bool = False
+    arguments: argparse.Namespace, study: str = "", command: str = "", solving: bool = False
 ) -> None:
     """Take the output folder for this command and study until the end of the run.
+
+    The command is by default the verb.
 
     It is called before the first file is written, and after the input was read, so that a refused
     input leaves no folder. See `halbach_fe.core.result_folder.result_folder`. Pages that are
@@ -198,9 +163,9 @@ def own_folder(
               if isinstance(value, InputFile)]
     # a map that needs options is not known by its path alone
     named = {word: path for word, path in _given(arguments).items() if path in inputs
-             and not (word == "MAP" and _describes_a_format(arguments))}
+             and not (word == "MAP" and describes_a_format(arguments))}
     arguments.at_end.enter_context(result_folder(
-        arguments.output, command, study, inputs, named, solving))
+        arguments.output, command or f"halbach-fe {arguments.verb}", study, inputs, named, solving))
     arguments.at_end.enter_context(known_paths({
         word: path if word in (MAP_OPTIONS, LISTED_MAPS) else _from_here(path)
         for word, path in _paths_of(arguments).items()}))
@@ -231,25 +196,22 @@ def _described(arguments: argparse.Namespace) -> dict[str, str]:
     return found
 
 
-def keep_input(output: Path, *inputs: Path) -> None:
-    """Refuse to write a file over one that is read.
+def own_file(arguments: argparse.Namespace, *inputs: Path) -> None:
+    """Take the output file, which is none of the inputs, for this verb until the end of the run.
 
     Raises
     ------
     OutputError
-        If ``output`` is one of the inputs. A link at ``output`` would be replaced, not followed.
+        If it is one of them. A link at its place would be replaced, not followed.
     """
-    for path in inputs:
-        if not output.is_symlink() and output.exists() and path.exists() and (
-                path.samefile(output)):
+    from halbach_fe.core.result_folder import single_file
+
+    output = arguments.output
+    for one in inputs:
+        if not output.is_symlink() and output.exists() and one.exists() and one.samefile(output):
             raise OutputError(must_be("-o", "the command line", "a file other than the input",
                                       str(output), "Name another file."))
-
-
-def add_getdp_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --getdp."""
-    parser.add_argument("--getdp", type=given, metavar="PATH",
-                        help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
+    arguments.at_end.enter_context(single_file(output, f"halbach-fe {arguments.verb}"))
 
 
 SIMULATED = b"# source: synthetic"
@@ -275,35 +237,6 @@ def _if_simulated(path: Path) -> str:
     return ""
 
 
-def add_json_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --json."""
-    parser.add_argument("--json", action="store_true", help="print results as JSON")
-
-
-def add_multipole_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of multipoles: their reference, and the limit of unwanted multipoles."""
-    parser.add_argument("--reference-radius-m", type=positive_number, metavar="R",
-                        help="reference radius of the multipoles in m (default: that of the "
-                        "study's circle, or two thirds of the inner radius of the blocks)")
-    parser.add_argument("--orders", type=orders, metavar="N..M",
-                        help="orders of the unwanted multipoles, 1 for the dipole, for example "
-                        "2..10 or 3,5,7; the magnet's main order is ignored (default: 1..10)")
-    parser.add_argument("--at-z-m", type=finite_number, metavar="Z",
-                        help="in 3D: multipoles on the circle at Z in m, instead of those of the "
-                        "field integrated along z")
-    parser.add_argument("--limit-units", type=within(finite_number, *LIMIT_UNITS), metavar="U",
-                        help="largest unwanted multipole that is allowed, in units of 1e-4 of the "
-                        "main multipole")
-
-
-def add_objective_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of multipoles, and the limit of a study that asks for a homogeneous field."""
-    add_multipole_arguments(parser)
-    parser.add_argument("--limit-ppm", type=within(finite_number, *LIMIT_PPM), metavar="P",
-                        help="if the study has a table [homogeneity]: largest rms deviation of |B| "
-                        "in its region that is allowed, in ppm of the mean")
-
-
 def reference(arguments: argparse.Namespace) -> MultipoleReference | None:
     """Return the reference that options of `add_multipole_arguments` describe, if any is given."""
     from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
@@ -315,32 +248,44 @@ def reference(arguments: argparse.Namespace) -> MultipoleReference | None:
                               arguments.at_z_m)
 
 
-def add_measurement_arguments(parser: argparse.ArgumentParser, several: bool = False) -> None:
-    """Add --measurements and --blocks; ``several`` maps may be listed by the study instead."""
-    parser.add_argument("--measurements", type=input_file, required=not several, metavar="MAP",
-                        help="measured field map (CSV or HDF5)"
-                        + (", unless the study lists maps" if several else ""))
-    parser.add_argument("--blocks", type=input_file, metavar="CSV",
-                        help="measured moments of the single blocks, whose prior replaces the "
-                        "study's")
+def region_of(arguments: argparse.Namespace) -> Region | None:
+    """Return the region that the options describe; None for the default one.
 
+    Raises
+    ------
+    StudyError
+        If only its centre is given.
+    """
+    from halbach_fe.response.homogeneity import Region
 
-def add_held_out_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --held-out."""
-    parser.add_argument("--held-out", type=input_file, metavar="MAP",
-                        help="another map at other positions, which is predicted but does not "
-                        "update the model")
+    region = Region.of(arguments.sphere_m, arguments.ellipsoid_m, arguments.cylinder_m,
+                       arguments.centre_m)
+    if region is None and any(arguments.centre_m):
+        raise StudyError(must_be("--centre-m", "the command line", "beside a region",
+                                 "given alone", "Add --sphere-m R."))
+    return region
 
 
 def blocks_and_held_out(
     arguments: argparse.Namespace,
 ) -> tuple[BlockTable | None, xr.Dataset | None]:
     """Read the block table and the held-out map; None stands for a file not given."""
+    return (blocks_of(arguments.blocks),
+            read_one(arguments, arguments.held_out) if arguments.held_out else None)
+
+
+def blocks_of(path: Path | None) -> BlockTable | None:
+    """Read a table of measured blocks, if it is given."""
     from halbach_fe.measurement.block_table import read_blocks
 
-    held_out = getattr(arguments, "held_out", None)
-    return (read_blocks(arguments.blocks) if arguments.blocks else None,
-            read_one(arguments, held_out) if held_out else None)
+    return read_blocks(path) if path else None
+
+
+def posterior_of(arguments: argparse.Namespace, magnet: Magnet) -> StoredPosterior | None:
+    """Read the posterior of the magnet, if it is given."""
+    from halbach_fe.inference.storage import read_posterior
+
+    return read_posterior(magnet, arguments.posterior) if arguments.posterior else None
 
 
 def read_measurements(
@@ -361,7 +306,7 @@ def read_measurements(
             "both" if study.maps else "neither",
             "Leave --measurements out." if study.maps else "Add --measurements, or [[maps]]."))
     if study.maps:
-        if getattr(arguments, "held_out", None) is None and _describes_a_format(arguments):
+        if getattr(arguments, "held_out", None) is None and describes_a_format(arguments):
             raise StudyError(must_be(
                 "options of the format", "the command line", "left out, as the study lists its "
                 "maps", "given", "State maps.instrument.length_unit_m and flux_density_unit_T in "
@@ -374,13 +319,11 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     """Read a map in halbach-fe's own columns, as the options of `import-map` describe it, or as
     the file itself says.
     """
-    from halbach_fe.cli.format_options import declared_format
     from halbach_fe.measurement.field_map import FOREIGN, read_map
-    from halbach_fe.measurement.formats.declared import DeclaredFormat
     from halbach_fe.measurement.formats.files import import_map
 
-    if _describes_a_format(arguments):
-        imported = import_map(path, declared_format(arguments), arguments.format)
+    if describes_a_format(arguments):
+        imported = import_map(path, declared(arguments, DeclaredFormat), arguments.format)
     else:
         try:
             return read_map(path)
@@ -401,130 +344,12 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     return data
 
 
-def _describes_a_format(arguments: argparse.Namespace) -> bool:
-    """Tell whether any option says how a map in other columns or units is read."""
-    if not hasattr(arguments, "columns"):
-        return False
-    from halbach_fe.cli.format_options import declared_format
-    from halbach_fe.measurement.formats.declared import DeclaredFormat
-
-    return bool(declared_format(arguments) != DeclaredFormat() or arguments.format)
-
-
 def _listed(arguments: argparse.Namespace, study: Study) -> dict[str, InputFile]:
     """Return the files of the maps that the study lists, the same objects whenever it is called."""
     if not hasattr(arguments, "listed_maps"):
         arguments.listed_maps = {
             one.name: InputFile(arguments.study.parent / one.file) for one in study.maps}
     return dict(arguments.listed_maps)
-
-
-def add_seed_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --seed."""
-    parser.add_argument("--seed", type=positive, default=1, metavar="N",
-                        help="seed of the random numbers (default: %(default)s)")
-
-
-def orders(text: str) -> tuple[int, ...]:
-    """Parse orders of multipoles: ``2..10``, ``3,5,7``, or both."""
-    numbers = set[int]()
-    for part in text.split(","):
-        first, dots, last = part.partition("..")
-        ends = [first, last if dots else first]
-        if not all(end.isdecimal() and 1 <= int(end[:9]) <= HIGHEST_ORDER for end in ends) or (
-                int(ends[0]) > int(ends[1])):
-            raise argparse.ArgumentTypeError(
-                f"must be orders from 1 to {HIGHEST_ORDER}, such as 2..10 or 3,5,7, not "
-                f"{printable(text, MAX_QUOTED)!r}")
-        numbers.update(range(int(ends[0]), int(ends[1]) + 1))
-    return tuple(sorted(numbers))
-
-
-def within(
-    parse: Callable[[str], Number], least: float, most: float
-) -> Callable[[str], Number]:
-    """Return a function that parses a number, and refuses one below ``least`` or above ``most``."""
-    def parsed(text: str) -> Number:
-        value = parse(text)
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(
-                f"must be from {least:g} to {most:g}, not {printable(text, MAX_QUOTED)}")
-        return value
-
-    return parsed
-
-
-def given(text: str) -> str:
-    """Return the text of an option, or refuse an empty one, as an unset variable of a shell is."""
-    if not text:
-        raise argparse.ArgumentTypeError("must not be empty")
-    return text
-
-
-def path(text: str) -> Path:
-    """Return a path, or refuse one that is empty (the current folder) or too long."""
-    raw = os.fsencode(given(text))
-    if len(raw) > MOST_PATH_BYTES or max(map(len, raw.split(b"/"))) > MOST_NAME_BYTES:
-        raise argparse.ArgumentTypeError(
-            f"must be a path of up to {MOST_PATH_BYTES} bytes, with names of up to "
-            f"{MOST_NAME_BYTES}, not {printable(text, 50)!r} of {len(raw)} bytes")
-    return Path(text)
-
-
-def input_file(text: str) -> InputFile:
-    """Return an input file, or refuse a path as `path` does."""
-    return InputFile(path(text))
-
-
-def count(text: str) -> int:
-    """Parse a whole number of at least 0."""
-    return at_least(0, text)
-
-
-def finite_number(text: str) -> float:
-    """Parse a finite number."""
-    value = _number(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"must be finite, not {text}")
-    return value
-
-
-def positive(text: str) -> int:
-    """Parse a whole number of at least 1."""
-    return at_least(1, text)
-
-
-def whole(text: str) -> int:
-    """Parse a whole number."""
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"must be a whole number, not {printable(text, MAX_QUOTED)!r}") from None
-
-
-def at_least(least: int, text: str) -> int:
-    """Parse a whole number of at least ``least``."""
-    value = whole(text)
-    if value < least:
-        raise argparse.ArgumentTypeError(f"must be at least {least}, not {value}")
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"must be a number, not {printable(text, MAX_QUOTED)!r}") from None
-
-
-def positive_number(text: str) -> float:
-    """Parse a number above 0."""
-    value = _number(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be above 0, not {text}")
-    return value
 
 
 @contextmanager
@@ -540,7 +365,7 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
 
     getdp = getdp_or_none(arguments.getdp)
     if study is not None:
-        own_folder(arguments, f"halbach-fe {arguments.verb}", study.name, solving=True)
+        own_folder(arguments, study.name, solving=True)
     arguments.at_end.enter_context(known_inputs({"GetDP": getdp.version, **inputs_of_command()}))
     with progress_bar("solving") as show, ExitStack() as stack:
         opened = Session(
@@ -680,11 +505,7 @@ def _paths_of(arguments: argparse.Namespace) -> dict[str, Any]:
     given = {word: path for word, path in _given(arguments).items() if path is not None}
     posterior = given.get("POSTERIOR")
     behind = named_inputs(posterior.parent) if posterior else {}
-    options = []
-    if "MAP" in given and _describes_a_format(arguments):
-        from halbach_fe.cli.format_options import format_words
-
-        options = format_words(arguments)
+    options = format_words(arguments) if "MAP" in given and describes_a_format(arguments) else []
     return {**{word: path for word, path in behind.items() if word in ("MAP", "BLOCKS")}, **given,
             "DIR": getattr(arguments, "output", None), MAP_OPTIONS: options,
             LISTED_MAPS: _lists_maps(given.get("STUDY"))}

@@ -19,7 +19,13 @@ from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_te
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.prism import Prism, circle
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.assembly_sheets import common_beginning, drawing, height_mm, sheets
+from halbach_fe.report.assembly_sheets import (
+    common_beginning,
+    drawing,
+    height_mm,
+    labels_in_words,
+    sheets,
+)
 from halbach_fe.report.page import Page, Section, Table, csv_file, page_of, rendered
 from halbach_fe.report.words import counted
 
@@ -290,7 +296,8 @@ def _sheets(assembly: Assembly) -> Markup:
     ordered_as = dict(zip((kind.number for kind in assembly.kinds), assembly.ordered_as,
                           strict=True))
     prefix = common_beginning([one.serial for one in assembly.blocks])
+    drawn = sheets(assembly)
     return Markup(rendered(
-        "assembly.html.j2", prefix=prefix, holder=assembly.holder,
+        "assembly.html.j2", labels=labels_in_words(drawn, prefix), holder=assembly.holder,
         measured=any(one.serial for one in assembly.blocks),
-        sheets=[drawing(sheet, prefix, ordered_as) for sheet in sheets(assembly)]))
+        sheets=[drawing(sheet, prefix, ordered_as) for sheet in drawn]))

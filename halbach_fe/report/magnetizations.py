@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,11 +16,11 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     SECOND,
+    Page,
+    Section,
+    Table,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
 )
 from halbach_fe.report.words import decimals, fraction
 from halbach_fe.stats.gaussian import Gaussian
@@ -73,12 +73,11 @@ def answer(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats) -> Answ
         f"halbach-fe {'infer' if sound else 'diagnose'} STUDY --measurements MAP -o DIR", sound)
 
 
-@own_style
-def write_magnetizations(
-    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, folder: Path, what: str,
-    files: str, figures: Mapping[str, object] | None = None, ring: int = 1,
-) -> None:
-    """Write magnetizations.html, and magnetizations.png with the magnetizations of a ring.
+def page(
+    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, what: str,
+    figures: Mapping[str, float] | None = None, ring: int = 1,
+) -> Page:
+    """Return the page of magnetizations.html, which compares those of a ring with the truth.
 
     Parameters
     ----------
@@ -88,26 +87,26 @@ def write_magnetizations(
     truth : ndarray, shape (parameters,), in A/m
     what : str
         The page's title.
-    files : str
-        Names of the machine-readable files beside the page.
     figures : mapping, optional
         Further numbers to list, by name.
     ring : int
         The ring that is drawn, counted from 1.
     """
-    pictures = save({"magnetizations.png": (
-        _magnetizations_figure(magnet, known, truth, ring), f"Deviation of the "
-        f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are standard "
-        "deviations")}, folder)
     rows = []
     for name, distribution in known.items():
         largest, rms, ratio = error_summary(distribution, truth).values()
         rows.append({"": name, "largest error in kA/m": decimals(1e-3 * largest),
                      "rms error in kA/m": decimals(1e-3 * rms),
                      "rms of error / sd": f"{ratio:.2f}"})
-    write_page(folder / "magnetizations.html", "magnetizations.html.j2", pictures,
-               study=magnet.study, rows=rows, figures=figures or {}, what=what, machine_files=files,
-               answer=answer(magnet, known, truth))
+    further = [{"": key.replace("_", " "), "value": f"{value:.4g}"}
+               for key, value in (figures or {}).items()]
+    return Page("magnetizations", what, magnet.study, answer(magnet, known, truth), {}, [
+        Section([Table(rows, "numbers")]),
+        Section([Table(further, "numbers")] if further else [], "Further numbers")], rows=rows,
+        figures={"magnetizations.png": (
+            partial(_magnetizations_figure, magnet, known, truth, ring), f"Deviation of the "
+            f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are "
+            "standard deviations")}, stored=False)
 
 
 def _magnetizations_figure(

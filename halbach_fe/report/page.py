@@ -69,7 +69,9 @@ Figures = Mapping[str, tuple[Callable[[], Figure], str]]
 
 
 class Text(NamedTuple):
-    """A paragraph; words between backticks are code, those between pairs of asterisks bold."""
+    """A paragraph; words between backticks are code, those between pairs of asterisks bold,
+    and [words](page.html) a link.
+    """
 
     text: str
     kind: str = ""
@@ -216,9 +218,7 @@ def write_files(page: Page, folder: Path, file: Path | None = None) -> Path:
                    json.dumps(page.summary, indent=1, allow_nan=False) + "\n")
     pictures = save(page.figures, folder)
     path = folder / f"{page.name}.html"
-    write_page(path, "page.html.j2", pictures, page.study, page.provenance, answer=page.answer,
-               rows=page.rows or next(iter(page.tables.values()), ()), page=page,
-               drawn={picture.file: picture for picture in pictures})
+    write_page(path, page, pictures)
     if page.new_study is not None:
         name, steps = page.new_study
         write_changed_study(folder / name, steps(), file, page.study)
@@ -275,45 +275,24 @@ def png_of(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def write_page(
-    path: Path, template: str, pictures: Sequence[Picture], study: Study | None = None,
-    provenance: Mapping[str, str] | None = None, answer: Answer | None = None,
-    rows: Sequence[Mapping[str, str]] = (), **data: object,
-) -> None:
-    """Write a self-contained HTML page from a template of this folder, and page.json beside it.
+def write_page(path: Path, page: Page, pictures: Sequence[Picture]) -> None:
+    """Write a page as self-contained HTML, and page.json beside it; ``pictures`` are from `save`.
 
-    The page ends with its provenance: the entries of ``provenance``, the files that the command has
-    read, the versions of the programs, and the text of the study file as it was read.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    template : str
-        Name of the template's file.
-    pictures : sequence of Picture
-        Figures from `save`.
-    provenance : mapping, optional
-        Text by name of the entry.
-    answer : Answer, optional
-        What the page says first, with the paths that are known; every page of a command has one.
-    rows : sequence of mapping of str to str
-        The main table of the page, which page.json has too.
-    **data
-        Variables of the template.
+    It ends with its provenance: the entries of its own, the files that the command has read, the
+    versions of the programs, and the text of the study file as it was read.
     """
-    given = dict(provenance or {})
+    given = page.provenance
     read = {name: file for name, file in inputs_of_command().items()
             if file not in given.values()}
     provenance = {**given, **read, "programs": programs()}
-    text = rendered(template, pictures=pictures, study=study, rows=rows, provenance=provenance,
-                    simulated=simulated_files(provenance),
-                    answer=answer and answer.with_known_paths(), **data)
+    rows = page.rows or next(iter(page.tables.values()), ())
+    text = rendered("page.html.j2", page.study, page=page, pictures=pictures, provenance=provenance,
+                    drawn={picture.file: picture for picture in pictures},
+                    simulated=simulated_files(provenance), answer=page.answer.with_known_paths())
     write_text(path, text)
     title = re.search("<title>(.*?)</title>", text, re.S)
     write_record(path, html.unescape(title[1]) if title else "",
-                 answer and answer.with_known_paths(folder=False), pictures, rows, provenance,
-                 study)
+                 page.answer.with_known_paths(folder=False), pictures, rows, provenance, page.study)
 
 
 def simulated_files(provenance: Mapping[str, str]) -> str:
@@ -367,6 +346,7 @@ def _templates() -> jinja2.Environment:
 def _marked(text: str) -> Markup:
     """Return a text as HTML, see `Text`."""
     text = re.sub("`(.*?)`", r"<code>\1</code>", html.escape(text))
+    text = re.sub(r"\[([^]]+)\]\(([\w./-]+\.html)\)", r'<a href="\2">\1</a>', text)
     return Markup(re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", text))
 
 

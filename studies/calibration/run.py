@@ -16,7 +16,6 @@ steps::
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,17 +23,18 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from calibration_page import page
 
 from halbach_fe.cli import common
+from halbach_fe.cli.options import positive, positive_number
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
-from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.mcmc import LAPLACE_STEPS, PRIOR_STEP
 from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
-from halbach_fe.report.calibration import write_calibration
+from halbach_fe.report.page import write_files
 from halbach_fe.response.deviation_field import with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
@@ -328,8 +328,7 @@ def run(arguments: argparse.Namespace) -> int:
             "smallest_p_of_a_parameter": float(values.min()),
             "model_error_over_noise": case.error_over_noise,
             "as_expected": together > PASS if case.good else together < FAIL}
-    write_text(arguments.output / "calibration.json", json.dumps(results, indent=1) + "\n")
-    write_calibration(found, DRAWS, results, arguments.output)
+    write_files(page(found, DRAWS, results), arguments.output)
     common.print_table([{"what": name} | {key: f"{value:.3g}" if isinstance(value, float)
                                           else str(value) for key, value in row.items()}
                         for name, row in results.items()], "Ranks of the truth: uniform?")
@@ -348,10 +347,10 @@ def nominal_magnetizations(magnet: Magnet) -> Floats:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--repeats", type=common.positive, default=500, metavar="N",
+    parser.add_argument("--repeats", type=positive, default=500, metavar="N",
                         help="truths drawn (default: %(default)s)")
-    parser.add_argument("--seed", type=common.positive, default=5, metavar="N")
-    parser.add_argument("--block-size-m", type=common.positive_number, default=0.01,
+    parser.add_argument("--seed", type=positive, default=5, metavar="N")
+    parser.add_argument("--block-size-m", type=positive_number, default=0.01,
                         help="of the mesh (default: %(default)s)")
 
 

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from sealed_cases_page import page
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, HalbachError
@@ -42,7 +43,7 @@ from halbach_fe.inference.result import HELD_OUT, InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.report.diagnosis_answer import answer
-from halbach_fe.report.sealed_cases import write_sealed_cases
+from halbach_fe.report.page import write_files
 from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_axis
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
@@ -673,7 +674,7 @@ def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[st
         allow_nan=False) + "\n")
     confusion = Counter((one["hidden"][0], tuple(names)) for one in results
                         if len(one["hidden"]) == 1 for names in one["named"] or [[NONE]])
-    write_sealed_cases(study, results, rates, stated, named_first["bins"], confusion, folder)
+    write_files(page(study, results, rates, stated, named_first["bins"], confusion), folder)
     common.print_table([{"hidden": hidden, "named": ", ".join(names), "cases": str(count)}
                         for (hidden, names), count in sorted(confusion.items())],
                        "What was hidden alone, and what was named")

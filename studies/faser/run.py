@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.cli.options import positive_number
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
@@ -102,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--z-step-m", type=common.positive_number, default=Z_STEP_M,
+    parser.add_argument("--z-step-m", type=positive_number, default=Z_STEP_M,
                         help="assumed distance of the readings (default: %(default)g m)")
 
 

@@ -17,13 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.cli import common
+from halbach_fe.cli.options import positive
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior, sampled_summary, with_samples, write_sampled
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report.magnetizations import error_summary, write_magnetizations
+from halbach_fe.report.magnetizations import error_summary, page
+from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
@@ -71,10 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
         results[f"{what}: prior"] = dict(error_summary(prior, truth))
         results[f"{what}: posterior"] = error_summary(
             updated.posterior, truth) | sampled_summary(found)
-        write_magnetizations(
-            build_magnet(study), {"prior": prior, "posterior": updated.posterior}, truth, folder,
-            f"the magnetizations of {what}", "sampled.json, sampled.csv, chains.nc",
-            sampled_summary(found))
+        write_files(page(
+            build_magnet(study), {"prior": prior, "posterior": updated.posterior}, truth,
+            f"the magnetizations of {what}", sampled_summary(found)), folder)
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
     common.print_table([{"what": name} | {key: f"{row[key]:.4g}" for key in paper}
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    parser.add_argument("--samples", type=common.positive, default=1500,
+    parser.add_argument("--samples", type=positive, default=1500,
                         help="draws of each chain (default: %(default)s)")
 
 

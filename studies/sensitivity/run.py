@@ -14,6 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import sensitivity_page
+from sensitivity_page import Sensitivity, plan_rows
 
 from halbach_fe.cli import common
 from halbach_fe.core.arrays import Floats
@@ -23,7 +25,6 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import write_files
 from halbach_fe.report.plan import page, plan_summary
-from halbach_fe.report.sensitivity import Sensitivity, plan_rows, write_sensitivity
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.formulation_choice import gateaux_derivative
 from halbach_fe.solver.session import Session
@@ -104,9 +105,9 @@ def run(options: argparse.Namespace) -> int:
     write_files(page(plans["on the circle"]), options.output / "plan-circle")
     write_files(page(plans["wherever the probe can go"]), options.output / "plan")
     summaries = {name: plan_summary(found) for name, found in plans.items()}
-    write_sensitivity(build_magnet(study), Sensitivity(
+    write_files(sensitivity_page.page(build_magnet(study), Sensitivity(
         BLOCK, axis, axis, size, np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), along,
-        across, error, information, model.matrix.shape[1]), options.output, summaries)
+        across, error, information, model.matrix.shape[1]), summaries), options.output)
     common.print_table(plan_rows(summaries), "Where to measure")
     common.say(f"Report: {options.output / 'sensitivity.html'}")
     return 0

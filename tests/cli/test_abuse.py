@@ -16,7 +16,7 @@ import pytest
 import tomlkit
 
 from halbach_fe.cli import main
-from halbach_fe.cli.common import orders
+from halbach_fe.cli.options import orders
 from halbach_fe.cli.verbs import with_values
 from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import InputFile

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import tomlkit
 
 from halbach_fe.cli import main
-from halbach_fe.cli.verbs import module_of
+from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, write_record
@@ -47,6 +46,13 @@ def test_a_map_that_the_update_explains_needs_nothing_else(study, generator, tmp
     assert "halbach-fe register" not in printed.err
 
 
+def test_a_map_that_is_not_there_is_said_once(study, tmp_path, capsys):
+    assert main(["explain", str(study), str(tmp_path / "no.csv"), "-o", str(tmp_path / "out")]) == 4
+    printed = capsys.readouterr().err
+    assert printed.count("no.csv must be a readable file") == 1
+    assert "cannot be checked" not in printed
+
+
 CHECK = Answer("?", "Passed.", "Yes.", "")
 GOOD, BAD = (replace(CHECK, sound=sound) for sound in (True, False))
 REGISTERED = replace(GOOD, command="halbach-fe infer DIR/study.registered.toml -o DIR")
@@ -72,7 +78,7 @@ def test_each_command_runs_as_far_as_it_is_needed(
     """With answers that are given, so that every way is taken."""
     ran, pages = [], []
 
-    def answered(module, arguments):
+    def answered(arguments):
         ran.append((arguments.output.name, str(getattr(arguments, "study", ""))))
         arguments.output.mkdir(parents=True)
         answer = {"check": CHECK, **answers}[arguments.output.name]
@@ -82,10 +88,9 @@ def test_each_command_runs_as_far_as_it_is_needed(
         return 0
 
     for verb in ("check", "infer", "register", "diagnose"):
-        module = module_of(verb)
-        monkeypatch.setattr(module, "run", partial(answered, module))
-    monkeypatch.setattr(module_of("report"), "run", lambda arguments: pages.extend(
-        folder.name for folder in arguments.folders) or 0)
+        monkeypatch.setitem(VERBS, verb, replace(VERBS[verb], run=answered))
+    monkeypatch.setitem(VERBS, "report", replace(VERBS["report"], run=lambda arguments: (
+        pages.extend(folder.name for folder in arguments.folders) or 0)))
     (tmp_path / "map.csv").write_text("x")
     assert main(["explain", str(study), str(tmp_path / "map.csv"), "-o",
                  str(tmp_path / "out")]) == 0

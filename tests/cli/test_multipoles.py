@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tomlkit
 
-from halbach_fe.cli import common, main
+from halbach_fe.cli import main, options
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.storage import read_posterior
 from halbach_fe.measurement.block_table import read_blocks
@@ -298,10 +298,10 @@ def test_bad_input(made, tmp_path, capsys, arguments, code, said):
 @pytest.mark.parametrize(("text", "orders"), [
     ("2..4", (2, 3, 4)), ("3,5,7", (3, 5, 7)), ("2..3,9,2", (2, 3, 9))])
 def test_orders(text, orders):
-    assert common.orders(text) == orders
+    assert options.orders(text) == orders
 
 
 @pytest.mark.parametrize("text", ["0..3", "5..2", "2..1000", "x", "", "2..3.."])
 def test_orders_that_are_none(text):
-    with pytest.raises((ValueError, common.argparse.ArgumentTypeError)):
-        common.orders(text)
+    with pytest.raises((ValueError, options.argparse.ArgumentTypeError)):
+        options.orders(text)

@@ -18,7 +18,9 @@ def study():
     spec = importlib.util.spec_from_file_location("sealed_cases", SCRIPT)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # for its dataclasses
+    sys.path.insert(0, str(SCRIPT.parent))  # as if it were run
     spec.loader.exec_module(module)
+    sys.path.remove(str(SCRIPT.parent))
     return module
 
 

@@ -16,7 +16,6 @@ from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
-from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import Picture
 from halbach_fe.solver.magnetostatics import CROSS_SECTION, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
@@ -25,6 +24,7 @@ from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, changed, circle
 from tests.fuzz.documents import HOSTILE
 from tests.fuzz.readers import FREE_CSV, STEEL, WITH_STEEL
+from tests.support.pages import write_any_page
 
 TINY = changed(DIPOLE, array__blocks_per_ring=4, mesh__block_size_m=0.18, mesh__growth=4.0,
                open_boundary={"radius_m": 0.3}, prior={"types": {"a": [1, 2], "b": [3, 4]}},
@@ -267,8 +267,8 @@ def test_templates_escape(tmp_path, text):
     """The frame that all pages share, text in every place; the harmless page is the control."""
     def parts(word):
         study = parse_study(TINY).model_copy(update={"description": word})
-        write_page(tmp_path / "page.html", "calibration.html.j2", [Picture("", word)], study,
-                   {word or "x": word}, results={})
+        write_any_page(tmp_path / "page.html", [Picture("", word)], study,
+                   {word or "x": word})
         return Parts((tmp_path / "page.html").read_text(encoding="utf-8"))
     found = parts(text.replace("\ud7ff", ""))
     assert found.parts == parts("harmless").parts

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import (
     check_magnitudes,
@@ -18,6 +22,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import export_map, format_of, import_map
 from halbach_fe.measurement.formats.units import in_si, unit_symbol
+from tests.conftest import ROOT
 
 AXES = [-0.01, 0.01], [0.0, 0.005, 0.01], [0.1, 0.2, 0.3, 0.4]
 POINTS = np.stack(np.meshgrid(*AXES, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -109,6 +114,9 @@ def test_declared_columns_and_units(tmp_path):
         "z[mm]", "y[mm]", "x[mm]", "Bz[mT]", "By[mT]", "Bx[mT]")))
     left = imported(tmp_path, text, columns=("z", "y", "x", "-", "-", "Bx"), **declared)
     assert same(left, field=np.where([True, False, False], FIELD, np.nan))
+    ended = text.replace("\n", ",\n").replace("  ", ",")  # a comma at the end of every line
+    assert same(imported(tmp_path, ended, columns=(*columns, "-"), **declared))
+    assert "of 6 columns" in said(tmp_path, ended, columns=(*columns, "t"), **declared)
 
 
 STAGE = ["dx[mm]", "dy[mm]", "dz[mm]", "Bx[T]", "By[T]", "Bz[T]", "t[min]"]
@@ -453,3 +461,18 @@ def test_what_is_advised_for_another_unit_can_be_followed(tmp_path, unit, factor
         check_magnitudes(read_map(path))
     rows[head] = rows[head].replace("_T", f"_{unit}")
     assert same(imported(tmp_path, "\n".join(rows)))
+
+
+def test_commands_of_the_measured_studies_read_their_maps(tmp_path):
+    """What the Makefile has `halbach-fe import-map` do with the measured maps works."""
+    text = (ROOT / "Makefile").read_text().replace("\\\n", " ")
+    recipes = re.findall(r"^results/\S+: (\S+) .*\n\t\.venv/bin/halbach-fe (import-map .*)", text,
+                         re.MULTILINE)
+    assert len(recipes) == 3
+    probe = ROOT / "studies/emphatic/measured/probe_calibration.csv"
+    for number, (source, recipe) in enumerate(recipes):
+        output = tmp_path / f"{number}.csv"
+        words = shlex.split(recipe.replace("$<", str(ROOT / source)).replace("$@", str(output))
+                            .replace("$(EMPHATIC_PROBE)", str(probe)))
+        assert main(words) == 0
+        assert len(points_of(read_map(output))) > 1000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import re
 import shlex
@@ -150,7 +149,8 @@ def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
     """A Fourier coefficient is off by less than B at a point: each answer says what is meant."""
     for quantity, settings in (("flux_density", {}), (
             "fourier_coefficients", {"observation__harmonics": 5})):
-        magnet = build_magnet(dipole(observation__quantity=quantity, **settings))
+        magnet = build_magnet(dipole(
+            observation__quantity=quantity, mesh__block_size_m=0.04, **settings))
         solved, verified = hf.solve(magnet, session), hf.verify(magnet, session)
         coefficient = quantity == "fourier_coefficients"
         said = solution.answer(solved).said
@@ -398,20 +398,6 @@ def test_a_mere_verdict_stands_with_its_reason():
                          ("No. It is off. More.", "No. It is off."),
                          ("The fit is good. More.", "The fit is good.")):
         assert Answer("?", "Said.", trust, "Step.").short_trust == short
-
-
-def test_every_page_has_an_answer():
-    found = {path.stem: answers_in(path.read_text())
-             for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
-    assert not [name for name, answers in found.items() if not all(answers)]
-    assert sum(map(len, found.values())) > 1  # the others are made of a Page, which has one
-    assert not all(answers_in("write_page(path, template, pictures, study)"))  # the control
-
-
-def answers_in(code):
-    """Whether each call of write_page in a text has an answer."""
-    return [any(key.arg == "answer" for key in node.keywords) for node in ast.walk(ast.parse(code))
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "write_page"]
 
 
 def test_page_and_terminal_say_the_same(tmp_path, capsys, monkeypatch):

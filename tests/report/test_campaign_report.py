@@ -22,9 +22,9 @@ from halbach_fe.core.result_folder import RECORD, result_folder
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
 from halbach_fe.report.campaign_report import _parts, read_campaign
-from halbach_fe.report.page import write_page
 from halbach_fe.report.page_record import PAGE_RECORD, Picture
 from tests.conftest import changed, parse_study
+from tests.support.pages import write_any_page
 from tests.support.results import STUDY, TINY, results
 
 
@@ -295,7 +295,7 @@ def test_what_fits(home):
 def another_posterior(home):
     with result_folder(home / "inferred", "halbach-fe infer", "tiny", [home / "map.csv"]):
         write_text(home / "inferred" / "posterior.h5", "another")
-        write_page(home / "inferred" / "page.html", "calibration.html.j2", [], STUDY, results={})
+        write_any_page(home / "inferred" / "page.html", [], STUDY)
 
 
 def another_map(home):
@@ -667,13 +667,13 @@ def test_figures_are_png_of_the_folder(tmp_path, secret, change):
 
 def test_page_records_are_of_what_is_on_the_page(tmp_path):
     """What a page says, it says to machines too."""
-    write_page(tmp_path / "one.html", "calibration.html.j2", [Picture("", "what is seen", "a.png")],
-               STUDY, {"map": "m.csv"}, Answer("q", "s", "t", "n"), [{"a": "1"}], results={})
+    write_any_page(tmp_path / "one.html", [Picture("", "what is seen", "a.png")],
+               STUDY, {"map": "m.csv"}, Answer("q", "s", "t", "n"), [{"a": "1"}])
     said = json.loads(Path(tmp_path, PAGE_RECORD).read_text())
     assert said["provenance"].pop("programs").startswith("halbach-fe")
     assert said.pop("study")["name"] == "tiny"
     assert said == {
-        "page": "one.html", "title": "Calibration", "rows": [{"a": "1"}],
+        "page": "one.html", "title": "tiny: Calibration", "rows": [{"a": "1"}],
         "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
         "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
                    "sound": True, "concern": "", "changes_study": True, "gist": "", "numbers": []}}

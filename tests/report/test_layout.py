@@ -6,10 +6,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from halbach_fe.cli import main
-from halbach_fe.report.page import SMALL, figure_of, label_logarithmic, save, units_kept, write_page
+from halbach_fe.report.page import SMALL, figure_of, label_logarithmic, save, units_kept
 from halbach_fe.report.page_record import WIDEST_IN
 from tests.report.conftest import PATIENCE_MS
 from tests.report.test_page import ANSWER, SEEN
+from tests.support.pages import write_any_page
 from tests.support.results import STUDY
 from tests.support.short_dipole import TEXT
 
@@ -40,8 +41,8 @@ def written(folder, *sizes_in):
         figure = Figure(figsize=size_in)
         figure.text(0.5, 0.5, "text", fontsize=SMALL)
         figures[f"{number}.png"] = figure, SEEN
-    write_page(folder / "page.html", "calibration.html.j2", save(figures, folder), STUDY,
-               answer=ANSWER, results={})
+    write_any_page(folder / "page.html", save(figures, folder), STUDY,
+               answer=ANSWER)
     return folder / "page.html"
 
 

@@ -21,10 +21,10 @@ import halbach_fe as hf
 from halbach_fe.cli import common, main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import SMALL, own_style, save, simulated_files, write_page
+from halbach_fe.report.page import SMALL, own_style, save, simulated_files
 from halbach_fe.report.page_record import DPI, LEGIBLE_PX
 from tests.conftest import DIPOLE, ROOT, parse_study
-from tests.support.pages import page
+from tests.support.pages import page, write_any_page
 
 ANSWER = Answer("Is this a page?", "It is 1 page.", "Yes: it is a test.", "Read it to its end.")
 SEEN = "what the picture shows, in words"
@@ -34,8 +34,8 @@ SEEN = "what the picture shows, in words"
 def written(tmp_path):
     study = parse_study(DIPOLE | {"description": "<b>not bold</b>"})
     path = tmp_path / "page.html"
-    write_page(path, "calibration.html.j2", save({"one.png": (Figure(), SEEN)}, tmp_path), study,
-               {"source": "a test"}, ANSWER, results={})
+    write_any_page(path, save({"one.png": (Figure(), SEEN)}, tmp_path), study,
+               {"source": "a test"}, ANSWER)
     return path
 
 
@@ -106,8 +106,7 @@ def test_texts_of_figures_can_be_read(tmp_path):
     width_px = matplotlib.image.imread(tmp_path / "one.png").shape[1]
     assert SMALL / 72 * DPI * picture.legible_px / width_px >= LEGIBLE_PX  # of the text, as shown
     path = tmp_path / "page.html"
-    write_page(path, "calibration.html.j2", [picture], parse_study(DIPOLE), answer=ANSWER,
-               results={})
+    write_any_page(path, [picture], parse_study(DIPOLE), answer=ANSWER)
     style = f"min-width: {picture.legible_px}px; --width: {picture.width_in}in"
     assert f'style="{style}"' in path.read_text()
     assert re.search(r'<div class="wide"><img [^>]*><div class="more"></div></div><figcaption>',
@@ -115,10 +114,10 @@ def test_texts_of_figures_can_be_read(tmp_path):
 
 
 def test_figures_are_made_no_wider_than_paper():
-    """All by `figure_of`, but for the matrix of all effects of the sealed cases."""
+    """All by `figure_of`."""
     found = {path.name: path.read_text().count("Figure(figsize=")
              for path in (ROOT / "halbach_fe" / "report").glob("*.py")}
-    assert {name for name, count in found.items() if count} == {"page.py", "sealed_cases.py"}
+    assert {name for name, count in found.items() if count} == {"page.py"}
 
 
 def test_no_text_of_a_figure_is_smaller():

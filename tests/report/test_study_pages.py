@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report import calibration, magnetizations, sealed_cases, sensitivity
-from halbach_fe.report.sensitivity import Sensitivity
+from halbach_fe.report import magnetizations
+from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
+from studies.calibration import calibration_page as calibration
+from studies.diagnosis import sealed_cases_page as sealed_cases
+from studies.sensitivity import sensitivity_page as sensitivity
+from studies.sensitivity.sensitivity_page import Sensitivity
 from tests.support.pages import answer_of, page
 from tests.support.results import STUDY
 
@@ -31,7 +35,7 @@ def calibrated(**changes):
 
 def test_calibration_says_whether_error_bars_hold(tmp_path):
     ranks = {name: np.random.default_rng(1).integers(0, 20, (50, 8)) for name in calibrated()}
-    calibration.write_calibration(ranks, 19, calibrated(), tmp_path)
+    write_files(calibration.page(ranks, 19, calibrated()), tmp_path)
     text = page(tmp_path / "calibration.html")
     assert answer_of(tmp_path / "calibration.html")["said"].startswith("Yes: ")
     assert "p = 0.4 of 300 magnets" in text
@@ -50,8 +54,8 @@ def test_a_calibration_that_is_off_is_a_warning(changes, part):
 
 def test_sealed_cases_say_how_sure_their_rates_are(tmp_path):
     bins = [{"stated": 0.9, "happened": 1.0, "statements": 20}]
-    sealed_cases.write_sealed_cases(STUDY, CASES, RATES, bins, bins, {("gain", ("gain_x",)): 1},
-                                    tmp_path)
+    write_files(sealed_cases.page(STUDY, CASES, RATES, bins, bins, {("gain", ("gain_x",)): 1}),
+                tmp_path)
     text = page(tmp_path / "sealed_cases.html")
     said = answer_of(tmp_path / "sealed_cases.html")["said"]
     # Clopper and Pearson's interval for 38 of 40, and 1 - 0.025^(1/20) for 0 of 20
@@ -79,7 +83,7 @@ def test_magnetizations_whose_error_bars_are_too_small_are_a_warning(tmp_path, w
     after = Gaussian(nominal, 500.0 * np.eye(len(nominal)))
     truth = nominal + wrong_by * 500.0 * np.where(np.arange(len(nominal)) % 2, 1, -1)
     known = {"prior": Gaussian(nominal, 1e4 * np.eye(len(nominal))), "posterior": after}
-    magnetizations.write_magnetizations(magnet, known, truth, tmp_path, "test", "none.json")
+    write_files(magnetizations.page(magnet, known, truth, "test"), tmp_path)
     found = answer_of(tmp_path / "magnetizations.html")
     assert found["trust"].startswith("Yes: " if sound else "No: ")
     assert f"{0.5 * wrong_by:.2g}\u00a0kA/m" in found["said"]
@@ -96,9 +100,9 @@ def test_sensitivity_says_what_a_block_changes_and_where_to_measure(tmp_path):
              "anywhere": plan | {"mean_sd_over_study_with_as_many_points": 0.41}}
     axis, angle = np.linspace(-0.1, 0.1, 5), np.linspace(0, 6, 8)
     gain = np.arange(1, 4), np.arange(3.0)
-    sensitivity.write_sensitivity(build_magnet(STUDY), Sensitivity(
+    write_files(sensitivity.page(build_magnet(STUDY), Sensitivity(
         1, axis, axis, np.full((5, 5), 1e-9), angle, np.full((8, 4), 2e-3), np.full((8, 4), 3e-3),
-        0.1, {"anywhere": gain}, 8), tmp_path, plans)
+        0.1, {"anywhere": gain}, 8), plans), tmp_path)
     text = page(tmp_path / "sensitivity.html")
     assert "nats" not in text
     first, second = sensitivity.plan_rows(plans)

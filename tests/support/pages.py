@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 from html.parser import HTMLParser
 
 from halbach_fe.core.versions import version
-from halbach_fe.report.page import write_files
+from halbach_fe.report.answer import Answer
+from halbach_fe.report.page import Page, Section, Table, write_files, write_page
+from halbach_fe.report.page_record import PAGE_RECORD
 from halbach_fe.report.result_files import page_of
+
+
+def write_any_page(path, pictures, study=None, provenance=None, answer=None, rows=()):
+    """Write a page with a table and pictures, as those of all commands are."""
+    write_page(path, Page(
+        "any", "Calibration", study, answer or Answer("What?", "That.", "Yes: so.", "Nothing."), {},
+        [Section([Table(rows)])], rows=rows, provenance=provenance or {},
+        figures={each.file: (None, each.caption) for each in pictures}), pictures)
+    if answer is None:  # as of versions of halbach-fe that had no answers
+        record = path.with_name(PAGE_RECORD)
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"answer": None}))
 
 
 class _Parts(HTMLParser):

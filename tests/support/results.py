@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import save, write_page
+from halbach_fe.report.page import save
 from halbach_fe.study.model import Study
 from tests.conftest import DIPOLE, changed, parse_study
+from tests.support.pages import write_any_page
 
 TINY = changed(DIPOLE, name="tiny", array__blocks_per_ring=4, array__recoil_permeability=1.0,
                observation__positions__angles=8, noise={"regions": [
@@ -33,8 +34,7 @@ def results(
                        named=named or {}):
         for name in files:
             write_text(folder / name, f"{name} of {folder.name}")
-        write_page(folder / "page.html", "calibration.html.j2",
-                   save({f"{verb}.png": (FIGURE, f"figure of {verb}")}, folder), study,
-                   answer=said, results={},
-                   rows=[{"order": "2", "size": f"cell of {verb}"}])
+        write_any_page(folder / "page.html",
+                       save({f"{verb}.png": (FIGURE, f"figure of {verb}")}, folder), study,
+                       answer=said, rows=[{"order": "2", "size": f"cell of {verb}"}])
     return folder

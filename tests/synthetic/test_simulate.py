@@ -203,7 +203,7 @@ def test_an_instrument_of_the_study(tmp_path):
 
 def test_output_that_cannot_be_written(tmp_path, capsys, monkeypatch):
     """It is found out before the simulation."""
-    monkeypatch.delattr("halbach_fe.cli.simulate_measurement.simulate_campaign")
+    monkeypatch.setattr("halbach_fe.synthetic.simulate.simulate_campaign", None)
     (tmp_path / "file").write_text("")
     study = tmp_path / "vacuum.toml"
     study.write_text(STUDY.replace("1.05", "1.0"))

@@ -347,12 +347,13 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
     if not declared.columns:
         return _of_h(table.columns)
     count = len(table.columns) - table.added
-    if len(declared.columns) != count:
+    more = declared.columns[count:]  # delimiters at the ends of lines have no column in the table
+    if len(declared.columns) < count or any(text != "-" for text in more):
         raise MeasurementError(must_be(
             "--columns", table.where, f"of {count} columns, as the file has",
             f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
-    for text, column in zip(declared.columns, table.columns[:count], strict=True):
+    for text, column in zip(declared.columns, table.columns[:count], strict=False):
         stated = ColumnName("") if text == "-" else names.parse(text, stated=True)
         if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
             raise MeasurementError(must_be(

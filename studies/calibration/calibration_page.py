@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
+from functools import partial
 from textwrap import wrap
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Ints
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import POSTERIOR, PUBLISHED, figure_of, own_style, save, write_page
+from halbach_fe.report.page import POSTERIOR, PUBLISHED, Page, Section, Table, Text, figure_of
 from halbach_fe.report.words import counted, fraction, p_value
 from halbach_fe.stats.calibration import BINS
 
@@ -43,12 +44,10 @@ def answer(results: Mapping[str, Mapping[str, Any]]) -> Answer:
         "" if off else "halbach-fe infer STUDY --measurements MAP -o DIR", not off and not passed)
 
 
-@own_style
-def write_calibration(
+def page(
     ranks: Mapping[str, Ints], draws: int, results: Mapping[str, Mapping[str, Any]],
-    folder: Path,
-) -> None:
-    """Write calibration.html and ranks.png.
+) -> Page:
+    """Return the page of a calibration, whose calibration.json has the results.
 
     Parameters
     ----------
@@ -59,8 +58,23 @@ def write_calibration(
         Number of posterior draws per repeat.
     results : mapping
         Rows of the page's table by kind of posterior.
-    folder : Path
     """
+    rows = calibration_rows(results)
+    return Page("calibration", "Simulation-based calibration", None, answer(results), results, [
+        Section([Table(rows, "numbers"), Text(
+            "True magnetizations are drawn from the prior. Their field is not that of the model "
+            "that is tested: it is a closed form where the iron is linear, and that of a finer "
+            "mesh where it saturates. The probe reads it with noise, at positions that are moved "
+            "by the stated standard deviation. If the posterior is right, the rank of the true "
+            "value among the posterior draws is uniformly distributed; p is the probability of "
+            "ranks as uneven as these, over all parameters. The controls use wrong posteriors and "
+            "must fail this test.", "small")])], rows=rows, figures={"ranks.png": (
+        partial(_ranks_figure, ranks, draws), "Ranks of the true parameters among draws of the "
+        "posterior, all parameters together; a calibrated posterior gives the horizontal line")})
+
+
+def _ranks_figure(ranks: Mapping[str, Ints], draws: int) -> Figure:
+    """Draw the histogram of the ranks for every kind of posterior."""
     panels_in_a_row = 3  # more would be unreadable on a narrow screen
     columns = min(panels_in_a_row, len(ranks))
     rows = -(-len(ranks) // columns)
@@ -74,12 +88,7 @@ def write_calibration(
         axis.axhline(1 / (draws + 1), color=PUBLISHED)
         axis.set(title="\n".join(wrap(name, 28)), xlabel="rank of the true value", yticks=[])
         axis.title.set_fontsize(9)
-    pictures = save({"ranks.png": (figure, "Ranks of the true parameters among draws of the "
-                                   "posterior, all parameters together; a calibrated posterior "
-                                   "gives the horizontal line")},
-                    folder)
-    write_page(folder / "calibration.html", "calibration.html.j2", pictures, answer=answer(results),
-               rows=calibration_rows(results))
+    return figure
 
 
 def calibration_rows(results: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:

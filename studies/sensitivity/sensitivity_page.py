@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,6 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.files import write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -24,13 +20,15 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     THIRD,
+    Page,
+    Section,
+    Table,
+    Text,
+    csv_file,
     draw_cross_section,
     figure_of,
     label_logarithmic,
     legend_above,
-    own_style,
-    save,
-    write_page,
 )
 from halbach_fe.report.words import flux_density, fraction
 
@@ -93,41 +91,39 @@ def answer(found: Sensitivity, plans: Mapping[str, Mapping[str, Any]]) -> Answer
         "Plan the measurement of your own magnet.", "halbach-fe plan STUDY -o DIR")
 
 
-@own_style
-def write_sensitivity(
-    magnet: Magnet, found: Sensitivity, folder: Path, plans: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Write sensitivity.html, its figures, sensitivity.json and readings.csv.
-
-    ``plans`` are the summaries of measurement plans, by name.
-    """
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["angle_rad", "slot", "one_percent_T", "one_degree_T"])
-    writer.writerows(
-        [angle, slot + 1, found.along[row, slot], found.across[row, slot]]
-        for row, angle in enumerate(found.angle.tolist()) for slot in range(found.along.shape[1]))
-    write_text(folder / "readings.csv", table.getvalue())
-    summary = {
+def page(magnet: Magnet, found: Sensitivity, plans: Mapping[str, Mapping[str, Any]]) -> Page:
+    """Return the page of a sensitivity study; ``plans`` are the summaries of plans, by name."""
+    readings, blocks = found.along.shape
+    return Page("sensitivity", "what the field tells about its blocks", magnet.study,
+                answer(found, plans), {
         "study": magnet.name, "block": found.block, "printed_form_error": found.printed_form,
         "largest_one_percent_T": float(found.along.max()),
         "smallest_one_percent_T": float(found.along.min()),
-        "largest_one_degree_T": float(found.across.max()), "plans": plans}
-    write_text(folder / "sensitivity.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    pictures = save({
-        "derivative.png": (
-            _derivative_figure(magnet, found), f"Change of B if block {found.block} (outlined) has "
-            "1 % more magnetization, on a logarithmic scale: the derivative of B with respect to "
-            "its magnetization, times 1 % of that"),
-        "readings.png": (
-            _sensitivity_of_readings_figure(found), "Change of B at every reading of the circle "
-            "for every block: for 1 % more magnetization, and for a turn by 1 degree"),
-        "information.png": (
-            _uncertainty_of_plans_figure(found), "Uncertainty of all patterns of blocks that "
-            "remains, in the geometric mean, against the number of points"),
-    }, folder)
-    write_page(folder / "sensitivity.html", "sensitivity.html.j2", pictures, study=magnet.study,
-               found=found, rows=plan_rows(plans), answer=answer(found, plans))
+        "largest_one_degree_T": float(found.across.max()), "plans": plans}, [
+        Section([Text(
+            "The derivatives are those of the non-linear problem at the nominal magnet, with the "
+            "differential reluctivity of the iron (the Gateaux derivative). The formula as printed "
+            "in the paper, which takes the reluctivity at the field of the derivative, deviates on "
+            f"the circle by up to {100 * found.printed_form:.2g} %.", "small")]),
+        Section([Table(plan_rows(plans), "numbers"), Text(
+            "Uncertainty is the geometric mean of the standard deviations of all patterns of "
+            "blocks (the principal axes of the posterior).", "small")], "Where to measure")],
+        rows=plan_rows(plans), figures={
+            "derivative.png": (
+                partial(_derivative_figure, magnet, found), f"Change of B if block {found.block} "
+                "(outlined) has 1 % more magnetization, on a logarithmic scale: the derivative of "
+                "B with respect to its magnetization, times 1 % of that"),
+            "readings.png": (
+                partial(_sensitivity_of_readings_figure, found), "Change of B at every reading of "
+                "the circle for every block: for 1 % more magnetization, and for a turn by 1 "
+                "degree"),
+            "information.png": (
+                partial(_uncertainty_of_plans_figure, found), "Uncertainty of all patterns of "
+                "blocks that remains, in the geometric mean, against the number of points")},
+        files={"readings.csv": csv_file({
+            "angle_rad": np.repeat(found.angle, blocks),
+            "slot": np.tile(np.arange(1, blocks + 1), readings),
+            "one_percent_T": found.along.ravel(), "one_degree_T": found.across.ravel()}, {})})
 
 
 def plan_rows(plans: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,13 +23,14 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     SMALL,
+    Page,
+    Section,
+    Table,
+    Text,
     figure_of,
     legend_above,
-    own_style,
-    save,
-    write_page,
 )
-from halbach_fe.report.words import fraction
+from halbach_fe.report.words import counted, fraction
 from halbach_fe.study.model import Study
 
 Confusion = Mapping[tuple[str, tuple[str, ...]], int]
@@ -107,13 +108,12 @@ def title_of_hidden(name: str) -> str:
     return name.replace("_", " ")
 
 
-@own_style
-def write_sealed_cases(
+def page(
     study: Study, results: Sequence[Mapping[str, Any]], rates: Mapping[str, float],
     reliability: Sequence[Mapping[str, float]], naming: Sequence[Mapping[str, float]],
-    confusion: Confusion, folder: Path,
-) -> None:
-    """Write sealed_cases.html and its figures.
+    confusion: Confusion,
+) -> Page:
+    """Return the page of sealed cases, whose rates and bins are in summary.json.
 
     Parameters
     ----------
@@ -130,32 +130,36 @@ def write_sealed_cases(
         The same of the likeliest effect of each case only.
     confusion : mapping
         See `Confusion`.
-    folder : Path
     """
-    drawn = {
+    rows = [{
+        "hidden": " and ".join(map(title_of_hidden, case["hidden"])) or (
+            f"outside the catalogue: {case['outside']}" if case["outside"] else "nothing"),
+        "named": "; ".join(" or ".join(map(title_of_hidden, names)) for names in case["named"])
+        or ("something unknown" if case["unknown"] else "nothing"),
+        "chi² before": f"{case['chi2_before']:.3g}", "after": f"{case['chi2_after']:.3g}"}
+        for case in results]
+    title = "is what is hidden found, and only that?"
+    return Page("sealed-cases", title, study, answer(rates), {}, [
+        Section([Table(rate_rows(rates), "numbers"), Text(
+            f"{counted(len(results), 'simulated campaign')} of magnets and maps that were drawn: "
+            "fields by magpylib and NGSolve, never by the model that explains them. A case counts "
+            "as detectable if the hidden effect's own log Bayes factor is above 5; effects that a "
+            "map cannot tell apart count as one. The two controls must fail: labels that are "
+            "shuffled, and a detector that does not integrate the blocks out.", "small")]),
+        Section([Table(rows)], "Every case")], rows=rows, figures={
         "confusion.png": (
-            _confusion(confusion), "Number of cases by the effect that was hidden alone and by the "
-            "effect that was identified. Effects that a map cannot distinguish count as one"),
+            partial(_confusion, confusion), "Number of cases by the effect that was hidden alone "
+            "and by the effect that was identified. Effects that a map cannot distinguish count as "
+            "one"),
         "reliability.png": (
-            _reliability({"every effect": reliability, "the likeliest effect": naming}),
+            partial(_reliability, {"every effect": reliability, "the likeliest effect": naming}),
             "How often effects were present, against the probability that was stated: every effect "
             "of every case, and the likeliest one of each case. Bars are binomial 95 % intervals. "
             "The expected calibration error is the mean distance of the points on the right from "
             "the line, weighted with their numbers of statements"),
         "gap.png": (
-            _gap(results), "Chi² per held-out reading of every case, before and after the "
-            "diagnosis; the band is 0.9 to 1.1")}
-    write_page(folder / "sealed_cases.html", "sealed_cases.html.j2", save(drawn, folder),
-               study=study, cases=len(results), answer=answer(rates), rates=rate_rows(rates),
-               rows=[{
-                   "hidden": " and ".join(map(title_of_hidden, case["hidden"])) or (
-                       f"outside the catalogue: {case['outside']}" if case["outside"]
-                       else "nothing"),
-                   "named": "; ".join(" or ".join(map(title_of_hidden, names))
-                                      for names in case["named"])
-                   or ("something unknown" if case["unknown"] else "nothing"),
-                   "chi² before": f"{case['chi2_before']:.3g}",
-                   "after": f"{case['chi2_after']:.3g}"} for case in results])
+            partial(_gap, results), "Chi² per held-out reading of every case, before and after the "
+            "diagnosis; the band is 0.9 to 1.1")}, stored=False)
 
 
 def _confusion(confusion: Confusion) -> Figure:

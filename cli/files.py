@@ -1,0 +1,375 @@
+"""The verbs that write or convert a single file: studies, maps, tables of blocks."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from halbach_fe.cli import common
+from halbach_fe.cli.options import (
+    AXES,
+    JSON,
+    MAP_FORMAT,
+    TABLE_FORMAT,
+    declared,
+    input_file,
+    names,
+    option,
+    path,
+    positive,
+    positive_number,
+    verb,
+)
+from halbach_fe.core.errors import CommandLineError, MeasurementError, must_be
+
+if TYPE_CHECKING:
+    from halbach_fe.core.arrays import Floats
+    from halbach_fe.measurement.formats.files import ImportedFile
+
+
+def _template(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a new study."""
+    from halbach_fe.study.template import MagnetTemplate
+
+    template = MagnetTemplate()
+    parser.add_argument("study", type=path, metavar="STUDY", help="file to write (TOML)")
+    strength = parser.add_mutually_exclusive_group()
+    rings = parser.add_mutually_exclusive_group()
+    groups = {"remanence-T": strength, "inner-radius-m": rings}
+    for name, kind, text in (
+            ("multipole-order", positive, "main multipole: 1 dipole, 2 quadrupole, ..."),
+            ("blocks-per-ring", positive, "number of blocks in each ring"),
+            ("rings", positive, "number of rings along z"),
+            ("inner-radius-m", positive_number, "inner radius of the blocks"),
+            ("outer-radius-m", positive_number, "outer radius of the blocks (default: 1.8 "
+             "times the inner radius)"),
+            ("ring-length-m", positive_number, "length of a ring along z; without it the "
+             "study is a cross-section"),
+            ("remanence-T", positive_number, "remanence of the blocks")):
+        default = getattr(template, name.replace("-", "_"))
+        groups.get(name, parser).add_argument(
+                            f"--{name}", type=kind, metavar="N" if kind is positive else "X",
+                            help=text if "default" in text or default is None
+                            else f"{text} (default: {default})")
+    parser.add_argument("--shape", choices=("sector", "trapezoid", "cuboid"),
+                        help=f"shape of the blocks (default: {template.shape})")
+    strength.add_argument("--material", metavar="GRADE",
+                        help="grade of the blocks, such as N42, in place of the remanence")
+    rings.add_argument("--inner-radii-m", type=_radii, metavar="X,X,...", default=(),
+                       help="inner radii of rings that differ, in the order of z; needs "
+                       "--ring-length-m")
+    rings.add_argument("--free-blocks", type=path, metavar="TABLE",
+                       help="table of the blocks (CSV or HDF5), in place of rings")
+    rings.add_argument("--cube-m", type=positive_number, metavar="X",
+                       help="edge of cubes in rings on --radius-m; sets shape, radii and length")
+    parser.add_argument("--radius-m", type=positive_number, metavar="X",
+                        help="radius of the middles of the cubes of --cube-m")
+    parser.add_argument("--iron-ring", action="store_true",
+                        help="add an iron tube around the blocks")
+    parser.add_argument("--steel", metavar="NAME",
+                        help="steel of the iron tube, whose magnetization curve is known, such as "
+                        "aisi_1010; adds the tube")
+    parser.add_argument("--dsv-m", type=positive_number, metavar="X",
+                        help="diameter of a spherical volume in the middle, on whose surface the "
+                        "field is measured, and in which that of a dipole is to be homogeneous "
+                        "(default: circles along the magnet)")
+
+
+def _radii(text: str) -> tuple[float, ...]:
+    """Return the radii in m of a list, or refuse it."""
+    return tuple(map(positive_number, text.split(",")))
+
+
+@verb(_template)
+def new(arguments: argparse.Namespace) -> int:
+    """Write a commented study file to start from.
+
+    The file is a valid study, and a comment explains every key.
+    """
+    from halbach_fe.magnets import new_magnet
+    from halbach_fe.study.template import OUTER_RADIUS, MagnetTemplate, write_new_study
+
+    given = {name: value for name, value in vars(arguments).items()
+             if name in MagnetTemplate.__dataclass_fields__ and value}
+    _check(given, arguments.radius_m)
+    if "cube_m" in given:
+        edge, radius = given["cube_m"], arguments.radius_m
+        given |= {"shape": "cuboid", "ring_length_m": edge,
+                  "inner_radius_m": round(radius - edge / 2, 9),
+                  "outer_radius_m": round(radius + edge / 2, 9)}
+    if "steel" in given:
+        given["iron_ring"] = True
+    inner = max([*given.get("inner_radii_m", ()), given.get("inner_radius_m", 0.0)])
+    if inner:
+        given.setdefault("outer_radius_m", round(OUTER_RADIUS * inner, 6))
+    path, folder = arguments.study, arguments.study.parent
+    if "free_blocks" in given:
+        given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)
+    magnet, template = new_magnet(MagnetTemplate(**given), path.stem, folder)
+    if template.dsv_m is not None:
+        from halbach_fe.response.homogeneity import Region, region_points
+
+        region_points(magnet, Region.sphere(template.dsv_m / 2))  # refuses one that is not in air
+    write_new_study(path, template)
+    name = str(path) if not str(path).startswith("-") else f"./{path}"
+    common.say(f"Wrote {path}. Its noise suits the field of the magnet: "
+               f"{1e6 * template.sigma_T:g} µT for a reading, {1e6 * template.position_sd_m:g} µm "
+               f"for a position. Next: halbach-fe solve {shlex.quote(name)} -o DIR")
+    return 0
+
+
+def _check(given: Mapping[str, object], radius_m: float | None) -> None:
+    """Refuse options that the study would not show beside others.
+
+    Raises
+    ------
+    CommandLineError
+    """
+    if "inner_radii_m" in given and "ring_length_m" not in given:
+        raise CommandLineError(must_be(
+            "--ring-length-m", "the command line", "given with --inner-radii-m", "nothing",
+            "Rings that follow each other along z have a length."))
+    rings = given.get("rings")
+    if isinstance(rings, int) and rings > 1 and not given.keys() & {
+            "ring_length_m", "cube_m", "free_blocks"}:
+        raise CommandLineError(must_be(
+            "--ring-length-m", "the command line", "given with --rings", "nothing",
+            "Rings that follow each other along z have a length."))
+    if "dsv_m" in given and not given.keys() & {"ring_length_m", "cube_m", "free_blocks"}:
+        raise CommandLineError(must_be(
+            "--ring-length-m", "the command line", "given with --dsv-m", "nothing",
+            "A cross-section has no volume."))
+    edge = given.get("cube_m")
+    if isinstance(edge, float) and radius_m is not None and not edge < 2 * radius_m:
+        raise CommandLineError(must_be(
+            "--cube-m", "the command line", f"less than twice --radius-m, {radius_m:g}, at which "
+            "the cubes have their middles", f"{edge:g}", "Both are in metres."))
+    if ("cube_m" in given) != (radius_m is not None):
+        raise CommandLineError(must_be(
+            "--radius-m", "the command line", "given together with --cube-m", "one of them",
+            "Cubes have their middles at this radius."))
+    of_table = given.keys() - {"free_blocks", "multipole_order", "iron_ring", "steel", "dsv_m"}
+    for name, others, why in (
+            ("free_blocks", of_table, "The table has it."),
+            ("inner_radii_m", given.keys() & {"rings"}, "There is a ring of each radius."),
+            ("cube_m", given.keys() & {"shape", "outer_radius_m", "ring_length_m"},
+             "The cube has it.")):
+        if name in given and others:
+            raise CommandLineError(must_be(
+                f"--{min(others).replace('_', '-')}", "the command line",
+                f"left out with --{name.replace('_', '-')}", "both", why))
+
+
+def _calibration(parser: argparse.ArgumentParser) -> None:
+    """Add --calibration."""
+    from halbach_fe.measurement.calibration import HEADER
+
+    parser.add_argument("--calibration", type=input_file, metavar="TABLE",
+                        help="CSV file with the errors of the probe's sensors against a reference, "
+                        "by which the readings are corrected; its header is like "
+                        f"{HEADER.replace('%', '%%')}")
+
+
+@verb(
+    option("file", type=input_file, metavar="FILE", help="map as it was delivered"),
+    option("-o", "--output", type=path, required=True, metavar="MAP",
+           help="map to write: .csv, .h5 or .vtu"),
+    MAP_FORMAT, _calibration, JSON)
+def import_map(arguments: argparse.Namespace) -> int:
+    """Convert a measured map from another file format, to metres, tesla and columns of halbach-fe.
+
+    Reads tables of columns (separated by commas, semicolons, tabs or spaces, with or without a
+    header), Opera's .table files, text files exported by COMSOL, maps of G4beamline, BDSIM, SRW and
+    FLUKA, and openPMD-beamphysics field meshes. Units, columns and constant coordinates that the
+    file does not state must be given as options; nothing is guessed.
+    """
+    import numpy as np
+
+    from halbach_fe.measurement.calibration import read_calibration
+    from halbach_fe.measurement.field_map import refuse_total_field, write_map
+    from halbach_fe.measurement.formats.declared import DeclaredFormat
+    from halbach_fe.measurement.formats.files import import_map
+
+    common.own_file(arguments, arguments.file, *filter(None, [arguments.calibration]))
+    imported = import_map(arguments.file, declared(arguments, DeclaredFormat), arguments.format)
+    corrections = {}
+    if arguments.calibration:
+        refuse_total_field(imported.data, "--calibration")
+        if imported.imported.cylindrical:
+            raise MeasurementError(must_be(
+                "--calibration", arguments.file.name, "beside Bx, By and Bz as the sensors read "
+                "them", "beside Br and Bphi", "Import the readings of the three sensors."))
+        before, imported = imported.data["B_T"].values, imported.with_data(
+            read_calibration(arguments.calibration).corrected(
+                imported.data, arguments.file.name))
+        corrections["largest_correction_T"] = float(
+            np.nanmax(np.abs(imported.data["B_T"].values - before)))
+    write_map(imported.data, arguments.output)
+    properties = _properties(imported) | corrections
+    if arguments.json:
+        common.print_json(properties | {"map": str(arguments.output)})
+    else:
+        common.print_table([{"property": key, "value": _text(value)}
+                            for key, value in properties.items() if key != "remarks"],
+                           f"Read as {imported.format}")
+        for remark in imported.imported.remarks:
+            common.say(remark)
+        common.say(f"Map: {arguments.output}")
+    return 0
+
+
+def _properties(file: ImportedFile) -> dict[str, object]:
+    """Return the properties of the imported map as plain data, for the user to check."""
+    import numpy as np
+
+    from halbach_fe.measurement.field_map import TOTAL_COLUMN, UNDIRECTED, is_undirected, points_of
+
+    points, field = points_of(file.data), file.data["B_T"].values
+    columns: dict[str, Floats] = {name: field[:, i] for i, name in enumerate(AXES)}
+    if TOTAL_COLUMN in file.data:
+        columns["abs"] = file.data[TOTAL_COLUMN].values
+    columns = {name: values for name, values in columns.items() if not np.isnan(values).all()}
+    return {
+        "format": file.format, "readings": len(points),
+        "components": [UNDIRECTED] if is_undirected(file.data) else list(columns),
+        "length_units": list(file.imported.length_units),
+        "field_units": list(file.imported.field_units),
+        "ignored_columns": list(file.imported.ignored),
+        "also_read": [name for name in ("sigma_T", "time_s", "scan") if name in file.data],
+        "remarks": list(file.imported.remarks),
+        "points_without_reading": file.imported.dropped,
+        "from_m": points.min(axis=0).tolist(), "to_m": points.max(axis=0).tolist(),
+        "min_B_T": [float(np.nanmin(values)) for values in columns.values()],
+        "max_B_T": [float(np.nanmax(values)) for values in columns.values()]}
+
+
+def _text(value: object) -> str:
+    """Return a value as text for the table."""
+    if isinstance(value, list):
+        return ", ".join(
+            f"{element:.6g}" if isinstance(element, float) else str(element) for element in value)
+    return str(value)
+
+
+def _block_columns(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what a table of blocks holds."""
+    from halbach_fe.measurement.formats.blocks import QUANTITIES
+
+    def fixed(text: str) -> dict[str, str]:
+        """Parse values such as ``volume=12 cm^3,type=1``."""
+        pairs = [part.partition("=") for part in text.split(",")]
+        for name, _, value in pairs:
+            if name.strip() not in QUANTITIES or not value.strip():
+                raise argparse.ArgumentTypeError(
+                    f"must be like 'volume=12 cm^3', with one of {', '.join(QUANTITIES)}, not "
+                    f"{text!r}")
+        return {name.strip(): value.strip() for name, _, value in pairs}
+
+    parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
+                        help=f"content of each column: {', '.join(QUANTITIES)}, or - for one that "
+                        "is ignored; a unit may follow, as in moment_x[mA m^2], volume[mm^3]")
+    parser.add_argument("--fixed", type=fixed, default={}, metavar="NAME=VALUE,...",
+                        help="what all blocks share and the table does not say, as in "
+                        "'volume=12 cm^3,sigma=0.2 %%,type=1,shape=cuboid'")
+
+
+def _axes(text: str) -> tuple[str, ...]:
+    """Parse three axes, each once, with a sign or not."""
+    if sorted(one.removeprefix("-") for one in names(text)) != sorted(AXES):
+        raise argparse.ArgumentTypeError(f"must be x, y and z in some order, not {text!r}")
+    return names(text)
+
+
+@verb(
+    option("file", type=input_file, metavar="FILE", help="table as it is: text or .xlsx"),
+    option("-o", "--output", type=path, required=True, metavar="TABLE",
+           help="table to write (CSV)"),
+    TABLE_FORMAT, _block_columns,
+    option("--axes", type=_axes, default=AXES, metavar="AXIS,AXIS,AXIS",
+           help="axis along which each component of the strength lies, as z,-y,x; for measured "
+           "blocks x is radial, y azimuthal, z that of the magnet"),
+    option("--along-block", action="store_true",
+           help="components of the strength of free blocks are along their own axes"),
+    JSON)
+def import_blocks(arguments: argparse.Namespace) -> int:
+    """Convert a table of blocks from own columns and units to one that halbach-fe reads.
+
+    A table with positions becomes one of free blocks, which a study names as array.free_blocks; any
+    other one becomes one of measured blocks, for prior, sort and infer. FILE is text or a workbook
+    (.xlsx). What the table does not say must be given as options; nothing is guessed.
+    """
+    from halbach_fe.measurement.block_table import BlockTable, write_blocks
+    from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
+    from halbach_fe.study.free_blocks_file import write_free_blocks
+
+    common.own_file(arguments, arguments.file)
+    table = import_blocks(arguments.file, declared(arguments, DeclaredBlocks))
+    kind = "measured blocks" if isinstance(table, BlockTable) else "free blocks"
+    if isinstance(table, BlockTable):
+        write_blocks(table, arguments.output)
+        after = f"halbach-fe prior STUDY {arguments.output} -o DIR"
+    else:
+        write_free_blocks(table, arguments.output)
+        after = f"halbach-fe new STUDY --free-blocks {arguments.output}"
+    if arguments.json:
+        common.print_json({"blocks": len(table), "kind": kind, "table": str(arguments.output)})
+    else:
+        common.say(f"Wrote {len(table)} {kind}: {arguments.output}. Next: {after}")
+    return 0
+
+
+def _export_format(parser: argparse.ArgumentParser) -> None:
+    """Add --format."""
+    from halbach_fe.measurement.formats.files import WRITERS
+
+    parser.add_argument("--format", choices=(*WRITERS, "blocks"), required=True,
+                        help="format of FILE")
+
+
+@verb(
+    option("input", type=input_file, metavar="MAP",
+           help="map in m and T (CSV, HDF5 or VTU); for the format blocks, a study"),
+    _export_format,
+    option("-o", "--output", type=path, required=True, metavar="FILE", help="file to write"))
+def export(arguments: argparse.Namespace) -> int:
+    """Write a map, or the blocks of a magnet, in the file format of another program.
+
+    The formats openpmd (openPMD-beamphysics field mesh, HDF5), bdsim (BDSIM's three-dimensional
+    text format) and geant4 (table of Geant4's PurgMagTabulatedField3D) need points on a regular
+    grid; csv and vtu accept any points.
+
+    With the format blocks, the input is a study, and the file a table of free blocks (CSV or HDF5):
+    all blocks where and as they are, with their exceptions. A study reads it as array.free_blocks.
+    """
+    from halbach_fe.geometry.free_blocks import blocks_table
+    from halbach_fe.geometry.magnet import build_magnet
+    from halbach_fe.measurement.field_map import read_map
+    from halbach_fe.measurement.formats.files import export_map
+    from halbach_fe.study.free_blocks_file import write_free_blocks
+    from halbach_fe.study.reader import read_study
+
+    if arguments.format != "blocks":
+        common.own_file(arguments, arguments.input)
+        data = read_map(arguments.input)
+        export_map(data, arguments.format, arguments.output)
+        common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")
+        return 0
+    columns = blocks_table(build_magnet(read_study(arguments.input)))
+    common.own_file(arguments, arguments.input, *_free_blocks_files(arguments.input))
+    write_free_blocks(columns, arguments.output)
+    common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}")
+    return 0
+
+
+def _free_blocks_files(study: Path) -> list[Path]:
+    """Return the file of the free blocks of a valid study, if it has one.
+
+    Written over it, a table would have the study's exceptions, which the study then adds again.
+    """
+    table = tomllib.loads(study.read_text("utf-8-sig"))["array"].get("free_blocks", {})
+    return [study.parent / table["file"]] if "file" in table else []

@@ -1,0 +1,500 @@
+"""The verbs that compute or design a magnet as its study states it, or as it was measured."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from halbach_fe.cli import common
+from halbach_fe.cli.common import question, say
+from halbach_fe.cli.options import (
+    BLOCKS,
+    JSON,
+    MAP,
+    MULTIPOLES,
+    OBJECTIVE,
+    OUTPUT,
+    POSTERIOR,
+    SEED,
+    SOLVED,
+    STUDY,
+    at_least,
+    count,
+    dry_run,
+    finite_number,
+    input_file,
+    map_format,
+    option,
+    positive,
+    positive_number,
+    region,
+    verb,
+    whole,
+    within,
+)
+from halbach_fe.core.errors import StudyError
+from halbach_fe.core.numbers import ACROSS, DENSITY, DRAWS, HIGHEST_DEGREE
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from halbach_fe.core.arrays import Floats
+    from halbach_fe.geometry.magnet import Magnet
+    from halbach_fe.report.page import Page
+    from halbach_fe.response.field_on_lines import FieldOnLines
+
+
+@question(SOLVED, dry_run)
+def solve(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
+    """Compute the field of a study's nominal magnet at the study's positions.
+
+    Iron with an H(B) curve is solved by Newton's method. Writes field_map.h5, field_map.csv and
+    field_map.vtu (for ParaView), readings.csv with the readings of the study, multipoles.csv if the
+    study's positions are circles, report.html, and the run folders of GetDP, which can be run by
+    hand.
+    """
+    from halbach_fe.core.pace import duration
+    from halbach_fe.response.solution import solve, study_observation
+    from halbach_fe.solver.formulation_choice import choose_route
+    from halbach_fe.solver.session import newton_history
+
+    started = time.monotonic()
+    many = len(magnet.blocks) > 10_000  # which take minutes: the command says how far it is
+    if arguments.dry_run or (many and not magnet.is_vacuum):
+        from halbach_fe.response.resource_estimate import TIME_FACTOR, estimate_solve
+
+        cost = estimate_solve(magnet, study_observation(magnet), common.jobs(arguments))
+        if arguments.dry_run:
+            return common.print_estimate(cost, arguments.json)
+        say(f"{cost.blocks} blocks that magnetize each other, or iron: about "
+            f"{duration(cost.seconds)}, within a factor of {TIME_FACTOR:g}, and "
+            f"{cost.memory_GiB:.2g} GiB. {cost.warning or ''}")
+    elif many:
+        say(f"{len(magnet.blocks)} blocks: first their field at the positions and far outside.")
+    with common.session(arguments, magnet.study) as session:
+        solution = solve(magnet, session)
+    seconds = round(time.monotonic() - started, 2)
+    if many:
+        say(f"Solved in {seconds} s; now its files and the page, which draws a part of the blocks.")
+    from halbach_fe.report.solution import page
+
+    summary: dict[str, object] = {"seconds": seconds, "output": str(arguments.output)}
+    if magnet.is_nonlinear and choose_route(magnet, solution.points) != "moments":
+        summary["newton_residuals"] = newton_history(arguments.output)
+    made = page(solution)
+    return replace(made, summary={**made.summary, **summary},
+                   provenance={**made.provenance, "solved in": f"{seconds} s"})
+
+
+@question(SOLVED, dry_run)
+def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
+    """Estimate the error of a study's field: refinement, a farther boundary, the dual formulation.
+
+    Solves the nominal array at the study's positions on two coarser meshes, the study's own and a
+    finer one, with the boundary farther away, and by the dual formulation if the route has one.
+    Writes verification.json, verification.csv (changes of the field at every point),
+    verification.html and its figures.
+    """
+    from halbach_fe.report.verification import page
+    from halbach_fe.response.discretization_error import verify
+    from halbach_fe.response.resource_estimate import estimate_verify
+
+    if arguments.dry_run:
+        return common.print_estimate(estimate_verify(magnet, common.jobs(arguments)),
+                                     arguments.json)
+    exact = magnet.is_vacuum and magnet.study.solver.method != "direct"
+    with common.session(arguments, magnet.study) as session:
+        return page(verify(magnet, session, say=lambda purpose: (
+            None if exact else say(f"solving {purpose}"))))
+
+
+@question(
+    SOLVED,
+    *(option(f"--{end}-m", type=finite_number, nargs=3, required=True, metavar=("X", "Y", "Z"),
+             help=f"where the line goes {end}") for end in ("from", "to")),
+    option("--count", type=partial(at_least, 3), default=201, metavar="N",
+           help="number of points of a line (default: 201)"),
+    option("--across-m", type=finite_number, nargs=2, default=(0.0, 0.0), metavar=("U", "V"),
+           help="half widths of a grid of parallel lines: of a line along z those along x and y"),
+    option("--lines", type=positive, default=5, metavar="N",
+           help="number of lines along each half width (default: 5)"),
+    POSTERIOR, option("--inside", action="store_true", help="points may lie inside blocks and iron"))
+def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
+    """Compute B and H on lines with error bars, their first and second integrals, and kick maps.
+
+    The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With
+    --posterior the bars are those of the measured magnet, otherwise those of the study's prior.
+    With --inside points may lie inside blocks and iron. Writes field.csv, field_map.csv (B as a
+    map, which halbach-fe export turns into other formats) and integrals.csv, and for a grid of
+    lines kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
+    """
+    import numpy as np
+
+    from halbach_fe.api import field
+    from halbach_fe.core.files import write_text
+    from halbach_fe.core.tables import csv_text
+    from halbach_fe.inference.same_magnet import disagreement_of
+    from halbach_fe.measurement.field_map import field_map, write_map
+    from halbach_fe.report.words import with_error
+    from halbach_fe.response.field_on_lines import Lines
+    from halbach_fe.study.types import COMPONENTS
+
+    offsets = tuple(np.linspace(-half, half, arguments.lines) if half else np.zeros(1)
+                    for half in arguments.across_m)
+    lines = Lines(np.array(arguments.from_m), np.array(arguments.to_m), (offsets[0], offsets[1]),
+                  arguments.count)
+    read = common.posterior_of(arguments, magnet)
+    with common.session(arguments, magnet.study) as session:
+        found = field(magnet, lines, session, read, arguments.inside)
+    folder = arguments.output
+    write_text(folder / "field.csv", csv_text(_points(found)))
+    write_map(field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
+        "study": magnet.name}), folder / "field_map.csv")
+    grid = np.meshgrid(*offsets, indexing="ij")
+    columns: dict[str, Floats] = {"u_m": grid[0].ravel(), "v_m": grid[1].ravel()}
+    for order, unit in ((1, "T_m"), (2, "T_m2")):
+        mean, sd = found.integrals(order)
+        for axis, values, bars in zip(COMPONENTS, mean.T, sd.T, strict=True):
+            columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
+    columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
+    if min(map(len, offsets)) > 1:
+        kicks = found.kicks()
+        for across, (kick, sd) in zip("uv", kicks, strict=True):
+            columns |= {f"kick_{across}_T2_m2": kick.ravel(),
+                        f"sd_kick_{across}_T2_m2": sd.ravel()}
+        write_text(folder / "kick_map.txt", kick_map(
+            found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
+    write_text(folder / "integrals.csv", csv_text(columns))
+    doubt = disagreement_of(read)
+    if arguments.json:
+        common.print_json({"lines": len(lines.points), "points_per_line": lines.count,
+                           "reservation": doubt or None, "folder": str(folder),
+                           **{name: values.tolist() for name, values in columns.items()}})
+        return 0
+    middle = len(columns["u_m"]) // 2
+    common.print_table([{
+        "component": axis, **{
+            f"{name} integral, {unit}": with_error(columns[f"I{order}{axis}_{key}"][middle],
+                                                   columns[f"sd_I{order}{axis}_{key}"][middle])
+            for order, name, unit, key in ((1, "first", "T m", "T_m"), (2, "second", "T m²",
+                                                                         "T_m2"))}}
+        for axis in COMPONENTS], "Integrals of B along the middle line")
+    if doubt:
+        say(doubt)
+    say(f"Wrote {lines.points.shape[0]} lines of {lines.count} points: {folder}")
+    return 0
+
+
+def _points(found: FieldOnLines) -> dict[str, NDArray[Any]]:
+    """Return the columns of the table of points."""
+    from halbach_fe.study.types import COMPONENTS
+
+    strength, strength_sd = found.strength
+    columns: dict[str, NDArray[Any]] = {}
+    for name, values in (("{}_m", found.lines.points), ("B{}_T", found.mean),
+                         ("sd_B{}_T", found.sd), ("H{}_A_per_m", strength),
+                         ("sd_H{}_A_per_m", strength_sd)):
+        columns |= {name.format(axis): values[..., number].ravel()
+                    for number, axis in enumerate(COMPONENTS)}
+    return columns | {"in_block": found.in_block.ravel()}
+
+
+def kick_map(length: float, offsets: tuple[Floats, ...], kicks: tuple[Floats, Floats]) -> str:
+    """Return a kick map in the text format of Radia; rows begin at the highest offset."""
+    text = ["# kick map of halbach-fe", "# Length [m]", f"{length:.9g}",
+            "# Number of Horizontal Points", f"{len(offsets[0])}",
+            "# Number of Vertical Points", f"{len(offsets[1])}"]
+    for name, kick in zip(("Horizontal", "Vertical"), kicks, strict=True):
+        text += [f"# {name} 2nd Order Kick [T2m2]", "START",
+                 "\t" + "\t".join(f"{u:.9g}" for u in offsets[0])]
+        text += ["\t".join([f"{offsets[1][row]:.9g}", *(f"{value:.12g}" for value in kick[:, row])])
+                 for row in range(len(offsets[1]) - 1, -1, -1)]
+    return "\n".join(text) + "\n"
+
+
+@question(SOLVED, POSTERIOR, MULTIPOLES)
+def multipoles(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Compute the multipoles of a magnet, with their standard deviations.
+
+    With --posterior they are those of the measured magnet, otherwise those that the study's prior
+    predicts. A 3D magnet has two tables: of the field integrated along z, and of the circle at
+    --at-z-m (default: the middle of the magnet). Writes multipoles.csv, multipoles.json,
+    multipoles.html and its figures.
+    """
+    from halbach_fe.api import multipoles
+    from halbach_fe.report.multipoles import page
+
+    posterior = common.posterior_of(arguments, magnet)
+    with common.session(arguments, magnet.study) as session:
+        return page(replace(multipoles(magnet, session, common.reference(arguments), posterior),
+                            limit=arguments.limit_units))
+
+
+@question(
+    SOLVED, map_format("--measurements"), POSTERIOR,
+    option("--measurements", type=input_file, metavar="MAP",
+           help="measured map, whose own homogeneity is shown beside the magnet's"),
+    region,
+    option("--degrees", type=int, choices=range(1, HIGHEST_DEGREE + 1), metavar="L",
+           help=f"largest degree of the spherical harmonics, 1 to {HIGHEST_DEGREE} (default: 6)"))
+def homogeneity(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Compute how homogeneous the field of a magnet is in a region, in ppm and with error bars.
+
+    The region is a sphere, an ellipsoid or a cylinder: by default that of the study's table
+    [homogeneity], or else the sphere about the centre of the magnet of half the radius of the bore.
+    With --posterior the magnet is the measured one, otherwise those that the study's prior allows.
+    With --measurements the homogeneity of the map itself is beside it, of a harmonic fit of its
+    readings. Writes homogeneity.json, harmonics.csv if the region is a sphere, homogeneity.html and
+    its figures.
+    """
+    from halbach_fe.api import homogeneity
+    from halbach_fe.report.homogeneity import page
+    from halbach_fe.response.homogeneity import SHOWN_DEGREES
+
+    within_it, posterior = common.region_of(arguments), common.posterior_of(arguments, magnet)
+    data = (common.read_one(arguments, arguments.measurements) if arguments.measurements
+            else None)
+    with common.session(arguments, magnet.study) as session:
+        return page(homogeneity(magnet, session, within_it, posterior,
+                                arguments.degrees or SHOWN_DEGREES, data))
+
+
+def _density(text: str) -> float:
+    """Parse a density in kg/m^3, or refuse one that no magnet has: 7.5 is one in g/cm^3."""
+    try:
+        return within(finite_number, *DENSITY)(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{error}; 7.5 g/cm^3 are 7500 kg/m^3") from None
+
+
+@question(
+    SOLVED,
+    option("--order", type=input_file, metavar="CSV",
+           help="table whose column block names the blocks in the order in which they are inserted "
+           "(default: ring by ring, slot by slot)"),
+    option("--density-kg-per-m3", type=_density, metavar="D",
+           help="density of the blocks (default: that of their grade, or 7500)"),
+    option("--price-per-kg", type=positive_number, metavar="P",
+           help="price of the blocks per kg, in any currency"))
+def forces(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Compute forces and torques on every block, in place and while the magnet is assembled.
+
+    Each block is looked at twice: with all others in place, and as the next one to be inserted,
+    with the blocks before it in place (by default ring by ring, slot by slot). Writes forces.csv,
+    forces.json, forces.html and its figure, with the mass of the magnet.
+    """
+    from halbach_fe.design.forces import forces
+    from halbach_fe.measurement.block_table import read_order
+    from halbach_fe.report.forces import page
+    from halbach_fe.solver.separate_blocks import present_blocks
+
+    names = [block.name for block in present_blocks(magnet.blocks)]
+    order = read_order(arguments.order, names) if arguments.order else None
+    with common.session(arguments, magnet.study) as session:
+        return page(forces(magnet, session, order, arguments.density_kg_per_m3,
+                           arguments.price_per_kg))
+
+
+@question(SOLVED, option("--across", type=within(whole, *ACROSS), metavar="N",
+                         help="cells across the thickness of a block (default: 6)"))
+def demagnetization(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Map how near the blocks are to the knee of their demagnetization curve when they are hot.
+
+    The study's table `demagnetization` states coercivity, coefficients and temperature of the
+    material. Writes demagnetization.html and its figures, demagnetization.json, demagnetization.csv
+    (a row per block) and demagnetization.vtu (cells, for ParaView).
+    """
+    from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
+    from halbach_fe.report.demagnetization import page
+
+    with common.session(arguments, magnet.study) as session:
+        return page(demagnetization_map(magnet, session, arguments.across or ACROSS))
+
+
+@verb(SOLVED, region, SEED)
+def design(arguments: argparse.Namespace) -> int:
+    """Search for the rings of a magnet whose field in a region is homogeneous.
+
+    The rings to choose from (radii, layers, sizes of blocks), the least field and the largest mass
+    are [design] of the study. Writes study.designed.toml, the study with the best rings, rings.csv,
+    design.json, design.html with the designs of larger fields, and its figures.
+    """
+    from halbach_fe.design.ring_design import design_rings
+    from halbach_fe.report.ring_design import page
+    from halbach_fe.study.reader import read_study
+
+    study = read_study(arguments.study)
+    with common.session(arguments, study) as session:
+        found = design_rings(study, session, common.region_of(arguments), arguments.seed)
+    return common.finish(arguments, page(found))
+
+
+@question(
+    STUDY, OUTPUT,
+    option("--blocks", type=input_file, metavar="CSV",
+           help="table of measured blocks in their places, whose serial numbers name the blocks: "
+           "the blocks.sorted.csv of halbach-fe sort"),
+    JSON)
+def cad(magnet: Magnet, arguments: argparse.Namespace) -> int:
+    """Write the blocks and a holder for them as STEP and STL files, and the plan to assemble them.
+
+    The holder consists of plates with a pocket for every block; [holder] of the study says how they
+    are made. Writes blocks.step and blocks.stl, holder_NN.step and .stl for every different plate,
+    magnet.step with everything in its place, assembly.csv, assembly.json and assembly.html, a sheet
+    to print for every plate. Solids are in mm.
+    """
+    from halbach_fe.design.assembly import cad
+    from halbach_fe.report.assembly import page
+
+    blocks = common.blocks_of(arguments.blocks)
+    common.own_folder(arguments, magnet.name)
+    plan = cad(magnet, blocks)
+    with common.progress_bar("solids") as show:  # until its files are written
+        return common.finish(arguments, page(plan, show))
+
+
+@question(SOLVED, option("--points", type=positive, metavar="N",
+                         help="number of positions to choose (default: the study's plan.points)"))
+def plan(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Choose the positions whose readings carry most information about the block magnetizations.
+
+    If the study has a table [homogeneity], they tell most about the deviation of |B| in its region.
+    Positions are added one at a time from the study's plan.candidates (default: the positions that
+    the study measures). Their information is compared with that of the study's positions. Writes
+    plan.csv, plan.json, plan.html and its figures.
+    """
+    from halbach_fe.design.measurement_plan import plan_measurement
+    from halbach_fe.report.plan import page
+
+    with common.session(arguments, magnet.study) as session:
+        return page(plan_measurement(magnet, session, arguments.points))
+
+
+@question(
+    SOLVED, BLOCKS, OBJECTIVE,
+    option("--draws", type=within(whole, *DRAWS), default=10_000, metavar="N",
+           help="number of magnets to draw (default: %(default)s)"),
+    SEED)
+def tolerance(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Predict the multipoles, or the homogeneity, of magnets whose blocks are drawn from the prior.
+
+    It is the homogeneity in the region of the study's table [homogeneity], if there is one. With a
+    limit also the share of the magnets that meet it. Writes tolerance.json, tolerance.html and its
+    figures.
+    """
+    from halbach_fe.api import tolerance
+    from halbach_fe.report.tolerance import page
+
+    blocks = common.blocks_of(arguments.blocks)
+    with common.session(arguments, magnet.study) as session:
+        return page(tolerance(
+            magnet, session, blocks, common.reference(arguments), arguments.draws,
+            arguments.limit_units, arguments.seed, arguments.limit_ppm))
+
+
+@question(
+    SOLVED,
+    option("blocks", type=input_file, metavar="BLOCKS",
+           help="table of measured blocks (CSV); ring and slot may be missing"),
+    OBJECTIVE,
+    option("--turns", action="store_true",
+           help="turn blocks in their slots too, where shape and nominal magnetization allow it: "
+           "cubes about their magnetization"),
+    SEED)
+def sort(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Assign measured blocks to slots: for small multipoles, or a homogeneous field.
+
+    It is a homogeneous field if the study has a table [homogeneity] with its region.
+    Blocks are sorted before the magnet is assembled. Each goes to a slot of its own type; the table
+    may have more blocks than there are slots. Writes blocks.sorted.csv, sort.json, sort.html and
+    its figures.
+    """
+    from halbach_fe.api import sort
+    from halbach_fe.design.objective import check_objective
+    from halbach_fe.measurement.block_table import read_blocks
+    from halbach_fe.report.sorting import page
+
+    table = read_blocks(arguments.blocks)
+    with common.session(arguments, magnet.study) as session, common.progress_bar("sorting") as show:
+        check_objective(magnet, common.reference(arguments), arguments.limit_units,
+                        arguments.limit_ppm)
+        found = sort(magnet, table, session, common.reference(arguments), arguments.seed, show,
+                     arguments.turns)
+    return page(replace(found, limit=arguments.limit_units or arguments.limit_ppm))
+
+
+@question(
+    SOLVED, map_format("--measurements"), MAP, BLOCKS, OBJECTIVE,
+    option("--swaps", type=count, default=8, metavar="N",
+           help="largest number of swaps of two blocks (default: %(default)s)"),
+    option("--cycles", type=count, default=0, metavar="N",
+           help="largest number of cyclic exchanges of three blocks (default: %(default)s)"),
+    option("--turns", type=count, default=8, metavar="N",
+           help="largest number of blocks turned in their slots (default: %(default)s)"),
+    option("--replace", type=count, default=0, metavar="N",
+           help="largest number of blocks replaced by blocks of the stock, or without --stock by "
+           "new ones (default: %(default)s)"),
+    option("--stock", type=input_file, metavar="CSV",
+           help="table of measured blocks that may replace others: blocks that are not in the "
+           "magnet, without ring and slot"),
+    SEED)
+def shim(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Choose blocks to swap, turn or replace: for small multipoles, or a homogeneous field.
+
+    It is a homogeneous field if the study has a table [homogeneity] with its region. The moves are
+    chosen from the posterior of the block magnetizations, which is computed as by `halbach-fe
+    infer`. Writes shim.json, shim.html and its figures, and study.shimmed.toml, the study with the
+    blocks in their new places.
+    """
+    from halbach_fe.api import shim
+    from halbach_fe.design.objective import check_objective
+    from halbach_fe.design.shimming import check_shimming, check_stock
+    from halbach_fe.inference.infer import infer
+    from halbach_fe.measurement.campaign import refuse_several_maps
+    from halbach_fe.report.shimming import page
+
+    if arguments.stock and not arguments.replace:
+        raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
+                         "replaced; instead --replace is missing. Add --replace.")
+    check_shimming(magnet.study)
+    refuse_several_maps(magnet.study, "shim")
+    data = common.read_one(arguments, arguments.measurements)
+    blocks, stock = map(common.blocks_of, (arguments.blocks, arguments.stock))
+    # refuse before the solves, which may take long, what does not fit the study
+    check_objective(magnet, common.reference(arguments), arguments.limit_units,
+                    arguments.limit_ppm)
+    if stock:
+        check_stock(magnet, stock, blocks.serial if blocks else None)
+    with common.session(arguments, magnet.study) as session:
+        result = infer(magnet, data, session, blocks)
+        moves = shim(result, session, common.reference(arguments), arguments.swaps,
+                     arguments.turns, arguments.replace, arguments.limit_units, stock,
+                     arguments.seed, arguments.limit_ppm, arguments.cycles)
+    if result.disagreement:
+        say(f"warning: Model and measurement disagree. {result.disagreement}")
+    return page(moves)
+
+
+@question(
+    SOLVED,
+    option("--posterior", type=input_file, metavar="H5", required=True,
+           help="posterior.h5 that halbach-fe infer wrote for this magnet"),
+    region)
+def shim_tray(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    """Choose small magnets for the places of a shim tray so that the field becomes homogeneous.
+
+    The tray and its inventory are [shim_tray] of the study; the magnet is the measured one, whose
+    posterior halbach-fe infer wrote. Writes shim_tray.csv, the table to fill the tray from,
+    shim_tray.json, shim_tray.html and its figures.
+    """
+    from halbach_fe.design.shim_tray import shim_tray
+    from halbach_fe.inference.storage import read_posterior
+    from halbach_fe.report.shim_tray import page
+
+    within_it, stored = common.region_of(arguments), read_posterior(magnet, arguments.posterior)
+    with common.session(arguments, magnet.study) as session:
+        return page(replace(shim_tray(magnet, session, stored["posterior"], within_it),
+                            disagreement=stored.disagreement))
