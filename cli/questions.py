@@ -121,7 +121,8 @@ def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
            help="half widths of a grid of parallel lines: of a line along z those along x and y"),
     option("--lines", type=positive, default=5, metavar="N",
            help="number of lines along each half width (default: 5)"),
-    POSTERIOR, option("--inside", action="store_true", help="points may lie inside blocks and iron"))
+    POSTERIOR, option("--inside", action="store_true",
+                      help="points may lie inside blocks and iron"))
 def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     """Compute B and H on lines with error bars, their first and second integrals, and kick maps.
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
+from halbach_fe.cli.measured import floor_of
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement import harmonic_field, map_check
 from halbach_fe.measurement.field_map import (
@@ -349,7 +350,7 @@ def only(field, *axes):
     return np.where(np.isin(np.arange(3), axes), field, np.nan)
 
 
-def test_a_component_alone_shows_spikes_and_a_lag(generator):
+def test_a_component_alone_shows_spikes_and_a_lag(generator, tmp_path):
     """The stage goes to and fro along x, the readings are 1 mm late, one is 5 mT off."""
     lines = np.moveaxis(GRID.reshape(5, 7, 9, 3), 0, 2)[:, ::2].reshape(-1, 5, 3).copy()
     lines[1::2] = lines[1::2, ::-1]
@@ -367,7 +368,9 @@ def test_a_component_alone_shows_spikes_and_a_lag(generator):
     assert "Gains, axes, turns and places of sensors need three components" in sentences(check)[0]
     assert not any("gain of" in name for name in undetermined(check).split(";"))
     assert np.isnan(check.residual_T[:, 1:]).all()
-    json.dumps(page_of_check(data, check).summary, allow_nan=False)
+    (tmp_path / "check.json").write_text(json.dumps(
+        page_of_check(data, check).summary, allow_nan=False))
+    assert floor_of(tmp_path / "check.json", data) == {"Bx": check.floor_T[0]}
 
 
 @pytest.mark.parametrize(("axes", "obeys"), [((0,), False), ((0, 1), False), ((0, 2), True)])
