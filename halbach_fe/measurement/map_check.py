@@ -757,9 +757,7 @@ def scan_of(
     usable &= ~rough
     off, sd = quadratic_residual(points[usable], field[usable][:, measured])
     scatter = scatter_around(points, points[usable], off / sd[:, None])
-    directions = np.zeros_like(points)
-    if np.ptp(time):
-        directions[order] = motion(points[order])
+    directions = motion(points, time) if np.ptp(time) else np.zeros_like(points)
     return Scan(points, field, time, directions, scatter), usable, broken
 
 

@@ -20,6 +20,7 @@ from halbach_fe.measurement.map_check import (
     inner,
     oriented,
 )
+from halbach_fe.measurement.scan_lines import is_sorted
 from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -116,7 +117,7 @@ def _trust(check: MapCheck) -> str:
             f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
             "either the field is steeper there than the lines show, as near edges of magnets, or "
             "these readings are wrong. An update of the magnet tells which."
-            + (" DIR/inner_map.csv is the map without them."
+            + (" inner_map.csv beside this page is the map without them."
                if np.isfinite(reach.limit_m) else ""))
     return trust
 
@@ -226,7 +227,7 @@ def sentences(check: MapCheck) -> list[str]:
     if not check.is_whole:
         found.append(f"{NOT_WHOLE[len(check.measured) > len('Bx')].format(check.measured)}")
     if check.order == "none":
-        found.append(NO_TIMES["none"])
+        found.append(NO_ORDER)
     if check.is_reoriented:
         found.append(f"The map obeys with other axes than it names: {_axes(check)} (or all of them "
                      "with the opposite sign, which no map can show).")
@@ -253,8 +254,6 @@ def sentences(check: MapCheck) -> list[str]:
                      + (f"; and {others} more of the parameters in the table" if others > 0
                         else "")
                      + ".")
-        if check.order == "rows" and any(map(_of_the_scan, terms)):
-            found.append(NO_TIMES["rows"])
     return found
 
 
@@ -271,14 +270,11 @@ NOT_WHOLE = (
     "Gains, axes, turns and places of sensors need three components.")
 """What a map of one component tells, and one of two."""
 
-NO_TIMES = {
-    "rows": "The map has no times: its rows count as the order of the scan, in which each lies "
-    "near the one before. If they were sorted since, whatever changes during the scan and the lag "
-    "are wrong; a column time_s tells.",
-    "none": "The map has no times, and its rows are in no order in which a stage goes: whether "
-    "the readings lag, or the probe turns or drifts during the scan, cannot be judged. A column "
-    "time_s tells."}
-"""What the order of rows without times tells."""
+NO_ORDER = (
+    "The map has no times, and its rows are in no order in which a stage goes: whether the "
+    "readings lag, or the probe turns or drifts during the scan, cannot be judged. A column time_s "
+    "tells.")
+"""What rows in no order of a scan tell."""
 
 OPEN_SIGN = (
     "The common sign of all components is open. On it depends how the map lies in the magnet, and "
@@ -297,6 +293,7 @@ def _numbers(rows: Sequence[int]) -> str:
 
 BROKEN = {"zero": "all components are zero",
           "repeated": "the readings are those of the row before, at another place",
+          "copied": "another row at the same place again, digit for digit",
           "spike": "far off the field of all others"}
 
 
@@ -304,9 +301,9 @@ def verdict(check: MapCheck) -> str:
     """Return the answer in a sentence, which begins with whether the map passes."""
     if check.is_too_coarse:
         return ("Neither passed nor failed. The map cannot tell: with a spacing of "
-                f"{1e3 * check.spacing_m:.3g} mm the field changes more from point to point than "
-                "its neighbours show: what a field without sources leaves of it changes sign from "
-                "each reading to the next.")
+                f"{decimals(1e3 * check.spacing_m)} mm the field changes more from point to point "
+                "than its neighbours show: what a field without sources leaves of it changes sign "
+                "from each reading to the next.")
     if not check.suffices:
         return ("Neither passed nor failed. The map cannot tell: "
                 f"{100 * (1 - check.redundancy):.0f}\u00a0% of its readings are needed to describe "
@@ -341,7 +338,7 @@ def verdict(check: MapCheck) -> str:
 
 def _where(check: MapCheck, reach: Reach) -> str:
     """Describe the region in which held-out lines are predicted."""
-    limit = f"{1e3 * reach.limit_m:.3g}\u00a0mm"
+    limit = f"{decimals(1e3 * reach.limit_m)}\u00a0mm"
     if reach.along == "r":
         return (f"within {limit} of the line through the middle of the map along "
                 f"{check.windows[0]}")
@@ -426,6 +423,13 @@ def weighted_note(check: MapCheck) -> str:
             "of the map as it is given, where every reading counts alike.")
 
 
+OF_SORTED_ROWS = (
+    "The map states no times, and its rows are sorted by their coordinates. If that is not the "
+    "order in which they were read, it does not tell whether the probe lags behind the stage, nor "
+    "what changed during the scan: keep the rows as they were read, or a column time_s.")
+"""What is said of a map whose rows may have lost their order."""
+
+
 def page(data: xr.Dataset, check: MapCheck) -> Page:
     """Return the page of the check of a map, and the maps that are made of it."""
     points, found, rows = points_of(data), sentences(check), residual_table(check)
@@ -436,14 +440,16 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
     left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
     even = ("Noise alone would be about as large everywhere; here it is not alone"
             if check.uneven is not None else "Noise is about as large everywhere")
+    if "time_s" not in data and is_sorted(points):
+        found.append(OF_SORTED_ROWS)
     return Page(
         "check", TITLE, None, answer(check), check_summary(data, check), [
             Section([*([Items(found)] if found else []), Text(
                 f"{check.readings} readings at {check.points} points, "
-                f"{1e3 * check.spacing_m:.3g} mm apart. No magnet is assumed: the map is compared "
-                "with the field of sources outside the mapped region. A map by itself cannot show "
-                "a common factor or sign of all components, a uniform offset, a shift of the whole "
-                "map, or a position axis that counts backwards.", "small")]),
+                f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "
+                "compared with the field of sources outside the mapped region. A map by itself "
+                "cannot show a common factor or sign of all components, a uniform offset, a shift "
+                "of the whole map, or a position axis that counts backwards.", "small")]),
             Section([Table(rows, "numbers"), *(Text(text, "small") for text in [
                 weighted_note(check)] if text)], "What remains"),
             Section(["Distances of the sensors are along the axes of the stage, and turns of the "
