@@ -76,9 +76,9 @@ def check(arguments: argparse.Namespace) -> int:
     check.json, check.csv (the residual of every reading), check.html and its figures,
     oriented_map.csv, the map without broken rows and with its components along the right axes,
     inner_map.csv, its region that a field without sources describes, if it is not all, and
-    corrected_map.csv, what a probe without errors would have read. Of a map of |B| alone only rows
-    that are broken, repeated places and noise are checked, and the folder has check.json and
-    check.html.
+    corrected_map.csv, what a probe without errors would have read. A map of one or two components
+    is judged by what these show. Of a map of |B| alone only rows that are broken, repeated places
+    and noise are checked, and the folder has check.json and check.html.
 
     Several maps of one magnet are checked one by one and then joined: their relative poses follow
     from where they overlap and from one field without sources for all, no magnet is assumed. Maps
@@ -445,7 +445,7 @@ def floor_of(path: Path, data: xr.Dataset) -> dict[str, float]:
 
     try:
         found = json.loads(path.read_text("utf-8"))
-        floor = [float(value) for value in found["floor_T"]]
+        floor = [0.0 if value is None else float(value) for value in found["floor_T"]]
         maps = set(found["maps_sha256"].values())
     except OSError as error:
         raise MeasurementError(must_be("file --check", str(path), "a readable file",
@@ -460,7 +460,8 @@ def floor_of(path: Path, data: xr.Dataset) -> dict[str, float]:
         raise MeasurementError(must_be(
             "file --check", str(path), "that of the map that is diagnosed", "that of another map",
             "Run `halbach-fe check` with this map."))
-    return {f"B{name}": value for name, value in zip(AXES, floor, strict=True)}
+    return {f"B{name}": value for name, value, own in zip(
+        AXES, floor, found["floor_T"], strict=True) if own is not None}
 
 
 def print_cost(estimate: DiagnosisEstimate, as_json: bool) -> int:

@@ -121,14 +121,16 @@ def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
            help="half widths of a grid of parallel lines: of a line along z those along x and y"),
     option("--lines", type=positive, metavar="N",
            help="number of lines along each half width (default: 5)"),
-    POSTERIOR, option("--inside", action="store_true", help="points may lie inside blocks"))
+    POSTERIOR, option("--inside", action="store_true",
+                      help="points may lie inside blocks and iron"))
 def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     """Compute B and H on lines with error bars, their first and second integrals, and kick maps.
 
     The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With
     --posterior the bars are those of the measured magnet, otherwise those of the study's prior.
-    With --inside points may lie inside blocks. Writes field.csv and integrals.csv, and for a grid
-    of lines kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
+    With --inside points may lie inside blocks and iron. Writes field.csv, field_map.csv (B as a
+    map, which halbach-fe export turns into other formats) and integrals.csv, and for a grid of
+    lines kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
     """
     import numpy as np
 
@@ -136,6 +138,7 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     from halbach_fe.core.files import write_text
     from halbach_fe.core.tables import csv_text
     from halbach_fe.inference.same_magnet import disagreement_of
+    from halbach_fe.measurement.field_map import field_map, write_map
     from halbach_fe.report.words import with_error
     from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.types import COMPONENTS
@@ -153,6 +156,8 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
         found = field(magnet, lines, session, read, arguments.inside)
     folder = arguments.output
     write_text(folder / "field.csv", csv_text(_points(found)))
+    write_map(field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
+        "study": magnet.name}), folder / "field_map.csv")
     grid = np.meshgrid(*offsets, indexing="ij")
     columns: dict[str, Floats] = {"u_m": grid[0].ravel(), "v_m": grid[1].ravel()}
     for order, unit in ((1, "T_m"), (2, "T_m2")):

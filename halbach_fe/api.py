@@ -431,7 +431,7 @@ def field(
     posterior : mapping of str to Gaussian, or InferenceResult, optional
         By default the bars are those of the study's prior of an assembled magnet.
     inside : bool
-        Whether points may lie inside blocks.
+        Whether points may lie inside blocks and iron.
 
     Returns
     -------

@@ -67,7 +67,8 @@ class Pace:
             self._step_begun, self._first = now, done
         elif done < total and now - self._said >= QUIET_S:
             left = (now - self._step_begun) * (total - done) / max(done - self._first, 1)
-            foretold = f", about {duration(left)} left" if done >= foretold_share * total else ""
+            foretold = (f", about {duration(left)} left of this step"
+                        if done >= foretold_share * total else "")
             self.say(f"{self._step}: {done} of {total}{foretold}")
             self._said = now
         self._total, self._done = total, done

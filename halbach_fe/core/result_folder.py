@@ -52,7 +52,8 @@ WRITES = {
     "verify": ("verification.*", "verification_*.png"),
     "multipoles": ("multipoles.*", "multipoles_*.png"),
     "homogeneity": ("homogeneity.*", "harmonics.csv", "harmonics.png", "stray_field.png"),
-    "forces": ("forces.*",), "field": ("field.csv", "integrals.csv", "kick_map.txt"),
+    "forces": ("forces.*",), "field": (
+        "field.csv", "field_map.csv", "integrals.csv", "kick_map.txt"),
     "design": ("design.json", "design.html", "rings.csv", "rings.png", "front.png", "slices.png",
                "study.designed.toml"),
     "cad": ("blocks.step", "blocks.stl", "holder*.step", "holder*.stl", "magnet.step",

@@ -169,7 +169,8 @@ class JoinedModel(ProbeModel):
         value, one = at.instrument * self.prior_sd, copy(self.maps[number])
         one.charges = PosedCharges.seen_from(self.charges, self.pose(at, number))
         one.weights, one.prior_sd = self.weights[self.rows_of(number)], one.any_sd
-        instrument = (value[:TERMS] + value[self.own(number)]) / one.any_sd
+        instrument = (value[:TERMS] + value[self.own(number)]) / np.where(
+            one.any_sd > 0, one.any_sd, np.inf)
         lag = one.lag_shows(np.ones(len(one.points), bool))
         return (one, replace(at, instrument=instrument, prior_sd=one.any_sd, lag=lag),
                 1 + float(value[self.placed(number)][GAIN]))

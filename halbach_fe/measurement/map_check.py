@@ -26,8 +26,8 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.core.numbers import MAD_TO_SD
-from halbach_fe.core.pace import Pace, Progress, duration
+from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
+from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.doubted_terms import doubted_from
 from halbach_fe.measurement.field_map import (
     check_magnitudes,
@@ -278,6 +278,9 @@ class MapCheck:
         Numbers of the rows whose column of |B| is not that of their components, from 1.
     gap_m : float
         Distance of the charges from where the field was read, by the evidence of the readings.
+    order : str
+        What tells when each reading was taken: ``time_s``, the ``rows`` as they follow each other,
+        or ``none``, if the map has no times and no stage goes from row to row.
     """
 
     readings: int
@@ -305,6 +308,18 @@ class MapCheck:
     position_noise_at_most: bool = False
     contradicted: tuple[int, ...] = ()
     gap_m: float = 0.0
+    order: str = "rows"
+
+    @property
+    def measured(self) -> str:
+        """The components that the map has, such as "Bx and By"."""
+        return in_a_row([f"B{name}" for name, rms in zip(COMPONENTS, self.rms_T, strict=True)
+                         if np.isfinite(rms)])
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the map has all components."""
+        return bool(np.isfinite(self.rms_T).all())
 
     @property
     def suffices(self) -> bool:
@@ -321,7 +336,7 @@ class MapCheck:
     @property
     def floor_rms_T(self) -> float:  # noqa: N802 - a unit
         """The model-free floor: rms over the components of held-out lines."""
-        return float(np.sqrt(np.mean(self.floor_T**2)))
+        return float(np.sqrt(np.nanmean(self.floor_T**2)))
 
     @property
     def obeys(self) -> bool:
@@ -337,7 +352,7 @@ class MapCheck:
         Each has its limits in m and its rms in T over the components. It is None if noise that is
         the same everywhere, or positions that scatter, explain how the parts differ.
         """
-        parts = [(low, high, float(np.sqrt(np.mean(np.square(each)))))
+        parts = [(low, high, float(np.sqrt(np.nanmean(np.square(each)))))
                  for low, high, each in self.windows[1]]
         least, most = (pick(parts, key=lambda one: one[2], default=(0.0, 0.0, 0.0))
                        for pick in (min, max))
@@ -361,17 +376,21 @@ class MapCheck:
     def plain(self) -> dict[str, object]:
         """Return the results as plain data for JSON, without the arrays over rows."""
         left_out = ("excluded", "residual_T", "unseen_T", "corrected_T", "gap_m")
-        return {name: value.tolist() if isinstance(value, np.ndarray) else value
-                for name, value in self.__dict__.items()
-                if name not in left_out and name not in ("terms", "reach")} | {
+        plain = {name: value.tolist() if isinstance(value, np.ndarray) else value
+                 for name, value in self.__dict__.items()
+                 if name not in left_out and name not in ("terms", "reach")}
+        return {name: _finite(value) for name, value in plain.items()} | {
             "terms": [asdict(term) | {"found": term.found} for term in self.terms],
-            "reach": None if self.reach is None else _finite(asdict(self.reach)),
+            "reach": None if self.reach is None else {
+                name: _finite(value) for name, value in asdict(self.reach).items()},
             "floor_rms_T": self.floor_rms_T, "suffices": self.suffices}
 
 
-def _finite(values: dict[str, object]) -> dict[str, object]:
+def _finite(value: object) -> object:
     """Return plain data with None for NaN, which JSON does not have."""
-    return {name: None if value != value else value for name, value in values.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    return None if value != value else value
 
 
 def check_map(
@@ -397,8 +416,8 @@ def check_map(
     Raises
     ------
     MeasurementError
-        If fewer than `FEWEST_POINTS` points have all three components and are not broken, if they
-        lie on a line, or if the map holds what none does in m and T.
+        If fewer than `FEWEST_POINTS` points have all components of the map and are not broken, if
+        they lie on a line, or if the map holds what none does in m and T.
 
     Examples
     --------
@@ -410,32 +429,30 @@ def check_map(
     >>> hf.check_map(field_map(points, field)).suffices
     True
     """
-    many_rows = 20_000  # whose neighbours are compared in some seconds
     data = _checkable(data)
-    if data.sizes["point"] > many_rows:
-        say(f"comparing each of {data.sizes['point']} rows with its neighbours: some "
-            f"{duration(data.sizes['point'] / many_rows * 5)}")
-    scan, usable, broken = scan_of(data)
+    pace = Pace(say, progress)
+    _begin(pace, 1, "looking for rows that are no readings")
+    scan, usable, broken = scan_of(data, pace)
     lines = scan_lines(scan.points)
     rows = _Rows(lines, usable, usable & some_lines(lines, usable))
-    pace = Pace(say, progress)
-    _begin(pace, 1, "comparing the orientations of the probe")
+    _begin(pace, 2, "comparing the orientations of the probe")
     matrix, alike = _orientation(scan.of(rows.train), pace)
-    _begin(pace, 2, "fitting the field and the instrument")
+    _begin(pace, 3, "fitting the field and the instrument")
     fitted = _first_fit(scan.turned(matrix), rows, pace)
-    _begin(pace, 3, "asking every part of the map for each error of the instrument")
+    _begin(pace, 4, "asking every part of the map for each error of the instrument")
     fitted, terms = _stated(fitted, rows.train, pace)
-    _begin(pace, 4, "fitting all scan lines")
+    _begin(pace, 5, "fitting all scan lines")
     whole, fitted, rows = _without_spikes(fitted, rows, broken)
     return MapCheck(
         readings=int(np.isfinite(scan.field).sum()), points=len(usable),
         spacing_m=point_spacing(scan.points[rows.chosen]),
-        size_T=float(np.linalg.norm(scan.field[rows.usable], axis=1).max()),
+        size_T=float(np.linalg.norm(fitted.model.field[rows.usable], axis=1).max()),
+        order=_order(data),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
         corrected_T=fitted.model.ideal(fitted.at), gap_m=float(np.min(
             scan.points[rows.usable].min(axis=0) - fitted.model.charges.places.min(axis=0))),
-        **_remaining(fitted, whole, scan.field, matrix, rows))
+        **_remaining(fitted, whole, scan, matrix, rows))
 
 
 def oriented(data: xr.Dataset, check: MapCheck) -> xr.Dataset:
@@ -459,45 +476,59 @@ def inner(data: xr.Dataset, check: MapCheck) -> xr.Dataset | None:
 
 
 def _remaining(
-    fitted: _Fitted, whole: _Fitted, given: Floats, matrix: Floats, rows: _Rows
+    fitted: _Fitted, whole: _Fitted, scan: Scan, matrix: Floats, rows: _Rows
 ) -> dict[str, Any]:
     """Return what `MapCheck` has of residuals.
 
     ``fitted`` is the fit of the rows that are not held out, ``whole`` that of all that are chosen,
-    ``given`` (n, 3) in T are the columns of the map, which ``matrix`` (3, 3) turns.
+    ``matrix`` (3, 3) turns the columns of the map.
     """
     # Smallest share of a reading's noise variance that its residual counts to have: where the field
     # takes nearly all of it along, what is left tells of the field.
     least_left = 0.05
     model, points, chosen, held_out = whole.model, whole.model.points, rows.chosen, rows.held_out
     floor = model.field[held_out] - model.readings(fitted.at, held_out)
-    unseen = np.full(given.shape, np.nan)
-    unseen[held_out] = floor
-    residual = whole.left
+    unseen = np.full(scan.field.shape, np.nan)
+    unseen[held_out] = model.columns(floor)
+    residual, sensors = whole.left, model.sensors
     # a fit takes its part of the noise along, the most at the edges of a map
     left = residual[chosen] / np.sqrt(np.maximum(
         model.noise_left(whole.at, chosen, whole.width2), least_left))
-    scatter = scatter_of(model.charges.gradient(points[chosen], whole.at.amplitudes), left)
-    fields = FreeField(model.charges.fields(points[chosen]).reshape(-1, len(model.charges)), 0.0)
-    as_given = fields.most_probable(given[chosen].ravel(), whole.fit.number)
+    scatter = scatter_of(
+        model.charges.gradient(points[chosen], whole.at.amplitudes)[:, sensors], left)
+    fields = FreeField(model.charges.fields(points[chosen])[:, sensors].reshape(
+        -1, len(model.charges)), 0.0)
+    given = scan.field[chosen][:, sensors]
+    as_given = fields.most_probable(given.ravel(), whole.fit.number)
+
+    def by_column(values: Floats) -> Floats:
+        """Return the size of what sensors show, in the columns of the map."""
+        return _turned(np.abs(model.columns(values)), np.abs(matrix).T)
+
     return {
-        "rms_as_given_T": _rms(given[chosen] - (
-            fields.by_amplitude @ as_given.amplitudes).reshape(-1, 3)),
-        "rms_T": _rms(residual[chosen] @ np.abs(matrix)), "floor_T": _rms(floor @ np.abs(matrix)),
-        "windows": _windows(points[chosen], residual[chosen] @ np.abs(matrix)),
+        "rms_as_given_T": _rms(model.columns(given - (
+            fields.by_amplitude @ as_given.amplitudes).reshape(given.shape))),
+        "rms_T": _rms(by_column(residual[chosen])), "floor_T": _rms(by_column(floor)),
+        "windows": _windows(points[chosen], by_column(residual[chosen])),
         "noise_T": scatter.noise_T, "position_noise_m": scatter.position_m,
         "position_noise_sd_m": scatter.position_sd_m, "position_noise_at_most": scatter.at_most,
         "structure": _structure(points[chosen], (residual * model.weights)[chosen]),
         "reach": _reach(points[held_out], floor, points[chosen],
                         float(MAD_TO_SD * np.median(np.abs(left)))),
-        "redundancy": 1 - whole.at.used / (3 * int(chosen.sum())),
-        "residual_T": residual @ matrix, "unseen_T": unseen @ matrix}
+        "redundancy": 1 - whole.at.used / given.size,
+        "residual_T": _turned(model.columns(residual), matrix.T),
+        "unseen_T": _turned(unseen, matrix.T)}
+
+
+def _turned(values: Floats, matrix: Floats) -> Floats:
+    """Return vectors (n, 3) turned by a matrix (3, 3); empty columns stay if it is 1."""
+    return values if np.array_equal(matrix, np.eye(3)) else np.asarray(values @ matrix.T)
 
 
 def _begin(pace: Pace, step: int, what: str) -> None:
     """Say which step begins."""
-    pace.say(f"step {step} of 4: {what}")
-    pace.begin(f"step {step} of 4")
+    pace.say(f"step {step} of 5: {what}")
+    pace.begin(f"step {step} of 5")
 
 
 def _rms(residual: Floats) -> Floats:
@@ -505,9 +536,28 @@ def _rms(residual: Floats) -> Floats:
     return np.asarray(np.sqrt(np.mean(residual**2, axis=0)))
 
 
+def _order(data: xr.Dataset) -> str:
+    """Return what tells when each reading was taken, see `MapCheck.order`.
+
+    A stage goes along lines or circles, or on short ways. In maps in a random order, or sorted by
+    their readings, 1 to 24 % of the rows were on lines, and in scans 80 to 99 %; the next row was
+    as far as any other, and in scans a third to a sixth of that.
+    """
+    if "time_s" in data:
+        return "time_s"
+    points = points_of(data)
+    step = np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    to_any_other = np.sqrt(2 * np.sum(np.var(points, axis=0)))
+    on_lines = np.mean(motion(points).any(axis=1))
+    return "rows" if on_lines >= 1 / 2 or step <= to_any_other / 2 else "none"
+
+
 def _time(data: xr.Dataset, count: int) -> Floats:
-    """Return the times (n,) of the readings, from -1 to 1; by their order if there are none."""
-    time = np.asarray(data["time_s"].values, float) if "time_s" in data else np.arange(count) * 1.0
+    """Return the times (n,) of the readings, from -1 to 1; 0 if nothing tells their order."""
+    order = _order(data)
+    if order == "none":
+        return np.zeros(count)
+    time = np.asarray(data["time_s"].values, float) if order == "time_s" else np.arange(count) * 1.0
     time = np.where(np.isfinite(time), time, np.nanmean(time) if np.isfinite(time).any() else 0.0)
     span = float(np.ptp(time))
     return np.asarray((time - time.min()) / span * 2 - 1 if span else np.zeros(count))
@@ -555,7 +605,7 @@ class Scan:
 
     def turned(self, matrix: Floats) -> Scan:
         """Return the components that a matrix (3, 3) makes of the columns."""
-        return replace(self, field=self.field @ matrix.T)
+        return replace(self, field=_turned(self.field, matrix))
 
     def model(self, charges: Charges) -> ProbeModel:
         """Return the model of the readings."""
@@ -662,13 +712,6 @@ def _checkable(data: xr.Dataset) -> xr.Dataset:
     refuse_undirected(data)
     refuse_total_field(data, "Maxwell's check")
     check_magnitudes(data)
-    missing = [f"B{name}" for name, column in zip(COMPONENTS, data["B_T"].values.T, strict=True)
-               if not np.isfinite(column).any()]
-    if missing:
-        raise MeasurementError(must_be(
-            _where(data), "Maxwell's check", "with all three components of B",
-            f"a map without {' and '.join(missing)}", "What is left has no div B and no whole "
-            "curl B that could be tested: test it by the chi² of `halbach-fe infer`."))
     return data
 
 
@@ -678,7 +721,7 @@ def _where(data: xr.Dataset) -> str:
 
 
 def scan_of(
-    data: xr.Dataset
+    data: xr.Dataset, pace: Pace | None = None
 ) -> tuple[Scan, NDArray[np.bool_], dict[str, list[int]]]:
     """Return the readings, which of them are usable, and the rows that are broken.
 
@@ -686,32 +729,36 @@ def scan_of(
     """
     # Largest field of a map that is no measurement: SQUIDs resolve it, no probe of a magnet does.
     smallest_field_t = 1e-12
-    points, field = points_of(data), np.asarray(data["B_T"].values, float)
-    broken = broken_rows(points, field)
-    usable = np.isfinite(field).all(axis=1)
+    points, field = points_of(data), np.array(data["B_T"].values, float)
+    measured = np.isfinite(field).any(axis=0)
+    time = _time(data, len(points))
+    order = np.argsort(time, kind="stable")  # rows that have times may be sorted otherwise
+    broken = {kind: sorted((1 + order[np.array(rows) - 1]).tolist()) for kind, rows in broken_rows(
+        points[order], field[order][:, measured]).items()}
+    usable = np.isfinite(field[:, measured]).all(axis=1)
     for rows in (*broken.values(), contradicted_rows(data)):
         usable[np.array(rows, int) - 1] = False
     if usable.sum() < FEWEST_POINTS:
         raise MeasurementError(must_be(
-            _where(data), "Maxwell's check", f"of at least {FEWEST_POINTS} points with all three "
+            _where(data), "Maxwell's check", f"of at least {FEWEST_POINTS} points with all its "
             "components, neither all zero nor repeated", f"{int(usable.sum())}",
             "A line of one component obeys Maxwell's equations whatever it is."))
     if (np.ptp(points[usable], axis=0) > point_spacing(points[usable]) / 2).sum() < 2:
         raise MeasurementError(must_be(
             _where(data), "Maxwell's check", "of points in a plane or a volume",
             "points on a line", "Along a line any field has div B = 0 and curl B = 0."))
-    if np.abs(field[usable]).max() < smallest_field_t:
+    if np.nanmax(np.abs(field[usable])) < smallest_field_t:
         raise MeasurementError(must_be(
             _where(data), "Maxwell's check", f"of a field of at least {smallest_field_t:g} T "
-            "somewhere", f"{np.abs(field[usable]).max():.3g} T", "Is it in tesla?"))
-    rough = rough_rows(points, field, usable)
+            "somewhere", f"{np.nanmax(np.abs(field[usable])):.3g} T", "Is it in tesla?"))
+    rough = rough_rows(points, field[:, measured], usable, pace)
     if rough.any():
         broken["spike"] = (1 + np.flatnonzero(rough)).tolist()
     usable &= ~rough
-    off, sd = quadratic_residual(points[usable], field[usable])
+    off, sd = quadratic_residual(points[usable], field[usable][:, measured])
     scatter = scatter_around(points, points[usable], off / sd[:, None])
-    time = _time(data, len(points))
-    return Scan(points, field, time, motion(points, time), scatter), usable, broken
+    directions = motion(points, time) if np.ptp(time) else np.zeros_like(points)
+    return Scan(points, field, time, directions, scatter), usable, broken
 
 
 # --- orientation --------------------------------------------------------------------------------
@@ -743,6 +790,8 @@ def _orientation(
     # The same in a linear instrument, from which orientations are no longer tried: errors of usual
     # sizes are not quite linear.
     nearly_alike = 300.0
+    if np.isnan(scan.field).any():  # a component by itself has no axes
+        return np.eye(3), ()
     spacing = point_spacing(scan.points)
     scan = scan.of(_some_points(scan.points))
     given, every = scan.model(Charges.around(scan.points, GAPS[-2] * spacing)), np.ones(
@@ -970,6 +1019,8 @@ def _term(
     """
     # A parameter is determined if its standard deviation is below this part of its prior one.
     determined = 0.5
+    if not parameter.row.any():  # it is not asked, see `ProbeModel`
+        return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True), 0.0
     used = np.flatnonzero(kept | (np.isin(np.arange(len(kept)), parameter.own)))
     row = parameter.row[used]
     estimates = [each.estimate(used) for each in told]

@@ -334,6 +334,10 @@ def join_maps(
 
 def _refuse_disobedient(name: str, check: MapCheck) -> None:
     """Raise a MeasurementError if a map is none by itself."""
+    if not check.is_whole:
+        raise MeasurementError(must_be(
+            f"map '{name}'", "the maps that are joined", "with all three components of B",
+            f"one of {check.measured}", "Join it by the magnet: halbach-fe register."))
     if not check.suffices or not check.obeys or check.is_displaced:
         raise MeasurementError(must_be(
             f"map '{name}'", "the maps that are joined", "one that obeys Maxwell's equations by "

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.measurement.harmonic_field import Charges, FreeField, HarmonicFit
 from halbach_fe.measurement.suspect_rows import scatter_around
+from halbach_fe.study.types import COMPONENTS
 
 ITERATIONS, FEW_ITERATIONS = 12, 2
 """Largest number of steps of the fit of field and instrument before the last, linear one, and while
@@ -118,35 +119,44 @@ LEAST_OWN = 0.05
 """Smallest share of a reading that the fit counts to leave: beyond, its residual is rounding."""
 
 
-def weights_of(scatter: Floats) -> Floats:
-    """Return weights (n, 3), whose median is 1, of readings that scatter by as much (n,) in T."""
+def weights_of(scatter: Floats, sensors: int = 3) -> Floats:
+    """Return weights (n, s), whose median is 1, of readings that scatter by as much (n,) in T."""
     # Smallest standard deviation by which a reading is weighted, relative to the median one: the
     # flattest readings of a small map may be fitted by chance.
     least_error = 0.3
     median = float(np.median(scatter))
     if not median:
-        return np.ones((len(scatter), 3))
-    return np.repeat(median / np.maximum(scatter, least_error * median)[:, None], 3, axis=1)
+        return np.ones((len(scatter), sensors))
+    return np.repeat(median / np.maximum(scatter, least_error * median)[:, None], sensors, axis=1)
 
 
 class ProbeModel:
     """Readings of a three-axis probe in a harmonic field.
 
-    ``weights`` (n, 3) multiply the residuals. They follow from ``scatter`` (n,) in T, by which
-    readings are expected to be off a field without sources.
+    ``weights`` (n, s) multiply the residuals. They follow from ``scatter`` (n,) in T, by which
+    readings are expected to be off a field without sources. ``sensors`` (s,) are those whose
+    columns of the map (n, 3) are not empty: of one or two, only what changes during the scan is
+    asked, as one component says nothing of another. Nor is that if all times are the same.
     """
+
+    sensors: tuple[int, ...] = (0, 1, 2)
 
     def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
                  directions: Floats, scatter: Floats) -> None:
-        self.charges, self.points, self.field = charges, points, field
+        self.sensors = tuple(np.flatnonzero(np.isfinite(field).any(axis=0)).tolist())
+        self.charges, self.points, self.field = charges, points, field[:, self.sensors]
         self.time, self.directions = time, directions
         self.waves = np.polynomial.legendre.legvander(time, WAVES)[:, 1:]
         sd = np.array(PRIOR_SD)
         sd[OFFSETS] *= float(np.nanmax(np.abs(field)))
         step = np.linalg.norm(np.diff(points, axis=0), axis=1)[directions[1:].any(axis=1)]
         sd[LAG] = max(sd[LAG], float(np.median(step)) if len(step) else 0.0)  # a row late
+        if len(self.sensors) < len(COMPONENTS):
+            sd[:OFFSETS.start] = 0.0
+        if not np.ptp(time):
+            sd[TURNS.start:] = 0.0
         self.prior_sd = self.any_sd = sd
-        self.scatter, self.weights = scatter, weights_of(scatter)
+        self.scatter, self.weights = scatter, weights_of(scatter, len(self.sensors))
         self._last: list[Any] = []
         self.near = NEAR * sd
 
@@ -169,11 +179,11 @@ class ProbeModel:
         few such readings, but without weights they are what decides on the instrument: it is given
         errors of many standard deviations that it does not have.
         """
-        own = self.free(at, rows, at.sigma**2 / width2).diagonal().reshape(-1, 3)
+        own = self.free(at, rows, at.sigma**2 / width2).diagonal().reshape(-1, len(self.sensors))
         left = (self.field - self.readings(at))[rows] / np.maximum(own, LEAST_OWN)
         other = copy(self)
         other.scatter = scatter_around(self.points, self.points[rows], left)
-        other.weights = weights_of(other.scatter)
+        other.weights = weights_of(other.scatter, len(self.sensors))
         return other
 
     def allowed(self, at: ProbeFit) -> ProbeFit:
@@ -232,8 +242,9 @@ class ProbeModel:
         return left.ravel() + self.free(at, rows, 0.0).by_amplitude @ at.amplitudes
 
     def offsets(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the change (n, 3) in T of the sensors' offsets."""
-        return np.asarray(self.time[rows, None] * (at.instrument * self.prior_sd)[OFFSETS])
+        """Return the change (n, s) in T of the sensors' offsets."""
+        change = (at.instrument * self.prior_sd)[OFFSETS][list(self.sensors)]
+        return np.asarray(self.time[rows, None] * change)
 
     def read_by(
         self, at: ProbeFit, rows: NDArray[np.bool_], sensor: int
@@ -246,57 +257,58 @@ class ProbeModel:
                 reads)
 
     def by_amplitude(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the weighted readings (n, 3, k) per amplitude."""
-        found = np.empty((int(rows.sum()), 3, len(self.charges)))
-        for sensor in range(3):
+        """Return the weighted readings (n, s, k) per amplitude."""
+        found = np.empty((int(rows.sum()), len(self.sensors), len(self.charges)))
+        for number, sensor in enumerate(self.sensors):
             places, reads = self.read_by(at, rows, sensor)
-            found[:, sensor] = self.charges.fields_along(
-                places, self.weights[rows, sensor, None] * reads)
+            found[:, number] = self.charges.fields_along(
+                places, self.weights[rows, number, None] * reads)
         return found
 
     def by_parameter(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
-        """Return the weighted derivatives (n, 3, p) in T by the parameters / `PRIOR_SD`."""
-        found = np.zeros((int(rows.sum()), 3, len(PRIOR_SD)))
-        for sensor in range(3):
+        """Return the weighted derivatives (n, s, p) in T by the parameters / `PRIOR_SD`."""
+        found = np.zeros((int(rows.sum()), len(self.sensors), len(PRIOR_SD)))
+        for number, sensor in enumerate(self.sensors):
             places, reads = self.read_by(at, rows, sensor)
             field = self.charges.field(places, at.amplitudes)
             gradient = np.einsum("nc,ncj->nj", reads,
                                  self.charges.gradient(places, at.amplitudes))
             for other in range(3):  # of the mean of the sensors, which stays where it is
-                found[:, sensor, 3 * other:3 * other + 3] = gradient * (
+                found[:, number, 3 * other:3 * other + 3] = gradient * (
                     (sensor == other) - 1 / 3)
-            found[:, sensor, MIXING] = field @ MATRICES[:, sensor].T
-            found[:, sensor, TURNS] = np.einsum(
+            found[:, number, MIXING] = field @ MATRICES[:, sensor].T
+            found[:, number, TURNS] = np.einsum(
                 "nw,na->nwa", self.waves[rows], np.cross(np.eye(3)[sensor], field)
             ).reshape(len(found), -1)
-            found[:, sensor, OFFSETS.start + sensor] = self.time[rows]
-            found[:, sensor, GAINS] = self.waves[rows] * field[:, sensor, None]
+            found[:, number, OFFSETS.start + sensor] = self.time[rows]
+            found[:, number, GAINS] = self.waves[rows] * field[:, sensor, None]
             if at.lag:
-                found[:, sensor, LAG] = -np.sum(gradient * self.directions[rows], axis=1)
+                found[:, number, LAG] = -np.sum(gradient * self.directions[rows], axis=1)
         return found * self.prior_sd * self.weights[rows, :, None]
 
     def readings(self, at: ProbeFit, rows: NDArray[np.bool_] | None = None) -> Floats:
-        """Return what the instrument reads (n, 3) in T at some rows, by default at all."""
+        """Return what the instrument reads (n, s) in T at some rows, by default at all."""
         chosen = np.flatnonzero(np.ones(len(self.points), bool) if rows is None else rows)
-        found = np.empty((len(chosen), 3))
+        found = np.empty((len(chosen), len(self.sensors)))
         some = np.zeros(len(self.points), bool)
         some[chosen] = True
-        for sensor in range(3):
+        for number, sensor in enumerate(self.sensors):
             places, reads = self.read_by(at, some, sensor)
-            found[:, sensor] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
+            found[:, number] = np.sum(reads * self.charges.field(places, at.amplitudes), axis=1)
         return np.asarray(found + self.offsets(at, some))
 
     def noise_left(
         self, at: ProbeFit, rows: NDArray[np.bool_], width2: float
     ) -> Floats:
-        """Return how much of the variance of each reading (n, 3) the fit of the field leaves.
+        """Return how much of the variance of each reading (n, s) the fit of the field leaves.
 
         The rest the field takes along, the most at the edges of a map. For the prior variance
         ``width2`` of the amplitudes in T^2 it is the diagonal of P^2 of `FreeField`, and that of P
         is the share of a reading which is left: a residual divided by it is that of a fit without
         the reading. The few numbers of the instrument are left out.
         """
-        return self.free(at, rows, at.sigma**2 / width2).diagonals()[1].reshape(-1, 3)
+        left = self.free(at, rows, at.sigma**2 / width2).diagonals()[1]
+        return left.reshape(-1, len(self.sensors))
 
     def ideal(self, at: ProbeFit) -> Floats:
         """Return what a probe without errors would have read (n, 3) in T.
@@ -307,9 +319,17 @@ class ProbeModel:
         every = np.ones(len(self.points), bool)
         reads = np.stack([self.read_by(at, every, sensor)[1] for sensor in range(3)], axis=1)
         read, field = self.readings(at), self.charges.field(self.points, at.amplitudes)
+        if len(self.sensors) < len(COMPONENTS):
+            return np.asarray(self.columns(self.field - read + field[:, self.sensors]))
         gain = 1 + float(np.sum(self.shares(at) * at.mixing))
         return np.asarray(gain * (field + np.linalg.solve(
             reads, (self.field - read)[..., None])[..., 0]))
+
+    def columns(self, values: Floats) -> Floats:
+        """Return values (n, s) of the sensors as columns (n, 3) of a map, empty without one."""
+        found = np.full((len(values), len(COMPONENTS)), np.nan)
+        found[:, self.sensors] = values
+        return found
 
     def shares(self, at: ProbeFit) -> Floats:
         """Return the mean products (3, 3) of two components, relative to the mean square of |B|.
@@ -383,7 +403,7 @@ class Evidence:
 
         yield told(whole, np.ones(len(target), bool))
         for part in parts:
-            own = np.repeat(part[rows], 3)
+            own = np.repeat(part[rows], len(model.sensors))
             first = whole.part(own)
             yield told(first, own)
             yield told(whole.part(~own, first), ~own)

@@ -10,6 +10,7 @@ from scipy.special import gammainc
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.numbers import MAD_TO_SD
+from halbach_fe.core.pace import Pace
 from halbach_fe.measurement.field_map import TOTAL_COLUMN
 from halbach_fe.measurement.scan_lines import point_spacing
 
@@ -29,8 +30,8 @@ A single spike is 2 to 4 times as far off its own as off theirs."""
 
 
 def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
-    """Return the rows that are zero, or repeat the row before them at another position, or another
-    row at their own position (``copied``).
+    """Return the rows (n, c) that are zero, or repeat the row before them at another position, or
+    another row at their own position (``copied``).
     """
     zero = (field == 0).all(axis=1)
     alike = field[1:] == field[:-1]
@@ -46,13 +47,17 @@ def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
 
 
 def _no_chance(alike: NDArray[np.bool_], pairs: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which pairs (n,) of rows have all components (n, 3) alike; none if that is chance.
+    """Return which pairs (n,) of rows have all components (n, c) alike; none if that is chance.
 
     Where the field is uniform, rounded readings repeat by chance. How often all three components do
     is estimated from pairs that repeat only two: they are times the odds that the third one
-    repeats, which pairs tell that repeat one of the two. Repetitions count only if there are more.
+    repeats, which pairs tell that repeat one of the two. Repetitions count only if there are more,
+    of fewer than three components if they are a tenth of all rows.
     """
+    many = 0.1
     found = alike.all(axis=1) & pairs
+    if alike.shape[1] < 3:  # which the estimate needs
+        return found & bool(found.sum() > 1 + many * len(found))
     by_chance = max(_all_alike_by_chance(alike[pairs][:, order])
                     for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]))
     if found.any() and gammainc(found.sum(), by_chance) > CHANCE:  # of Poisson's distribution
@@ -94,7 +99,7 @@ def _all_alike_by_chance(alike: NDArray[np.bool_]) -> float:
 
 
 def rough_rows(
-    points: Floats, field: Floats, usable: NDArray[np.bool_]
+    points: Floats, field: Floats, usable: NDArray[np.bool_], pace: Pace | None = None
 ) -> NDArray[np.bool_]:
     """Return the rows that are far off a quadratic function through their neighbours.
 
@@ -113,7 +118,7 @@ def rough_rows(
         rows = np.flatnonzero(usable & ~found)
         near = neighbours(points[rows])
         residual = np.full_like(field, np.nan)
-        residual[rows], _ = quadratic_residual(points[rows], field[rows])
+        residual[rows], _ = quadratic_residual(points[rows], field[rows], pace)
         size = np.linalg.norm(residual[rows], axis=1)
         worst = spikes(points, residual, usable & ~found, 1.0)
         around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
@@ -132,14 +137,19 @@ def at_border(points: Floats, near: Ints) -> NDArray[np.bool_]:
     return np.asarray((((low > -0.5) | (high < 0.5)) & (high - low > 0.5)).any(axis=1))
 
 
-def quadratic_residual(points: Floats, field: Floats) -> tuple[Floats, Floats]:
+def quadratic_residual(
+    points: Floats, field: Floats, pace: Pace | None = None
+) -> tuple[Floats, Floats]:
     """Return how far rows (n, c) are off a quadratic function through their neighbours.
 
     The second array (n,) is the standard deviation of that for noise of 1.
     """
     near = neighbours(points)
     residual, sd = np.empty_like(field), np.empty(len(points))
-    for part in np.array_split(np.arange(len(points)), max(1, len(points) // 1000)):
+    parts = np.array_split(np.arange(len(points)), max(1, len(points) // 1000))
+    if pace is not None:
+        pace.advance(0, len(parts))  # the search of neighbours is no measure of what is left
+    for number, part in enumerate(parts, 1):
         away = points[near[part]] - points[part, None]
         away /= np.maximum(np.abs(away).max(axis=(1, 2), keepdims=True), 1e-12)
         x, y, z = np.moveaxis(away, 2, 0)
@@ -148,6 +158,8 @@ def quadratic_residual(points: Floats, field: Floats) -> tuple[Floats, Floats]:
         weights = np.linalg.pinv(terms, rcond=1e-6)[:, 0]  # of the value at the row itself
         residual[part] = field[part] - np.einsum("nk,nkc->nc", weights, field[near[part]])
         sd[part] = np.sqrt(1 + np.sum(weights**2, axis=1))
+        if pace is not None:
+            pace.advance(number, len(parts))
     return residual, sd
 
 

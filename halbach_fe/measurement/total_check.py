@@ -16,7 +16,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, check_magnitudes, checked_map, points_of
-from halbach_fe.measurement.suspect_rows import quadratic_residual, rough_rows
+from halbach_fe.measurement.suspect_rows import broken_rows, quadratic_residual, rough_rows
 
 FEWEST_REPEATS = 3
 """Places that were read again from which the noise follows."""
@@ -74,11 +74,9 @@ def check_total(data: xr.Dataset) -> TotalCheck:
     if not total.any():
         raise MeasurementError(must_be("|B|", "map", "that of a magnet", "zero at all points",
                                        "Was the probe connected?"))
-    zero, repeated = total == 0, np.zeros(len(total), bool)
-    repeated[1:] = (total[1:] == total[:-1]) & (points[1:] != points[:-1]).any(axis=1)
-    if repeated.sum() <= 1 + len(total) / 10:  # rounded readings repeat by chance
-        repeated[:] = False
-    usable = ~zero & ~repeated
+    broken, usable = broken_rows(points, total[:, None]), np.ones(len(total), bool)
+    for rows in broken.values():
+        usable[np.array(rows) - 1] = False
     spike, noise = np.zeros(len(total), bool), float("nan")
     if usable.sum() >= fewest_rows and (np.ptp(points[usable], axis=0) > 0).sum() > 1:
         spike = rough_rows(points, total[:, None], usable)
@@ -86,8 +84,8 @@ def check_total(data: xr.Dataset) -> TotalCheck:
         residual, size = quadratic_residual(points[usable], total[usable, None])
         noise = float(MAD_TO_SD * np.median(np.abs(residual[:, 0]) / size))
     repeats, repeatability = _repeated(points[usable], total[usable])
-    broken = {name: (1 + np.flatnonzero(rows)).tolist() for name, rows in (
-        ("zero", zero), ("repeated", repeated), ("spike", spike)) if rows.any()}
+    if spike.any():
+        broken["spike"] = (1 + np.flatnonzero(spike)).tolist()
     return TotalCheck(len(total), float(total.max()), broken, noise, repeats, repeatability,
                       ~usable)
 

@@ -11,7 +11,15 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
-from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach, inner, oriented
+from halbach_fe.measurement.map_check import (
+    SCATTERED_M,
+    VIOLATED,
+    InstrumentTerm,
+    MapCheck,
+    Reach,
+    inner,
+    oriented,
+)
 from halbach_fe.measurement.scan_lines import is_sorted
 from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
@@ -175,7 +183,7 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
                 "repeatedly at one place.")
     noise = ("The noise of a reading is "
-             f"{'at most ' if check.position_noise_at_most else ''}"
+             f"{'at most ' if check.position_noise_at_most or not check.is_whole else ''}"
              f"{flux_density(check.noise_T, 2)}")
     where = "put that into the study as sigma_T, unless you know better"
     if check.is_displaced:
@@ -216,6 +224,10 @@ def sentences(check: MapCheck) -> list[str]:
     # Number of the instrument's parameters that are named beside the table, the most certain ones.
     terms_named = 5
     found = []
+    if not check.is_whole:
+        found.append(f"{NOT_WHOLE[len(check.measured) > len('Bx')].format(check.measured)}")
+    if check.order == "none":
+        found.append(NO_ORDER)
     if check.is_reoriented:
         found.append(f"The map obeys with other axes than it names: {_axes(check)} (or all of them "
                      "with the opposite sign, which no map can show).")
@@ -244,6 +256,25 @@ def sentences(check: MapCheck) -> list[str]:
                      + ".")
     return found
 
+
+def _of_the_scan(term: InstrumentTerm) -> bool:
+    """Tell whether a parameter follows from the times of the readings."""
+    return "from start" in term.name or "from the ends" in term.name or "lag" in term.name
+
+
+NOT_WHOLE = (
+    "{} by itself obeys where it is harmonic, as each component of a field without sources is. "
+    "Gains, axes, turns and places of sensors need three components; a plane of one component "
+    "obeys if it is smooth.",
+    "{} were compared with one field without sources, of which the third component is free. "
+    "Gains, axes, turns and places of sensors need three components.")
+"""What a map of one component tells, and one of two."""
+
+NO_ORDER = (
+    "The map has no times, and its rows are in no order in which a stage goes: whether the "
+    "readings lag, or the probe turns or drifts during the scan, cannot be judged. A column time_s "
+    "tells.")
+"""What rows in no order of a scan tell."""
 
 OPEN_SIGN = (
     "The common sign of all components is open. On it depends how the map lies in the magnet, and "
@@ -281,7 +312,9 @@ def verdict(check: MapCheck) -> str:
     size = (f"{flux_density(check.floor_rms_T, 2)} rms on scan lines that were held out, "
             f"{relative(share)} of the largest field ({flux_density(check.size_T)})")
     if not check.obeys:
-        return ("Failed. The map does not obey div B = 0 and curl B = 0: it is not described by a "
+        law = "not obey div B = 0 and curl B = 0" if check.is_whole else (
+            f"not have {check.measured} of any field without sources")
+        return (f"Failed. The map does {law}: it is not described by a "
                 f"field without sources within its region, which leaves {size}. No instrument "
                 "explains it.")
     wrong = _impossible(check)
@@ -289,16 +322,18 @@ def verdict(check: MapCheck) -> str:
         return ("Failed. The map does not obey div B = 0 and curl B = 0 with any likely "
                 f"instrument: it would take an impossible one ({wrong[0]}"
                 f"{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}), which leaves {size}.")
+    law = "obeys div B = 0 and curl B = 0" if check.is_whole else (
+        f"has {check.measured} of a field without sources,")
     if check.reach is not None and np.isfinite(check.reach.limit_m):
-        return ("Passed. The map obeys div B = 0 and curl B = 0 to "
+        return (f"Passed. The map {law} to "
                 f"{flux_density(check.reach.inside_T, 2)} rms on scan lines that were held out "
                 f"{_where(check, check.reach)}, and to "
                 f"{flux_density(check.reach.beyond_T, 2)} beyond that. The largest field is "
                 f"{flux_density(check.size_T)}.")
     axes = (f", once its columns are put along the axes that they show ({_axes(check)})"
             if check.is_reoriented else "")
-    return f"Passed{axes}. The map then obeys div B = 0 and curl B = 0 to {size}." if axes else (
-        f"Passed. The map obeys div B = 0 and curl B = 0 to {size}.")
+    return f"Passed{axes}. The map then {law} to {size}." if axes else (
+        f"Passed. The map {law} to {size}.")
 
 
 def _where(check: MapCheck, reach: Reach) -> str:
@@ -353,9 +388,11 @@ def instrument_table(check: MapCheck) -> list[dict[str, str]]:
 def undetermined(check: MapCheck) -> str:
     """Say which parameters of the instrument the map does not tell, in a sentence; or nothing."""
     said = []
+    terms = check.terms if check.is_whole else [
+        term for term in check.terms if _of_the_scan(term)]
     for words, predictive in (("Not stated, because parts of the map contradict each other about "
                                "it", False), ("What this map cannot tell", True)):
-        names = [term.name for term in check.terms if term.predictive == predictive
+        names = [term.name for term in terms if term.predictive == predictive
                  and not (term.determined and predictive)]
         if names:
             said.append(f"{words}: {'; '.join(names)}.")
@@ -367,7 +404,7 @@ def residual_table(check: MapCheck) -> list[dict[str, str]]:
     def row(name: str, values: Floats | tuple[float, float, float]) -> dict[str, str]:
         return {"rms residual in µT": name} | {
             f"B{column}": decimals(1e6 * value) for column, value in zip(
-                COMPONENTS, values, strict=True)}
+                COMPONENTS, values, strict=True) if np.isfinite(value)}
 
     axis, windows = check.windows
     return [row("the map as it is given", check.rms_as_given_T),
@@ -379,7 +416,7 @@ def residual_table(check: MapCheck) -> list[dict[str, str]]:
 
 def weighted_note(check: MapCheck) -> str:
     """Explain residuals that are larger with the instrument; empty if none are."""
-    if (check.rms_T <= check.rms_as_given_T).all():
+    if not (check.rms_T > check.rms_as_given_T).any():
         return ""
     return ("With the instrument, readings count less where the field is steep, as positions that "
             "scatter a little change them much there: so plain residuals can be larger than those "

@@ -7,13 +7,15 @@ potential ``Phi = int |int B_across ds'|^2 ds`` in T^2 m^3 they are ``-1/2 grad 
 The integrals are Simpson's: lines through faces of blocks, where B jumps, need more points.
 
 Inside a block B is mu_0 H, that of all charges, plus the polarization of the block, ``B_r + chi
-mu_0 H``. With permeability 1 all of it is a closed form.
+mu_0 H``. With permeability 1 all of it is a closed form. Inside iron mu_0 H is the gradient of the
+potential in its elements, and B is ``mu_r`` times that.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +29,19 @@ from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
 from halbach_fe.solver.formulation_choice import check_points
-from halbach_fe.solver.separate_blocks import applies, present_blocks, solve_separate
+from halbach_fe.solver.separate_blocks import (
+    SeparateReaction,
+    applies,
+    present_blocks,
+    solve_separate,
+)
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
+
+if TYPE_CHECKING:
+    from halbach_fe.geometry.iron import IronSolid
+    from halbach_fe.solver.axisymmetric_iron import IronReaction
+    from halbach_fe.solver.iron_bodies import BodiesReaction
 
 
 @dataclass(frozen=True)
@@ -96,9 +108,9 @@ class FieldOnLines:
     error : ndarray, shape (lines, count, 3), in T
         Error bar of the finite elements.
     polarization : ndarray, shape (lines, count, 3, 1 + q), in T
-        Mean and root of J of the block in which a point is; 0 in air.
+        Mean and root of J of the block or iron in which a point is; 0 in air.
     in_block : ndarray of str, shape (lines, count)
-        Name of that block, empty in air.
+        Name of that block, ``iron 1`` in the first body of iron, empty in air.
     """
 
     lines: Lines
@@ -162,6 +174,9 @@ class FieldOnLines:
                 (second[..., 0], np.linalg.norm(second[..., 1:], axis=2)))
 
 
+ANGLES = 64
+"""Angles at which the fields of single blocks on iron with rotational symmetry are given."""
+
 OF_LINES = "--from-m and --to-m"
 """What places the points, for messages."""
 
@@ -180,7 +195,7 @@ def field_on_lines(
         Of all parameters of the response matrix.
     session : Session
     inside : bool
-        Whether points may lie inside blocks; see `_through_blocks` for what magnets.
+        Whether points may lie inside blocks and iron; see `_through_blocks` for what magnets.
 
     Raises
     ------
@@ -192,7 +207,7 @@ def field_on_lines(
     if not inside and (number >= 0).any():
         raise StudyError(must_be(
             "points", magnet.name, "in air", f"{int((number >= 0).sum())} of {len(points)} inside "
-            "blocks", "If B and H inside them are wanted, add --inside."))
+            "blocks or iron", "If B and H inside them are wanted, add --inside."))
     if (number >= 0).any():
         mean, root, error, polarization = _through_blocks(
             magnet, points, number, magnetizations, session)
@@ -203,16 +218,22 @@ def field_on_lines(
         root, error = model.whole @ magnetizations.root, model.error
         polarization = np.zeros((len(points), 3, 1 + root.shape[1]))
     shape = lines.points.shape
-    names = np.array([*(block.name for block in magnet.blocks), ""])
+    names = np.array([*(block.name for block in magnet.blocks),
+                      *(f"iron {body}" for body in range(1, len(magnet.iron) + 1)), ""])
     return FieldOnLines(lines, mean.reshape(shape), root.reshape(*shape, -1), error.reshape(shape),
                         polarization.reshape(*shape, -1), names[number].reshape(shape[:2]))
 
 
 def _blocks_of(magnet: Magnet, points: Floats) -> NDArray[np.intp]:
-    """Return the number (n,) of the block that contains every point, -1 in air."""
+    """Return the number (n,) of the block that contains every point, -1 in air.
+
+    Bodies of iron count on after the blocks.
+    """
     found = np.full(len(points), -1)
     for number, block in enumerate(magnet.blocks):
         found[block.contains(points)] = number
+    for number, body in enumerate(magnet.iron, len(magnet.blocks)):
+        found[body.contains(points)] = number
     return found
 
 
@@ -222,9 +243,9 @@ def _through_blocks(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return mean (n, 3), root (n, 3, q) and bar (n, 3) of B in T, and J (n, 3, 1 + q) in T.
 
-    ``number`` (n,) is the block that a point is in, -1 in air. Permeability and iron answer to the
-    nominal magnet only. What they add to the field of deviations is an error bar: chi times that
-    field, and beside iron as much as that field.
+    ``number`` (n,) is the block or iron that a point is in, see `_blocks_of`. Iron answers to the
+    deviations of the blocks too; what their permeability adds is an error bar, chi times that
+    field.
 
     Raises
     ------
@@ -238,26 +259,37 @@ def _through_blocks(
             "points inside blocks", magnet.name, "of a 3D magnet of uniform blocks without "
             "irreversible losses, and of the method reaction", "another magnet",
             "End the line before the blocks."))
-    outside = number < 0
+    outside, in_iron = number < 0, number >= len(blocks)
     points = points.copy()
     points[outside] = check_points(magnet, points[outside], OF_LINES)
-    strength, error = external_field(magnet, points) + field_of(blocks, points), 0 * points
-    if not magnet.is_vacuum:
-        reaction, error = _reaction(magnet, points, number, session)
-        strength += reaction
+    solved = None if magnet.is_vacuum else solve_separate(magnet, session)
+    free = np.flatnonzero(~in_iron)
+    strength, error = np.zeros_like(points), np.zeros_like(points)
+    strength[free] = external_field(magnet, points[free]) + field_of(blocks, points[free])
+    if solved is not None:
+        reaction, error[free] = _reaction(magnet, points[free], number[free], solved)
+        strength[free] += reaction
+        if solved.iron is not None and in_iron.any():
+            strength[in_iron], error[in_iron] = solved.iron.inside(points[in_iron])
     tensors = np.array([block.recoil_tensor for block in blocks])
     change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
                               magnetizations.root]).reshape(len(blocks), 3, -1)
     remanence = MU_0 * tensors @ change
-    of_change = sum((field @ remanence[block] for block, field in enumerate(
-        unit_fields(blocks, points))), np.zeros((*points.shape, change.shape[2])))
-    answer = 1.0 if magnet.iron else np.abs(tensors - np.eye(3)).max(initial=0.0)
-    error = error + answer * np.abs(of_change[..., 0])
+    of_change = np.zeros((*points.shape, change.shape[2]))
+    for block, field in enumerate(unit_fields(blocks, points[free])):
+        of_change[free] += field @ remanence[block]
+    if solved is not None and solved.iron is not None:
+        _add_answer(of_change, solved.iron, magnet, remanence, points, in_iron)
+    error += np.abs(tensors - np.eye(3)).max(initial=0.0) * np.abs(of_change[..., 0])
     of_change[..., 0] += strength
     polarization = np.zeros_like(of_change)
     nominal = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
     remanence[..., 0] += nominal
-    for block in set(number[~outside]):
+    for body in set(number[in_iron]):
+        here = number == body
+        polarization[here], times = _induced(magnet.iron[body - len(blocks)], of_change[here])
+        error[here] *= times
+    for block in set(number[~outside & ~in_iron]):
         here = number == block
         chi = tensors[block] - np.eye(3)
         polarization[here] = remanence[block] + chi @ of_change[here]
@@ -266,8 +298,41 @@ def _through_blocks(
     return flux[..., 0], flux[..., 1:], error, polarization
 
 
+def _add_answer(
+    of_change: Floats, iron: IronReaction | BodiesReaction, magnet: Magnet, remanence: Floats,
+    points: Floats, in_iron: NDArray[np.bool_]
+) -> None:
+    """Add to mu_0 H (n, 3, q) in T of deviations what iron answers to them.
+
+    ``remanence`` (blocks, 3, q) in T are the deviations. In iron it is all of mu_0 H.
+    """
+    nodes = iron.nodes(ANGLES)
+    order = np.concatenate([np.flatnonzero(~in_iron), np.flatnonzero(in_iron)])
+    for block, unit in enumerate(unit_fields(magnet.blocks, nodes)):
+        if remanence[block].any():
+            answer = iron.tangent(np.moveaxis(unit, 2, 0), points[~in_iron], points[in_iron])
+            of_change[order] += np.moveaxis(answer, 0, 2) @ remanence[block]
+
+
+def _induced(body: IronSolid, strength: Floats) -> tuple[Floats, Floats]:
+    """Return J (n, 3, 1 + q) of iron in T for mu_0 H, and dB / d mu_0 H (n, 1) at most.
+
+    Of the roots it is that of a small change.
+    """
+    mean = strength[..., 0]
+    square = np.sum(mean**2, axis=1)
+    if isinstance(body.law, float | int):
+        return (body.law - 1) * strength, np.full((len(mean), 1), float(body.law))
+    curve = body.law.permeability
+    excess, slope = curve.coefficient(square) - 1, 2 * curve.slope(square)
+    along = np.einsum("ni,niq->nq", mean, strength)
+    along[:, 0] = 0.0
+    return (excess[:, None, None] * strength + (slope[:, None] * mean)[..., None] * along[:, None],
+            np.maximum(1 + excess, 1 + excess + slope * square)[:, None])
+
+
 def _reaction(
-    magnet: Magnet, points: Floats, number: NDArray[np.intp], session: Session
+    magnet: Magnet, points: Floats, number: NDArray[np.intp], solved: SeparateReaction
 ) -> tuple[Floats, Floats]:
     """Return what permeability and iron add to mu_0 H of the nominal magnet, and its error bar.
 
@@ -275,7 +340,6 @@ def _reaction(
     """
     from halbach_fe.solver.moments.solve import field_within  # imports numba
 
-    solved = solve_separate(magnet, session)
     present = present_blocks(magnet.blocks)
     place = np.full(len(points), -1)  # number of the block of a point among those that are there
     for block in set(number[number >= 0]):

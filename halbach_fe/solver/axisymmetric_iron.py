@@ -130,12 +130,20 @@ class IronReaction:
         change = self.field(points) - self.coarse.field(points)
         return np.repeat(np.linalg.norm(change, axis=1)[:, None], 3, axis=1)
 
+    def inside(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""
+        found = _inside(self.name, self.problem.modes, self.problem.numbers, self.total, points)[0]
+        change = np.nan if self.coarse is None else np.linalg.norm(
+            found - self.coarse.inside(points)[0], axis=1)[:, None]
+        return found, np.broadcast_to(change, found.shape)
+
     def nodes(self, angles: int) -> Floats:
         """Return the points (angles k, 3) in m in the iron, angle by angle, for `tangent`."""
         return _nodes(self.problem.modes, _angles(angles))
 
     def tangent(
-        self, sources: Sequence[Source] | Floats, points: Floats, modes: int = TANGENT_MODES
+        self, sources: Sequence[Source] | Floats, points: Floats, inside: Floats | None = None,
+        modes: int = TANGENT_MODES
     ) -> Floats:
         """Return the derivative of the reaction with respect to additional sources.
 
@@ -146,12 +154,14 @@ class IronReaction:
         sources : sequence of callable, or ndarray, shape (c, angles k, 3), in T
             The sources' mu_0 H, or its values at `nodes`.
         points : ndarray, shape (n, 3), in m
+        inside : ndarray, shape (i, 3), in m, optional
+            Points in iron, for which the derivative of mu_0 H follows that at the points.
         modes : int
             Highest azimuthal mode.
 
         Returns
         -------
-        ndarray, shape (c, n, 3), in T
+        ndarray, shape (c, n + i, 3), in T
         """
         state, numbers = self.problem, np.arange(modes + 1)
         spaces = [state.modes.exterior(number) for number in numbers.tolist()]
@@ -165,7 +175,8 @@ class IronReaction:
                           gradients=tuple(state.modes.gradient(m) for m in numbers.tolist()))
         tangent = Tangent.of(problem, differential)
         highest = _modes_at(problem, points)
-        result = np.empty((len(sources), len(points), 3))
+        within = np.zeros((0, 3)) if inside is None else inside
+        result = np.empty((len(sources), len(points) + len(within), 3))
         # conjugate gradients stop at this relative residual in `IronReaction.tangent`
         tolerance = 1e-7
         # number of sources that `IronReaction.tangent` solves for at a time, which limits the
@@ -176,9 +187,12 @@ class IronReaction:
             own = np.concatenate([_source_potential(problem, _sampled(state.modes, source))
                                   for source in part], axis=2)
             total = tangent.solve(problem.stiffness(own), tolerance)
-            result[first:first + step] = _evaluate(self.name, state.modes, {
+            result[first:first + step, :len(points)] = _evaluate(self.name, state.modes, {
                 number: _continue(state.modes, spaces[number], (total - own)[number])
                 for number in numbers[numbers <= highest].tolist()}, points)
+            if len(within):
+                result[first:first + step, len(points):] = _inside(
+                    self.name, state.modes, numbers, total, within)
         return result
 
 
@@ -337,6 +351,17 @@ def _continue(modes: IronModes, space: Exterior, iron: Complexes) -> Complexes:
     return result
 
 
+def _inside(
+    name: str, modes: IronModes, numbers: Ints, total: Complexes, points: Floats
+) -> Floats:
+    """Return -grad (c, n, 3) in T of potentials (modes, iron, c) at points (n, 3) in m in iron."""
+    potentials = {}
+    for number, part in zip(numbers.tolist(), total, strict=True):
+        potentials[number] = np.zeros((modes.unknowns.count, part.shape[1]), complex)
+        potentials[number][modes.iron] = part
+    return _evaluate(name, modes, potentials, points, anywhere=True)
+
+
 def highest_mode_at(bodies: Sequence[IronRectangle], points: Floats) -> int | None:
     """Return the highest mode that iron produces at points (n, 3) in m; None for all modes."""
     inner = min(body.inner_radius_m for body in bodies)
@@ -355,9 +380,13 @@ def _modes_at(problem: Problem, points: Floats) -> int:
 
 
 def _evaluate(
-    name: str, modes: IronModes, potentials: dict[int, Complexes], points: Floats
+    name: str, modes: IronModes, potentials: dict[int, Complexes], points: Floats,
+    anywhere: bool = False
 ) -> Floats:
-    """Return -grad (c, n, 3) in T of potentials (unknowns, c) by mode, at points (n, 3) in m."""
+    """Return -grad (c, n, 3) in T of potentials (unknowns, c) by mode, at points (n, 3) in m.
+
+    The points are in air, or ``anywhere``.
+    """
     mesh = modes.mesh
     check_inside(name, mesh.radius, mesh.half_length, points)
     r, phi = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
@@ -366,7 +395,7 @@ def _evaluate(
     axis_radius = 1e-6
     least = axis_radius * mesh.points[mesh.points[:, 0] > 0, 0].min()
     places, where = unique_points(np.column_stack([np.maximum(r, least), points[:, 2], 0 * r]))
-    at = points_at(mesh, locate(mesh, places), modes.unknowns)
+    at = points_at(mesh, locate(mesh, places, anywhere), modes.unknowns, anywhere)
     columns = max((part.shape[1] for part in potentials.values()), default=1)
     cylindrical = np.zeros((3, len(points), columns))
     for mode, part in potentials.items():

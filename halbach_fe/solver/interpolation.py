@@ -95,29 +95,38 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
     points = points[:, :dimension]
     air = np.flatnonzero(mesh.in_air | anywhere)
     nodes = mesh.points[mesh.cells[air]]
-    tree = KDTree(nodes.mean(axis=1))
-    hits: list[tuple[Ints, Ints, Floats]] = []  # points, elements, coordinates
-    missing = np.arange(len(points))
-    for count, slack in ((min(n, len(air)), slack) for n, slack in SEARCHES):
-        nearest = tree.query(points[missing], count)[1].reshape(len(missing), count)
-        held = np.zeros(len(missing), bool)
-        for chosen in nearest.T:
-            reference, inside = _invert(nodes[chosen], points[missing], slack)
-            hits.append((missing[inside], air[chosen[inside]], reference[inside]))
-            held |= inside
-        missing = missing[~held]
-        if not len(missing):
-            break
+    rows, cells, reference, missing = elements_of(nodes, points)
     if len(missing):
         where = ", ".join(f"{x:g}" for x in points[missing[0]])
         raise PointsOutsideError(mesh.regions.study, (
             f"in its {'elements' if anywhere else 'air'}; instead {len(missing)} points lie in "
             f"none of its elements, the first at ({where}) m."))
-    rows = np.concatenate([row for row, _, _ in hits])
     share = 1 / np.bincount(rows, minlength=len(points))[rows]
     mean = sparse.csr_array((share, (rows, np.arange(len(rows)))), shape=(len(points), len(rows)))
-    return Located(np.concatenate([cell for _, cell, _ in hits]),
-                   np.vstack([reference for _, _, reference in hits]), mean)
+    return Located(air[cells], reference, mean)
+
+
+def elements_of(nodes: Floats, points: Floats) -> tuple[Ints, Ints, Floats, Ints]:
+    """Return which elements hold points (n, d), of elements of nodes (e, k, d) in m.
+
+    Point, element and reference coordinates (d,) of every pair, and the points that none holds.
+    """
+    tree = KDTree(nodes.mean(axis=1))
+    hits: list[tuple[Ints, Ints, Floats]] = []
+    missing = np.arange(len(points))
+    for count, slack in ((min(n, len(nodes)), slack) for n, slack in SEARCHES):
+        nearest = tree.query(points[missing], count)[1].reshape(len(missing), count)
+        held = np.zeros(len(missing), bool)
+        for chosen in nearest.T:
+            reference, inside = _invert(nodes[chosen], points[missing], slack)
+            hits.append((missing[inside], chosen[inside], reference[inside]))
+            held |= inside
+        missing = missing[~held]
+        if not len(missing):
+            break
+    return (np.concatenate([row for row, _, _ in hits]),
+            np.concatenate([cell for _, cell, _ in hits]),
+            np.vstack([reference for _, _, reference in hits]), missing)
 
 
 def probes_of(mesh: VerifiedMesh, cells: Ints, count: int = 10) -> tuple[Located, Floats]:

@@ -32,7 +32,7 @@ from scipy.sparse.csgraph import connected_components
 
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import GetDPError, OutputError, StudyError, must_be
+from halbach_fe.core.errors import GetDPError, OutputError, PointsOutsideError, StudyError, must_be
 from halbach_fe.core.files import make_folder
 from halbach_fe.core.threads import available_memory, in_threads, share_out
 from halbach_fe.geometry import domain as tags
@@ -42,7 +42,7 @@ from halbach_fe.solver.axisymmetric_iron import Source, conjugate_gradients, new
 from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.dofs import read_matrix, read_solutions, read_unknowns
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
-from halbach_fe.solver.interpolation import QUADRATURE, quadrature, shape_functions
+from halbach_fe.solver.interpolation import QUADRATURE, elements_of, quadrature, shape_functions
 from halbach_fe.solver.iron_modes import MESH
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
@@ -103,6 +103,26 @@ class Problem:
         return np.stack([np.bincount(self.nodes.ravel(), part.ravel(),
                                      self.stiffness_of_vacuum.shape[0])
                          for part in np.moveaxis(parts, 2, 0)], axis=1)
+
+    def strength(self, potential: Floats, points: Floats) -> Floats:
+        """Return -grad psi (c, n, 3) in T of potentials (k, c) at points (n, 3) in m in iron.
+
+        Raises
+        ------
+        PointsOutsideError
+            If a point lies in no element.
+        """
+        rows, cells, reference, missing = elements_of(self.places, points)
+        if len(missing):
+            raise PointsOutsideError("iron", "in the elements of its iron; instead "
+                                     f"{len(missing)} points lie in none of them")
+        _, slopes = shape_functions("tetra10", reference)
+        jacobian = np.einsum("nkd,nke->nde", self.places[cells], slopes)
+        slopes = np.einsum("nke,ned->nkd", slopes, np.linalg.inv(jacobian))
+        found = np.zeros((len(points), potential.shape[1], 3))
+        np.add.at(found, rows, -np.einsum("nkd,nkc->ncd", slopes, potential[self.nodes[cells]]))
+        share = np.bincount(rows, minlength=len(points))[:, None, None]
+        return np.moveaxis(found / share, 1, 0)
 
     def stiffness(self, potential: Floats) -> Floats:
         """Return S psi (n, c)."""
@@ -257,14 +277,24 @@ class BodiesReaction:
         change = self.field(points) - self.coarse.field(points)
         return np.repeat(np.linalg.norm(change, axis=1)[:, None], 3, axis=1)
 
+    def inside(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""
+        found = self.problem.strength(self.total, points)[0]
+        change = np.nan if self.coarse is None else np.linalg.norm(
+            found - self.coarse.inside(points)[0], axis=1)[:, None]
+        return found, np.broadcast_to(change, found.shape)
+
     def nodes(self, _angles: int = 0) -> Floats:
         """Return the points (k, 3) in m in the iron for `tangent`."""
         return self.problem.points
 
-    def tangent(self, sources: Sequence[Source] | Floats, points: Floats) -> Floats:
+    def tangent(
+        self, sources: Sequence[Source] | Floats, points: Floats, inside: Floats | None = None
+    ) -> Floats:
         """Return the derivative (c, n, 3) in T of the reaction with respect to additional sources.
 
-        They are functions, or values (c, k, 3) in T of their mu_0 H at `nodes`.
+        They are functions, or values (c, k, 3) in T of their mu_0 H at `nodes`. Below it is that of
+        mu_0 H (c, i, 3) in iron, at points ``inside`` (i, 3) in m.
         """
         problem = self.problem
         values = np.stack([source(problem.points) if callable(source) else source
@@ -278,8 +308,10 @@ class BodiesReaction:
         along = np.einsum("eqi,eqic->eqc", field, change)
         polarization = -(excess[..., None, None] * change
                          + (slope[..., None] * field)[..., None] * along[:, :, None])
-        return np.stack([_field_of(problem, part, points)
-                         for part in np.moveaxis(polarization, 3, 0)])
+        reaction = np.stack([_field_of(problem, part, points)
+                             for part in np.moveaxis(polarization, 3, 0)])
+        return reaction if inside is None else np.concatenate(
+            [reaction, problem.strength(total, inside)], axis=1)
 
 
 def _reference() -> Floats:

@@ -440,9 +440,12 @@ def assemble_modes(
                      axis_unknowns(mesh, unknowns), iron, points.restricted(iron), number)
 
 
-def points_at(mesh: VerifiedMesh, located: Located, unknowns: Unknowns) -> GaussPoints:
-    """Return the operators at located points in air, without weights."""
-    return _operators(mesh, located, grid_operators(mesh, located, unknowns))
+def points_at(
+    mesh: VerifiedMesh, located: Located, unknowns: Unknowns, anywhere: bool = False
+) -> GaussPoints:
+    """Return the operators at located points in air, or ``anywhere``, without weights."""
+    operators = nodal_operators if anywhere else grid_operators
+    return _operators(mesh, located, operators(mesh, located, unknowns))
 
 
 def _operators(

@@ -28,8 +28,8 @@ def test_progress_is_told_with_the_time_left():
         pace.advance(done, 100)
     assert shown[0] == (0, 100)
     assert shown[-1] == (100, 100)
-    assert said[0] == "effects: 10 of 100, about 2 min left"
-    assert said[-1] == "effects: 90 of 100, about 10 s left"
+    assert said[0] == "effects: 10 of 100, about 2 min left of this step"
+    assert said[-1] == "effects: 90 of 100, about 10 s left of this step"
     assert len(said) == 9
     pace.begin("more effects")
     clock.now += 20.0  # the first prepares what all others use: nothing is foretold from it
@@ -39,13 +39,13 @@ def test_progress_is_told_with_the_time_left():
     for done in range(1, 13):  # a part of the step that counts by itself
         pace.advance(done, 20)
         clock.now += 1.0
-    assert said[-1] == "more effects: 12 of 20, about 8 s left"
+    assert said[-1] == "more effects: 12 of 20, about 8 s left of this step"
     clock.now += 1000.0
     for done in range(1, 13):  # another part with as many
         pace.advance(done, 20)
         clock.now += 1.0
-    assert said[-1] == "more effects: 12 of 20, about 8 s left"
-    assert said[-2] == "more effects: 2 of 20, about 18 s left"  # without the 1000 s before
+    assert said[-1] == "more effects: 12 of 20, about 8 s left of this step"
+    assert said[-2] == "more effects: 2 of 20, about 18 s left of this step"  # not the 1000 s
     assert not pace.is_over
 
 

@@ -346,6 +346,10 @@ FILES = [
             "VECTORS B double\n" + table(" ", FIELD.T), {
                 "skip_lines": 9, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
             ("--skip-lines",)),
+    Foreign("Poisson, T7 with the grid above", "2DMagnetoStatic ZX\n-2 2 4\n0.2 1.0 14\n" + table(
+        " ", FIELD[:, [2, 0]].T), {"skip_lines": 3, "columns": ("Bz[T]", "Bx[T]"),
+                                  "positions": True}, ("with it, --skip-lines 3",),
+            field=FIELD * [1, np.nan, 1]),
     Foreign("the middle twice", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
             + "0,0,0,0.1,1e-6,0.05\n", points=np.vstack([POINTS, [[0, 0, 0]]]),
             field=np.vstack([FIELD, [[0.1, 1e-6, 0.05]]])),

@@ -82,6 +82,13 @@ def test_all_that_is_missing_in_one_message(tmp_path):
                  fixed={"sigma": "0.1 %"})
 
 
+def test_what_is_missing_is_asked_for_in_one_option(tmp_path):
+    table = "no,mx [Am^2],my [Am^2],mz [Am^2],V [cm^3]\n1,1.0,0,0,1\n"
+    with pytest.raises(MeasurementError, match="one --fixed NAME=VALUE,NAME=VALUE"):
+        imported(tmp_path, table)
+    assert imported(tmp_path, table, fixed={"sigma": "0.2 %", "type": "1"}).serial == ("1",)
+
+
 FREE = ("Name;Shape;xc [mm];yc [mm];zc [mm];Rot x (deg);Rot y (deg);Rot z (deg);dx [mm];dy [mm];"
         "dz [mm];")
 

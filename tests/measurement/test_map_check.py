@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
+from halbach_fe.cli.measured import floor_of
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement import harmonic_field, map_check
 from halbach_fe.measurement.field_map import (
@@ -35,6 +36,7 @@ from halbach_fe.report.map_check import (
     verdict,
     weighted_note,
 )
+from halbach_fe.report.map_check import page as page_of_check
 from tests.support.hard_maps import ERRORS, hard_map
 from tests.support.short_dipole import FRINGE, sectors, truth
 
@@ -183,7 +185,7 @@ def test_a_perfect_instrument(generator):
     check = check_map(field_map(GRID, read_by(generator)), said.append,
                       lambda *counts: shown.append(counts))
     assert list(dict.fromkeys(line.partition(":")[0] for line in said)) == [
-        f"step {number} of 4" for number in range(1, 5)]
+        f"step {number} of 5" for number in range(1, 6)]
     steps = {total: done for done, total in shown}
     assert steps == {total: total for total in steps}  # every step comes to its end
     assert len(steps) >= 2  # a clean map has one orientation, and the last step is one fit
@@ -337,13 +339,78 @@ def test_a_small_map_cannot_tell(generator):
         check_map(field_map(line, source().getB(line)))
     with pytest.raises(MeasurementError, match="at least 30 points"):
         check_map(field_map(GRID[:9], source().getB(GRID[:9])))
-    partly = read_by(generator)
-    partly[:, 2] = np.nan
-    with pytest.raises(MeasurementError, match=r"a map without Bz\. What is left has no div B"):
-        check_map(field_map(GRID, partly))
-    for wrong in (partly, 0 * GRID, np.ones_like(GRID)):
-        with pytest.raises(MeasurementError, match="all three components"):
+    for wrong in (0 * GRID, np.ones_like(GRID)):
+        with pytest.raises(MeasurementError, match="with all its components"):
             check_map(field_map(GRID, wrong))
+
+
+def only(field, *axes):
+    """The columns of some components of a map (n, 3), the others empty."""
+    return np.where(np.isin(np.arange(3), axes), field, np.nan)
+
+
+def test_a_component_alone_shows_spikes_and_a_lag(generator, tmp_path):
+    """The stage goes to and fro along x, the readings are 1 mm late, one is 5 mT off."""
+    lines = np.moveaxis(GRID.reshape(5, 7, 9, 3), 0, 2)[:, ::2].reshape(-1, 5, 3).copy()
+    lines[1::2] = lines[1::2, ::-1]
+    way = np.sign(np.diff(lines, axis=1, prepend=lines[:, :1])).reshape(-1, 3)
+    field = only(source().getB(lines.reshape(-1, 3) - 1e-3 * way), 0)
+    field += NOISE_T * generator.standard_normal(field.shape)
+    field[66, 0] += 5e-3
+    data = field_map(lines.reshape(-1, 3), field)
+    check = check_map(data)
+    lag = named(check, "lag of the readings behind the stage")
+    assert [term for term in check.terms if term.found] == [lag]
+    assert abs(lag.value - 1.0) < 4 * lag.sd
+    assert (check.broken, check.measured) == ({"spike": [67]}, "Bx")
+    assert verdict(check).startswith("Passed. The map has Bx of a field without sources")
+    assert "Gains, axes, turns and places of sensors need three components" in sentences(check)[0]
+    assert not any("gain of" in name for name in undetermined(check).split(";"))
+    assert np.isnan(check.residual_T[:, 1:]).all()
+    (tmp_path / "check.json").write_text(json.dumps(
+        page_of_check(data, check).summary, allow_nan=False))
+    assert floor_of(tmp_path / "check.json", data) == {"Bx": check.floor_T[0]}
+
+
+@pytest.mark.parametrize(("axes", "obeys"), [((0,), False), ((0, 1), False), ((0, 2), True)])
+def test_some_components_fail_if_no_field_has_them(generator, axes, obeys):
+    """Of one component the lines are shuffled, of Bx and By one has the other sign.
+
+    Control: Bx and Bz as they are.
+    """
+    field = only(read_by(generator), *axes)
+    if axes == (0,):
+        field = field.reshape(35, 9, 3)[generator.permutation(35)].reshape(-1, 3)
+    if axes == (0, 1):
+        field[:, 1] *= -1
+    check = check_map(field_map(GRID, field))
+    assert check.obeys == obeys
+    assert verdict(check).startswith("Passed. The map has Bx and Bz" if obeys else "Failed.")
+
+
+def test_rows_in_no_order_of_a_scan(generator):
+    """A lag follows the times; without them, nothing that changes during the scan is asked.
+
+    Control: grids along any axis and circles are scans.
+    """
+    field, shuffled = read_by(generator), generator.permutation(len(GRID))
+    circles = np.array([[np.cos(one), np.sin(one), z] for z in (0.0, 0.5) for one in range(7)])
+    for points in (GRID, GRID[np.lexsort(GRID.T)], circles):
+        assert map_check._order(field_map(points, points)) == "rows"
+    for order in (shuffled, np.argsort(field[:, 0]), np.argsort(np.linalg.norm(field, axis=1))):
+        data = field_map(GRID[order], field[order])
+        scan, *_ = map_check.scan_of(data)
+        assert not scan.directions.any()
+        asked = scan.model(Charges.around(GRID, 0.01)).prior_sd > 0
+        assert asked[:18].all()
+        assert not asked[18:].any()
+    assert "cannot be judged" in sentences(replace(CLEAN, order="none"))[0]
+    in_time, *_ = map_check.scan_of(field_map(GRID, field))
+    timed = field_map(GRID[shuffled], field[shuffled])
+    timed["time_s"] = ("point", 3.0 * shuffled)
+    scan, *_ = map_check.scan_of(timed)
+    np.testing.assert_array_equal(scan.directions, in_time.directions[shuffled])
+    np.testing.assert_allclose(scan.time, in_time.time[shuffled])
 
 
 @pytest.mark.parametrize(("axes", "named"), [

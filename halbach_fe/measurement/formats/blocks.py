@@ -139,8 +139,8 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
     if missing:
         raise MeasurementError(must_be(
             "content", where, "complete", f"a table that does not say {'; '.join(missing)}",
-            "A column can be named by --columns, and a value that all blocks share be given by "
-            "--fixed; nothing is guessed."))
+            "A column can be named by --columns, and what all blocks share be given by one --fixed "
+            "NAME=VALUE,NAME=VALUE; nothing is guessed."))
     if free:
         return _free_blocks(table, declared)
     digest = hashlib.sha256(raw).hexdigest()

@@ -230,8 +230,9 @@ def rows_of(
                 f"line {position}", where, f"{columns} values", str(len(cells)),
                 "Is the file cut short? Else remove the line, or begin it with #"
                 + ("." if position == lines[-1][0] else
-                   f"; if the table begins below it, add --skip-lines {position}; if cells are "
-                   "separated otherwise, --delimiter.")))
+                   f"; if the table begins below it, add --skip-lines {position}, if with it, "
+                   f"--skip-lines {position - 1}; if cells are separated otherwise, "
+                   "--delimiter.")))
         row = [_number_or_none(cell, declared.decimal_comma) for cell in cells]
         for column, value in enumerate(row):
             if value is None:
