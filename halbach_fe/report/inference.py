@@ -14,7 +14,6 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import inference_summary, write_inference
 from halbach_fe.report.inference_answer import answer
-from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
 from halbach_fe.report.page import (
@@ -46,7 +45,15 @@ from halbach_fe.report.prediction import (
     whitened_quantiles_figure,
 )
 from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.words import decimals, flux_density, place_of, ppm, relative, with_error
+from halbach_fe.report.words import (
+    decimals,
+    flux_density,
+    magnet_rows,
+    place_of,
+    ppm,
+    relative,
+    with_error,
+)
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.multipoles import circle_models
