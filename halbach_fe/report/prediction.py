@@ -46,26 +46,6 @@ FEWEST_ON_A_LINE = 5
 
 
 @dataclass(frozen=True)
-class PublishedErrors:
-    """Relative errors from the literature for the same readings.
-
-    Attributes
-    ----------
-    label : str
-        Name of the source in legends.
-    z : ndarray, shape (n,), in m
-        Positions, increasing.
-    prior, posterior : ndarray, shape (n,)
-        Relative errors of the predictions at z.
-    """
-
-    label: str
-    z: Floats
-    prior: Floats
-    posterior: Floats
-
-
-@dataclass(frozen=True)
 class ReadingLine:
     """Readings of the same quantity along z, around a circle, or by harmonic.
 
@@ -158,7 +138,7 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
     residual, band = factor * difference, factor * band
     bottom.fill_between(line.place, -band, band, color=POSTERIOR, alpha=0.2, lw=0, step="mid",
                         label="95 % band (prediction and noise)")
-    for part, mask in _parts(result, index):
+    for part, mask in parts_of(result, index):
         for axis, values in ((top, 1e3 * measured), (bottom, residual)):
             axis.plot(line.place[mask], values[mask], ls="none", color=MEASURED, **MARKERS[part],
                       label=f"measured, {part}" if axis is top else None)
@@ -215,37 +195,14 @@ def residual_maps_figure(result: InferenceResult) -> Figure:
         for label in dict.fromkeys(observation.labels)}, unit)
 
 
-def relative_error_figure(result: InferenceResult, published: PublishedErrors | None) -> Figure:
-    """Draw the relative error |measured - predicted| / |measured| along the main line."""
-    line = main_line(result)
-    figure, (axis,) = stacked_axes(1)
-    figure.set_figheight(4.5)
-    if published is not None:
-        axis.semilogy(1e3 * published.z, published.prior, ":", color=PUBLISHED, lw=1,
-                      label=f"{published.label}, prior")
-        axis.semilogy(1e3 * published.z, published.posterior, "-", color=PUBLISHED, lw=1,
-                      label=f"{published.label}, posterior")
-    for name, prediction, colour in _predictions(result):
-        error = result.relative_error(prediction)[line.index]
-        axis.semilogy(line.place, error, "-", color=colour, lw=1, label=name)
-        for part, mask in _parts(result, line.index):
-            if part != TRAINING:
-                axis.semilogy(line.place[mask], error[mask], ls="none", color=colour,
-                              label=f"{name}, {part}", **MARKERS[part])
-    axis.set_xlabel(line.axis)
-    axis.set_ylabel(f"|measured − predicted| / |measured| of {line.what}")
-    legend_above(figure, axis)
-    return figure
-
-
 def standardized_residuals_figure(result: InferenceResult) -> Figure:
     """Draw the standardized residuals of all readings for prior and posterior."""
     crowd = 3000  # number of readings from which smaller, transparent markers are used
     place, label = axis_of_readings(result)
     figure, axes = stacked_axes(2)
-    for axis, (name, prediction, colour) in zip(axes, _predictions(result), strict=True):
+    for axis, (name, prediction, colour) in zip(axes, predictions(result), strict=True):
         scores = result.standardized(prediction)
-        for part, mask in _parts(result, np.arange(len(scores))):
+        for part, mask in parts_of(result, np.arange(len(scores))):
             style = {"marker": ".", "ms": 1.5} if len(scores) > crowd else MARKERS[part]
             axis.plot(place[mask], scores[mask], ls="none", label=part, **style,
                       color=MEASURED if part == TRAINING else colour,
@@ -283,7 +240,7 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
         label="95 % band of each quantile,\nif the model is right")
     axis.axline((0, 0), slope=1, color=PUBLISHED, lw=0.8)
     found = []
-    for name, prediction, colour in _predictions(result)[: 2 if unseen else 1]:
+    for name, prediction, colour in predictions(result)[: 2 if unseen else 1]:
         found.append(np.sort(result.whitened(prediction, chosen))[rank - 1])
         axis.plot(normal, found[-1], "." if name == "prior" else "x", color=colour, ms=4, mew=0.8,
                   label=name)
@@ -295,13 +252,13 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     return figure
 
 
-def _predictions(result: InferenceResult) -> list[tuple[str, Prediction, str]]:
+def predictions(result: InferenceResult) -> list[tuple[str, Prediction, str]]:
     """Return name, prediction and colour of prior and posterior."""
     return [("prior", result.prediction_prior, PRIOR),
             ("posterior", result.prediction_posterior, POSTERIOR)]
 
 
-def _parts(result: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def parts_of(result: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield each part of the readings that is present, and the mask of its readings."""
     parts = np.array(result.parts)[index]
     for part in MARKERS:
