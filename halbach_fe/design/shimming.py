@@ -146,7 +146,7 @@ class Shim(ShownInNotebook):
     before: Any
     steps: tuple[Step, ...]
     stop: str
-    tried: dict[str, int]
+    tried: dict[Kind, int]
     limit: float | None
     within: tuple[float, float] | None
     fields: tuple[Homogeneity, Homogeneity] | None
