@@ -519,6 +519,8 @@ class _Explanation:
         try:
             self.run("check", "check", self.map)
         except MeasurementError as error:
+            if not self.map.is_file():
+                raise
             common.say(f"The map cannot be checked by itself: {error}")
             return
         oriented = self.arguments.output / "check" / "oriented_map.csv"

@@ -59,6 +59,9 @@ class Verb:
 VERBS: dict[str, Verb] = {}
 """All verbs by name; `halbach_fe.cli.verbs` imports the modules that declare them."""
 
+MOST_NEEDED = "new", "explain", "solve", "infer", "diagnose"
+"""The verbs that most people need; the help names them first."""
+
 
 def verb(*options: Options) -> Callable[[Run], Run]:
     """Declare a function as the verb of its name, whose help is the function's docstring."""
@@ -115,11 +118,13 @@ def parser(verbs: Collection[str] = VERBS) -> argparse.ArgumentParser:
     """
     codes = "\n".join(f"  {code:3d}  {meaning}" for code, meaning in EXIT_CODES.items())
     top = Parser(
-        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays.",
+        prog="halbach-fe", description="Finite elements and Bayesian inference for Halbach arrays."
+        f"\n\nMost people need {', '.join(MOST_NEEDED[:-1])} and {MOST_NEEDED[-1]}.",
         epilog=f"exit codes:\n{codes}", formatter_class=argparse.RawDescriptionHelpFormatter)
     top.add_argument("--version", action="version", version=version("halbach-fe"))
     subparsers = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, one in VERBS.items():
+    for name in dict.fromkeys((*MOST_NEEDED, *VERBS)):
+        one = VERBS[name]
         added = subparsers.add_parser(name, help=one.text.splitlines()[0], description=one.text,
                                       formatter_class=argparse.RawDescriptionHelpFormatter)
         if name in verbs:

@@ -48,6 +48,7 @@ from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
+from halbach_fe.measurement.field_map import taking_arrays
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks
 from halbach_fe.measurement.formats.blocks import import_blocks as read_foreign_blocks
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
@@ -285,6 +286,7 @@ class HomogeneityResult(ShownInNotebook):
     map_remarks: tuple[str, ...] = ()
 
 
+@taking_arrays
 @alone
 def diagnose(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session = NOT_KEPT,

@@ -22,7 +22,7 @@ from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.field_map import directed, is_total_field, is_undirected
+from halbach_fe.measurement.field_map import directed, is_total_field, is_undirected, taking_arrays
 from halbach_fe.measurement.map_check import MapCheck, check_map, oriented
 from halbach_fe.measurement.total_check import check_total
 from halbach_fe.report import diagnosis_answer, inference_answer, registration
@@ -92,6 +92,7 @@ class Explanation:
         return f"Explanation({', '.join(self.answers)}: {last.said} {last.trust})"
 
 
+@taking_arrays
 @alone
 def explain(
     magnet: Magnet, data: xr.Dataset, session: Session = NOT_KEPT,
@@ -103,7 +104,8 @@ def explain(
     ----------
     magnet : Magnet
     data : Dataset
-        The map, see `halbach_fe.read_map` and `halbach_fe.field_map`.
+        The map, see `halbach_fe.read_map`; or positions (n, 3) in m, then readings (n, 3) in T, and
+        ``sigma_T=``, see `halbach_fe.field_map`.
     session : Session, optional
     blocks : BlockTable, optional
         Measured blocks, whose prior replaces the study's.

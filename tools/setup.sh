@@ -84,5 +84,5 @@ if [ ! -e "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
     echo "Installing halbach-fe into .venv"
     [ -x .venv/bin/python ] || "$python" -m venv .venv
     .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".${extras:+[$extras]}"
-    touch "$stamp"
+    touch "$stamp" .venv/.installed  # an extra's installation is that of the package, too
 fi

@@ -63,13 +63,14 @@ class Move:
         What is moved, and how.
     pairs : tuple of (int, int)
         Number from 0 of a block's slot, and of the slot from which the block that is there comes.
-    turn : tuple
-        Rotation of these blocks.
+    turn : tuple or None
+        Rotation of these blocks; None if each turns with the shape of its slot, see
+        `MagnetBlock.carried_from`.
     """
 
     words: str
     pairs: tuple[tuple[int, int], ...]
-    turn: Turn
+    turn: Turn | None
 
 
 @lru_cache(maxsize=4096)
@@ -107,7 +108,8 @@ def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
     ----------
     magnet : Magnet
     kind : str
-        ``exchanged``, ``turned`` (from slot to slot about z) or ``upside down``.
+        ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise than
+        their places, also the blocks without their holder) or ``upside down``.
     """
     return _moves(_drop_exceptions(magnet.array), magnet.dimension, kind)
 
@@ -120,15 +122,16 @@ def _drop_exceptions(array: Array) -> Array:
 @lru_cache(maxsize=32)
 def _moves(array: Array, dimension: int, kind: str) -> dict[str, Move]:
     blocks = nominal_blocks(array, dimension)
-    rings: dict[int, list[int]] = {}
+    every: dict[int, list[int]] = {}
     for number, block in enumerate(blocks):
-        rings.setdefault(block.ring, []).append(number)
-    groups = {f"ring {ring}": numbers for ring, numbers in rings.items() if len(numbers) > 2}
+        every.setdefault(block.ring, []).append(number)
+    groups = {f"ring {ring}": numbers for ring, numbers in every.items() if len(numbers) > 2}
     # numbers of blocks in a ring, and of rings, up to which moves of rings are tried
     most_in_ring, most_rings = 64, 40
     if dimension == 2 or not 1 <= len(groups) <= most_rings or max(
             map(len, groups.values())) > most_in_ring:
         return {}
+    rings = dict(groups)
     several = len(groups) > 1  # a whole magnet that is turned is an error of another kind
     if len(groups) > 3:
         names = list(groups)
@@ -136,7 +139,9 @@ def _moves(array: Array, dimension: int, kind: str) -> dict[str, Move]:
                            ("the upper half", names[-(len(names) // 2):])):
             groups[name] = [number for each in part for number in groups[each]]
     tried = (_exchanges(blocks, groups) if kind == "exchanged"
-             else _turns(blocks, groups, kind) if several else iter(()))
+             else [*_turns(blocks, groups, kind)] if several else [])
+    if kind == "turned":
+        tried = [*tried, *_fillings(blocks, rings)]
     return {move.words: move for move in tried}
 
 
@@ -167,8 +172,7 @@ def _turns(
         for k in range(0 if kind == "upside down" else 1, count):
             if kind == "turned":
                 turn = Rotation.from_euler("z", 2 * np.pi * k / count)
-                signed = k if k <= count // 2 else k - count
-                words = f"{name} by {signed:+d} slot{'s' if abs(signed) > 1 else ''}"
+                words = f"{name} {_by_slots(k, count)}"
             else:
                 angle = np.pi * k / count + np.radians(blocks[numbers[0]].angle_deg)
                 turn = Rotation.from_rotvec(np.pi * np.array([np.cos(angle), np.sin(angle), 0.0]))
@@ -179,12 +183,36 @@ def _turns(
                 yield Move(words, pairs, _matrix_rows(turn.as_matrix()))
 
 
+def _fillings(
+    blocks: Sequence[MagnetBlock], rings: dict[str, list[int]]
+) -> Iterator[Move]:
+    """Yield rings that were filled from another slot on, where slots are turned otherwise than
+    their places, as those of bars along the magnetization.
+    """
+    for name, numbers in rings.items():
+        count = len(numbers)
+        for k in range(1, count):
+            turn = Rotation.from_euler("z", 2 * np.pi * k / count).as_matrix()
+            pairs = _pairs(blocks, (numbers, numbers), turn, np.zeros(3), with_shape=True)
+            if pairs is not None and not all(
+                    np.allclose(blocks[to].carried_from(blocks[source]), turn)
+                    for to, source in pairs):
+                yield Move(f"the blocks of {name} {_by_slots(k, count)} each", pairs, None)
+
+
+def _by_slots(k: int, count: int) -> str:
+    """Describe a turn by ``k`` of ``count`` slots."""
+    signed = k if k <= count // 2 else k - count
+    return f"by {signed:+d} slot{'s' if abs(signed) > 1 else ''}"
+
+
 def _pairs(
-    blocks: Sequence[MagnetBlock], groups: tuple[list[int], list[int]], turn: Floats, shift: Floats
+    blocks: Sequence[MagnetBlock], groups: tuple[list[int], list[int]], turn: Floats,
+    shift: Floats, with_shape: bool = False
 ) -> tuple[tuple[int, int], ...] | None:
     """Return slot and source of the blocks of a group that is moved to the slots of another one.
 
-    None if a block does not fit there.
+    None if a block does not fit there. Blocks turn by ``turn``, or ``with_shape`` as their slots.
     """
     source, to = groups
     if len(source) != len(to):
@@ -196,6 +224,9 @@ def _pairs(
         there = turn @ blocks[number].middle + shift
         slot = to[int(np.linalg.norm(places - there, axis=1).argmin())]
         moved = (_shrink(corners) + corners.mean(axis=0)) @ turn.T + shift
+        if with_shape:
+            moved = _shrink(corners) @ blocks[slot].carried_from(blocks[number]).T + (
+                turn @ corners.mean(axis=0) + shift)
         if not _fits(blocks[slot], moved):
             return None
         found.append((slot, number))

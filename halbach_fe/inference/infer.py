@@ -35,7 +35,7 @@ from halbach_fe.inference.result import (
 from halbach_fe.inference.total_field import Magnitudes, bent, warn_of_bent_readings
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Map, maps_of
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import points_of, taking_arrays
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     probe_points,
@@ -81,6 +81,7 @@ LEFT_OUT = 0.02
 may cause; a larger change causes a warning."""
 
 
+@taking_arrays
 @alone
 def infer(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session = NOT_KEPT,
@@ -94,7 +95,8 @@ def infer(
     ----------
     magnet : Magnet
     data : Dataset or dict of str to Dataset
-        The measured map, see `halbach_fe.read_map`; or all maps that the study lists, see
+        The measured map, see `halbach_fe.read_map`; or positions (n, 3) in m, then readings (n, 3)
+        in T, and ``sigma_T=``, see `halbach_fe.field_map`; or all maps that the study lists, see
         `halbach_fe.read_maps`. Terms of their instruments of which the study states a standard
         deviation are estimated with the magnetizations.
     session : Session, optional

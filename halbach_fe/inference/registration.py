@@ -31,7 +31,7 @@ from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.pose_search import coarse_poses
 from halbach_fe.inference.pose_space import right_angles
-from halbach_fe.measurement.field_map import checked_map, directed, is_undirected
+from halbach_fe.measurement.field_map import checked_map, directed, is_undirected, taking_arrays
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import Instrument
@@ -45,6 +45,7 @@ UNDECIDED_LOG_EVIDENCE = 3.0
 symmetric magnet makes equal end up to 1 apart, since they end when chi-squared hardly falls."""
 
 
+@taking_arrays
 @alone
 def register(
     magnet: Magnet, data: xr.Dataset, session: Session = NOT_KEPT,

@@ -21,7 +21,9 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import meshio
 import numpy as np
@@ -139,6 +141,24 @@ def field_map(
                 f"{given.shape}", str(sigma.shape)))
         data["sigma_T"] = (("point", "component"), of_all(sigma), {"units": "T"})
     return data
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def taking_arrays(function: Function) -> Function:
+    """Decorate a function of a magnet and a map, which then takes arrays for the map too: positions
+    (n, 3) in m, readings (n, 3) in T, and ``sigma_T``, as `field_map` does.
+    """
+    @wraps(function)
+    def of_map_or_arrays(*arguments: Any, **options: Any) -> Any:
+        match arguments:
+            case magnet, points_m, B_T, *others if np.ndim(B_T):  # no session
+                data = field_map(points_m, B_T, options.pop("sigma_T", None))
+                return function(magnet, data, *others, **options)
+        return function(*arguments, **options)
+
+    return cast(Function, of_map_or_arrays)
 
 
 def undirected(data: xr.Dataset) -> xr.Dataset:
@@ -426,8 +446,9 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
     except MeasurementError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise MeasurementError(must_be("content", where, "a VTU file with point data `B_T` (n, 3)",
-                                       f"'{error}'")) from None
+        raise MeasurementError(must_be(
+            "content", where, "a VTU file with point data `B_T` (n, 3)", f"'{error}'",
+            "Save files of other programs as CSV, in ParaView by Save Data.")) from None
     return data
 
 

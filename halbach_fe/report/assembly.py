@@ -229,6 +229,16 @@ def _label(one: AssembledBlock, several: bool, prefix: str) -> str:
     return f"{place}: {one.serial.removeprefix(prefix)}" if one.serial else place
 
 
+def labels_in_words(drawn: Sequence[Sheet], prefix: str) -> str:
+    """Say what the labels of blocks are on all sheets, see `_label`."""
+    places = {"its name" if one.has_own_name else "its ring and slot" if len(sheet.rings) > 1
+              else "its slot" for sheet in drawn for one in sheet.blocks}
+    serial = (", then its serial number"
+              if any(one.serial for sheet in drawn for one in sheet.blocks) else "")
+    without = f" without the {prefix} that all begin with" if serial and prefix else ""
+    return f"The label of a block is {' or '.join(sorted(places))}{serial}{without}."
+
+
 def _radial(
     angle: float, radius: float, size: float, outwards: bool
 ) -> tuple[float, float, float, str, float]:
@@ -585,7 +595,8 @@ def _sheets(assembly: Assembly) -> Markup:
     ordered_as = dict(zip((kind.number for kind in assembly.kinds), assembly.ordered_as,
                           strict=True))
     prefix = common_beginning([one.serial for one in assembly.blocks])
+    drawn = sheets(assembly)
     return Markup(rendered(
-        "assembly.html.j2", prefix=prefix, holder=assembly.holder,
+        "assembly.html.j2", labels=labels_in_words(drawn, prefix), holder=assembly.holder,
         measured=any(one.serial for one in assembly.blocks),
-        sheets=[drawing(sheet, prefix, ordered_as) for sheet in sheets(assembly)]))
+        sheets=[drawing(sheet, prefix, ordered_as) for sheet in drawn]))

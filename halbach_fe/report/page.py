@@ -76,7 +76,9 @@ Figures = Mapping[str, tuple[Callable[[], Figure], str]]
 
 
 class Text(NamedTuple):
-    """A paragraph; words between backticks are code, those between pairs of asterisks bold."""
+    """A paragraph; words between backticks are code, those between pairs of asterisks bold,
+    and [words](page.html) a link.
+    """
 
     text: str
     kind: str = ""
@@ -351,6 +353,7 @@ def _templates() -> jinja2.Environment:
 def _marked(text: str) -> Markup:
     """Return a text as HTML, see `Text`."""
     text = re.sub("`(.*?)`", r"<code>\1</code>", html.escape(text))
+    text = re.sub(r"\[([^]]+)\]\(([\w./-]+\.html)\)", r'<a href="\2">\1</a>', text)
     return Markup(re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", text))
 
 

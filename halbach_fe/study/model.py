@@ -39,7 +39,20 @@ FIELD_KEYS = MAGNET_KEYS | {"external", "mesh", "open_boundary", "solver", "dema
 """Keys of a study that its computed field depends on."""
 
 
-class Study(StudyModel):
+class _OfKeys(type(StudyModel)):  # type: ignore[misc]
+    """Makes ``Study(...)`` refuse wrong keys as `read_study` does."""
+
+    def __call__(cls, *arguments: Any, **keys: Any) -> Any:
+        """Return the study of keys and tables; raise StudyError if there is no such study."""
+        if arguments:
+            raise StudyError(must_be("arguments", "Study", "keys of a study by name", "others"))
+        try:
+            return super().__call__(**keys)
+        except ValidationError as error:
+            raise StudyError(sentences.sentence(error, "study", cls)) from None
+
+
+class Study(StudyModel, metaclass=_OfKeys):
     """A magnet, its discretization, its measurement, and the prior knowledge of its blocks."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]

@@ -5,18 +5,14 @@ Every error message is one sentence that names the file, the key, and what to do
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
-import types
-import typing
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import MAX_QUOTED, HalbachWarning, StudyError, must_be, printable
@@ -131,7 +127,7 @@ def parse_study(document: dict[str, Any], where: str = "study") -> Study:
     try:
         return Study.model_validate(document)
     except ValidationError as error:
-        raise StudyError(_sentence(error, where)) from None
+        raise StudyError(sentences.sentence(error, where, Study)) from None
 
 
 def with_free_blocks(document: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
@@ -181,112 +177,3 @@ def _read_curve(curve: IronCurve | None, key: str, folder: Path, where: str) -> 
         wrong = sentences.reason(error) if isinstance(error, ValidationError) else error
         raise StudyError(must_be(f"`{key}.curve.file`", where, "a table of H(B)",
                                  f"{str(path)!r}, which cannot be used: {wrong}")) from None
-
-
-def _sentence(error: ValidationError, where: str) -> str:
-    """Return one sentence about the first of pydantic's errors, and the number of the others."""
-    errors = error.errors(include_url=False)
-    # An unknown key is the likeliest cause of the others: a misspelt key is also a missing key.
-    errors.sort(key=lambda e: e["type"] != "extra_forbidden")
-    first = errors[0]
-    key, model = _locate(first["loc"])
-    value, kind = first.get("input"), first["type"]
-    expected, received, hint = sentences.expected(first), sentences.received(value), ""
-    if (ours := sentences.contradiction(first)) is not None:
-        return (f"Input `{key or 'the whole'}` of {where} must be consistent: {ours}."
-                + _more(errors))
-    if kind == "extra_forbidden":
-        name = str(first["loc"][-1])
-        near = difflib.get_close_matches(name, model.model_fields if model else [], 1, 0.5)
-        hint = (sentences.did_you_mean(near[0], name) if near
-                else f"Known keys here: {', '.join(model.model_fields)}." if model else "")
-        if not near and len(first["loc"]) > 1 and name in Study.model_fields and not isinstance(
-                value, Mapping):
-            hint = f"`{name}` stands at the top of the file, above the first table."
-        received = f"`{name}`"
-    elif kind == "missing":
-        received, hint = "nothing", "Add the key."
-    elif kind.startswith("union_tag"):  # pydantic locates the table, of which one key says its kind
-        name = first["ctx"]["discriminator"].strip("'")
-        key, received = f"{key}.{name}", sentences.received(value.get(name))
-        tags = _tags_at(first["loc"], name)
-        near = difflib.get_close_matches(str(value.get(name)), tags, 1, 0.5)
-        hint = f"Did you mean '{near[0]}'?" if near else ""
-        if kind == "union_tag_not_found":
-            hint = f"Add the key, as one of {', '.join(map(repr, tags))}."
-    elif kind == "tuple_type" and isinstance(value, dict) and _holds_tables(model, first["loc"]):
-        hint = f"Write [[{key}]] for [{key}], and once more for each further one."
-    else:
-        hint = sentences.hint(key, first)
-    return must_be(f"`{key}`", where, expected, received, hint) + _more(errors)
-
-
-def _holds_tables(model: type[BaseModel] | None, location: tuple[int | str, ...]) -> bool:
-    """Return whether a key of a model is a list of tables."""
-    field = model.model_fields.get(str(location[-1])) if model else None
-    return field is not None and any(
-        isinstance(item, type) and issubclass(item, BaseModel)
-        for item in typing.get_args(field.annotation))
-
-
-def _more(errors: list[Any]) -> str:
-    return f" ({len(errors) - 1} more in this file.)" if len(errors) > 1 else ""
-
-
-def _locate(location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
-    """Return the dotted key of a pydantic location, and the model that holds its last part.
-
-    pydantic puts the tag of a discriminated union into the location. It is left out here, because
-    it is no key of the file.
-    """
-    models: list[type[BaseModel]] = [Study]
-    owner: type[BaseModel] | None = Study
-    parts: list[str] = []
-    for part in location:
-        if part == sentences.KEY:
-            continue
-        if isinstance(part, int):
-            parts[-1] += f"[{part}]"
-            continue
-        tagged = [m for m in models if len(models) > 1 and part in _tags(m)]
-        if tagged:
-            models = owner_models = tagged
-            owner = owner_models[0]
-            continue
-        owner = models[0] if models else None
-        parts.append(part)
-        field = owner.model_fields.get(part) if owner else None
-        models = _models_in(field.annotation) if field else []
-    return ".".join(parts), owner
-
-
-def _tags_at(location: tuple[int | str, ...], name: str) -> list[str]:
-    """Return the possible values of the key ``name``, the kind of table, at a pydantic location."""
-    models: list[type[BaseModel]] = [Study]
-    for part in location:
-        tagged = [model for model in models if len(models) > 1 and part in _tags(model)]
-        if tagged or isinstance(part, int):
-            models = tagged or models
-            continue
-        field = models[0].model_fields.get(part) if models else None
-        models = _models_in(field.annotation) if field else []
-    return [str(tag) for model in models for tag in get_args(model.model_fields[name].annotation)]
-
-
-def _tags(model: type[BaseModel]) -> set[str]:
-    """Return the values of a model's literal keys, which tag it in a discriminated union."""
-    return {
-        str(value)
-        for field in model.model_fields.values()
-        if get_origin(field.annotation) is Literal
-        for value in get_args(field.annotation)
-    }
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return all models that a type annotation mentions, in order."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    if get_origin(annotation) in (Union, types.UnionType, Annotated, tuple):
-        return [model for arg in get_args(annotation) for model in _models_in(arg)]
-    return []

@@ -19,7 +19,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS, Axes
-from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, Vector
+from halbach_fe.synthetic.shapes import Vector
+from halbach_fe.synthetic.true_magnet import ZERO_VECTOR
 
 IDEAL_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -1,19 +1,22 @@
-"""The true iron: material laws, coaxial tubes and discs, and prisms along z."""
+"""The true iron: material laws, and tubes, prisms and balls in any place."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
-from halbach_fe.study.iron import Iron, IronBox, IronMaterial, IronSphere
+from halbach_fe.study.iron import Iron, IronMaterial
+from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
-from halbach_fe.synthetic.shapes import PolygonBody, shoelace
+from halbach_fe.synthetic.shapes import PolygonBody, Vector, shoelace
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,31 @@ IronLaw = float | FroehlichLaw | TableLaw
 """Material law of iron: a constant relative permeability, or a curve."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class IronShape:
+    """What all bodies of iron have: a place, and perhaps a material of their own.
+
+    Attributes
+    ----------
+    origin, turn : tuple of float, in m and rad
+        Place of the origin of the body's own axes, and the rotation vector that turns the magnet's
+        axes into them.
+    law : IronLaw, optional
+        Its own material.
+    """
+
+    origin: Vector = (0.0, 0.0, 0.0)
+    turn: Vector = (0.0, 0.0, 0.0)
+    law: IronLaw | None = None
+
+    def in_own_axes(self, points: Floats) -> Floats:
+        """Return the coordinates (n, 3) in m, in the body's axes, of points (n, 3) in m."""
+        return np.asarray(Rotation.from_rotvec(self.turn).inv().apply(points - self.origin))
+
+
 @dataclass(frozen=True)
-class Tube:
-    """An iron tube about the z axis; a disc if its inner radius is 0.
+class Tube(IronShape):
+    """An iron tube about its z axis; a disc if its inner radius is 0.
 
     Attributes
     ----------
@@ -72,14 +97,15 @@ class Tube:
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m are inside or on the surface."""
-        radius = np.hypot(points[:, 0], points[:, 1])
+        x, y, z = self.in_own_axes(points).T
+        radius = np.hypot(x, y)
         return ((radius >= self.inner) & (radius <= self.outer)
-                & (np.abs(points[:, 2] - self.middle) <= self.half_length))
+                & (np.abs(z - self.middle) <= self.half_length))
 
 
 @dataclass(frozen=True)
-class Pole:
-    """A prism of iron along z.
+class Pole(IronShape):
+    """A prism of iron along its z axis.
 
     Attributes
     ----------
@@ -97,19 +123,47 @@ class Pole:
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m are inside or on the surface."""
-        return PolygonBody(self.outline, 2 * self.half_length).holds(points - [0, 0, self.middle])
+        return PolygonBody(self.outline, 2 * self.half_length).holds(
+            self.in_own_axes(points) - [0, 0, self.middle])
+
+
+@dataclass(frozen=True)
+class Ball(IronShape):
+    """A sphere of iron of a ``radius`` in m about its origin."""
+
+    radius: float
+
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Tell which points (n, 3) in m are inside or on the surface."""
+        return np.asarray(np.linalg.norm(points - self.origin, axis=1) <= self.radius)
 
 
 @dataclass(frozen=True)
 class TrueIron:
-    """Bodies of iron, all of one material."""
+    """Bodies of iron, and the material of those without their own."""
 
-    bodies: tuple[Tube | Pole, ...]
+    bodies: tuple[Tube | Pole | Ball, ...]
     law: IronLaw
+
+    @property
+    def laws(self) -> dict[str, IronLaw]:
+        """The materials by the names of their regions, see `region`."""
+        return {self.region(number): body.law or self.law
+                for number, body in enumerate(self.bodies)}
+
+    def region(self, number: int) -> str:
+        """Return the name of the region in a mesh of a body: all of one material share theirs."""
+        return "iron" if self.bodies[number].law is None else f"iron{number}"
 
 
 def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
-    """Return the iron of a study whose nominal blocks end at z = +- ``half_length`` in m."""
+    """Return the iron of a study whose nominal blocks end at z = +- ``half_length`` in m.
+
+    Raises
+    ------
+    StudyError
+        If the iron would answer to an external field, which no truth knows.
+    """
     def half(length: float | None) -> float:
         if study.dimension == 2:
             return np.inf
@@ -121,25 +175,40 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
                         law_of(ring))
     if iron is None:
         return None
-    bodies: list[Tube | Pole] = []
-    for number, body in enumerate(iron.bodies):
-        if isinstance(body, IronBox | IronSphere) or any(body.centre_m + body.rotation_deg) or (
-                body.own_material is not None):
-            raise StudyError(must_be(
-                f"`iron.bodies[{number}]`", f"study {study.name}", "a coaxial tube or a prism "
-                "along z, of the material of all bodies, to simulate a campaign", "another one",
-                "Leave it out; the field of the magnet can be computed with it."))
-        middle = 0.0 if study.dimension == 2 else body.z_m
-        if body.kind == "tube":
+    bodies: list[Tube | Pole | Ball] = []
+    for body in iron.bodies:
+        own = body.own_material
+        placed: dict[str, Any] = {
+            "origin": body.centre_m, "law": None if own is None else law_of(own),
+            "turn": tuple(np.radians(body.rotation_deg).tolist())}
+        if body.kind == "sphere":
+            bodies.append(Ball(body.radius_m, **placed))
+        elif body.kind == "box":
+            x, y, z = (size / 2 for size in body.size_m)
+            bodies.append(Pole((-x - 1j * y, x - 1j * y, x + 1j * y, -x + 1j * y), z, **placed))
+        elif body.kind == "tube":
             bodies.append(Tube(body.inner_radius_m, body.outer_radius_m, half(body.length_m),
-                               middle))
-            continue
-        corners = np.array([complex(x, y) for x, y in body.outline_m])
-        if shoelace(corners) < 0:
-            corners = corners[::-1]
-        for turn in np.exp(2j * np.pi * np.arange(body.copies) / body.copies):
-            bodies.append(Pole(tuple((corners * turn).tolist()), half(body.length_m), middle))
-    return TrueIron(tuple(bodies), law_of(iron))
+                               0.0 if study.dimension == 2 else body.z_m, **placed))
+        else:
+            corners = np.array([complex(x, y) for x, y in body.outline_m])
+            if shoelace(corners) < 0:
+                corners = corners[::-1]
+            for turn in np.exp(2j * np.pi * np.arange(body.copies) / body.copies):
+                bodies.append(Pole(
+                    tuple((corners * turn).tolist()), half(body.length_m),
+                    0.0 if study.dimension == 2 else body.z_m, **placed))
+    found = TrueIron(tuple(bodies), law_of(iron))
+    if study.external != External() and ((study.array.free_blocks is not None and not all(
+            isinstance(body, Tube) for body in bodies)) or any(map(_is_anywhere, bodies))):
+        raise StudyError(must_be(
+            "`external`", f"study {study.name}", "left out to simulate a campaign of a magnet with "
+            "such iron", "given", "The field of the magnet can be computed with it."))
+    return found
+
+
+def _is_anywhere(body: Tube | Pole | Ball) -> bool:
+    """Tell whether a body is none of the tubes and prisms along z of one material."""
+    return isinstance(body, Ball) or body.law is not None or any((*body.origin, *body.turn))
 
 
 def law_of(iron: IronMaterial | Iron) -> IronLaw:
@@ -152,8 +221,7 @@ def law_of(iron: IronMaterial | Iron) -> IronLaw:
     """
     curve = iron.curve
     if curve is None:
-        assert iron.relative_permeability is not None  # a study has the permeability or a curve
-        return iron.relative_permeability
+        return iron.relative_permeability or 1.0  # without it, every body has its own material
     if curve.kind == "froehlich_kennelly":
         return FroehlichLaw(curve.initial_relative_permeability, curve.saturation_polarization_T)
     if curve.kind == "brauer":

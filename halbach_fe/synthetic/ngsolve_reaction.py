@@ -25,7 +25,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.iron import FroehlichLaw, IronLaw, Pole, TableLaw, Tube
+from halbach_fe.synthetic.iron import Ball, FroehlichLaw, IronLaw, Pole, TableLaw, Tube
 from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape
 from halbach_fe.synthetic.true_magnet import Body, TrueMagnet
@@ -101,13 +101,13 @@ def _response(magnet: TrueMagnet, mesh: Any, potential: Any) -> tuple[Floats, Fl
     field = -ngs.grad(potential)
     unity = ngs.CF(tuple(np.eye(size).ravel()), dims=(size, size))
     polarization = (_recoil(magnet, mesh) - unity) * field
-    if magnet.iron is not None:
-        law = permeability(magnet.iron.law, field * field)
-        polarization = polarization + mesh.MaterialCF({"iron": 1.0}, default=0.0) * (
-            law - 1) * field
+    laws = magnet.all_iron.laws if magnet.all_iron else {}
+    for region, law in laws.items():
+        polarization = polarization + mesh.MaterialCF({region: 1.0}, default=0.0) * (
+            permeability(law, field * field) - 1) * field
     kind = ngs.TRIG if size == 2 else ngs.TET
     rule = ngs.IntegrationRule(kind, 2 * (potential.space.globalorder - 1))
-    responding = mesh.Materials("|".join(["iron", *(
+    responding = mesh.Materials("|".join([*laws, *(
         f"block{number}" for number, body in enumerate(magnet.all_bodies)
         if not body.is_vacuum)]))
     where = mesh.MapToAllElements({kind: rule}, responding)
@@ -138,7 +138,7 @@ def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:
 
 
 def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
-    """Return a mesh with the regions ``block0``, ``block1``, ..., ``iron`` and ``air``.
+    """Return a mesh with the regions ``block0``, ``block1``, ..., those of iron, and ``air``.
 
     Its outer boundary is named ``far`` and encloses all ``points`` (n, 3) in m.
 
@@ -155,15 +155,16 @@ def mesh_of(magnet: TrueMagnet, points: Floats, elements: Elements) -> Any:
     for number, body in enumerate(magnet.all_bodies):
         parts.append(_solid(body, flat))
         _name(parts[-1], f"block{number}", flat)
-    iron = magnet.all_iron.bodies if magnet.all_iron else ()
-    for solid in iron:
+    iron = magnet.all_iron
+    for number, solid in enumerate(iron.bodies if iron else ()):
         parts.append(_iron(solid, flat))
         sizes.append(min(sizes))
-        _name(parts[-1], "iron", flat)
+        _name(parts[-1], iron.region(number) if iron else "", flat)
     for part, size in zip(parts, sizes, strict=True):
         (part.faces if flat else part).maxh = size
     if not flat and elements.size is None:
-        for solid, part in zip(iron, parts[len(magnet.all_bodies):], strict=True):
+        for solid, part in zip(iron.bodies if iron else (), parts[len(magnet.all_bodies):],
+                               strict=True):
             if isinstance(solid, Tube):
                 _refine_ends(solid, part, min(sizes))
     extent = max(abs(value) for part in parts for corner in part.bounding_box
@@ -250,9 +251,19 @@ def outline_face(shape: Shape, centre: Floats, angle: float, z: float) -> Any:
         occ.ArcOfCircle(corner(inner, half), corner(inner, 0), corner(inner, -half))]))
 
 
-def _iron(body: Tube | Pole, flat: bool) -> Any:
-    """Return a body of iron as a solid, or as a face if ``flat``."""
+def _iron(body: Tube | Pole | Ball, flat: bool) -> Any:
+    """Return a body of iron in its place as a solid, or as a face if ``flat``."""
     occ = import_extra("netgen.occ")
+    solid = _iron_in_own_axes(body, flat)
+    if any(body.turn):
+        solid = _rotated(solid, Rotation.from_rotvec(body.turn), (0.0, 0.0, 0.0))
+    return solid.Move(occ.Vec(*body.origin)) if any(body.origin) else solid
+
+
+def _iron_in_own_axes(body: Tube | Pole | Ball, flat: bool) -> Any:
+    occ = import_extra("netgen.occ")
+    if isinstance(body, Ball):
+        return occ.Sphere(occ.Pnt(0, 0, 0), body.radius)
     if isinstance(body, Pole):
         face = outline_face(PolygonBody(body.outline, np.inf), np.zeros(2), 0.0,
                             0.0 if flat else body.middle - body.half_length)
@@ -272,7 +283,9 @@ def _refine_ends(body: Tube, solid: Any, size: float) -> None:
     on_end = 1e-6
     thickness = min(body.outer - body.inner, 2 * body.half_length)
     for edge in solid.edges:
-        if abs(abs(edge.center.z - body.middle) - body.half_length) < on_end * body.outer:
+        middle = edge.center
+        height = body.in_own_axes(np.array([[middle.x, middle.y, middle.z]]))[0, 2]
+        if abs(abs(height - body.middle) - body.half_length) < on_end * body.outer:
             edge.maxh = min(size, max(thickness, END_SIZE * size))
 
 
@@ -352,9 +365,9 @@ def solve_potential(magnet: TrueMagnet, mesh: Any, order: int) -> Any:
     form = ngs.BilinearForm(space, condense=True)
     form += _recoil(magnet, mesh) * ngs.grad(u) * ngs.grad(v) * ngs.dx("block.*|air")
     form += -source * ngs.grad(v) * ngs.dx("block.*")
-    if magnet.iron is not None:
-        law = permeability(magnet.iron.law, ngs.grad(u) * ngs.grad(u))
-        form += law * ngs.grad(u) * ngs.grad(v) * ngs.dx("iron", bonus_intorder=4)
+    for region, law in (magnet.all_iron.laws if magnet.all_iron else {}).items():
+        form += (permeability(law, ngs.grad(u) * ngs.grad(u)) * ngs.grad(u) * ngs.grad(v)
+                 * ngs.dx(region, bonus_intorder=4))
     solution = ngs.GridFunction(space)
     newton(form, solution, iterate=size == 3)
     return solution

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 
 Fractions = tuple[float, float]
+Vector = tuple[float, float, float]
 Triangle = tuple[complex, complex, complex]
 
 HALF_TURN = 0.99 * np.pi

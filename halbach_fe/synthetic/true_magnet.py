@@ -20,9 +20,15 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.iron import TrueIron
-from halbach_fe.synthetic.shapes import CylinderBody, Fractions, PrismBody, SectorBody, Shape
+from halbach_fe.synthetic.shapes import (
+    CylinderBody,
+    Fractions,
+    PrismBody,
+    SectorBody,
+    Shape,
+    Vector,
+)
 
-Vector = tuple[float, float, float]
 ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 
 
@@ -295,7 +301,7 @@ class TrueMagnet:
         if iron is None or not self.copies:
             return iron
         return replace(iron, bodies=iron.bodies + tuple(
-            replace(body, middle=body.middle + copy.shift)
+            replace(body, origin=vector(np.add(body.origin, (0, 0, copy.shift))))
             for copy in self.copies for body in iron.bodies))
 
     @property

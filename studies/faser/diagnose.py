@@ -262,6 +262,37 @@ def sentences(best: Answer, answers: list[Answer], fitted: list[Fitted],
     return said
 
 
+def answer_page(best: Answer, found: list[str], published: PublishedErrors,
+                quick: bool) -> PageAnswer:
+    """Return the answer of the page; ``found`` is what `sentences` says."""
+    asked, said = "What does the published profile of the FASER dipole show?", found[0]
+    step = ("For your own map, describe its magnet in the file that halbach-fe new writes, and run:"
+            if quick else "Read what is left, and the further pages below.")
+    if best.hypothesis.pose is ON_THE_AXIS:
+        return PageAnswer(asked, said, " ".join(found[1:]), step)
+    array = best.registration.study.array
+    assert array.ring_length_m is not None
+    radius = float(np.hypot(*best.registration.middle_m[:2]))
+    paper, here = medians(published.posterior, best.update)[0], best.medians()[0]
+    left = best.registration.held_out_chi2
+    sound = best.registration.explains
+    trust = [
+        f"{'Yes' if sound else 'No'}: chi² of held-out readings is {left:.2g} each, where 1 is "
+        "expected; but which of four equal lines it is, the profile cannot tell.",
+        *found[1:]]
+    if not best.registration.at_rest:
+        trust.append("The search for the line ended before it came to rest, so that the line may "
+                     "lie farther from the place given here than the error bars say.")
+    return PageAnswer(
+        asked, said, " ".join(trust), step, "halbach-fe explain STUDY MAP -o DIR" if quick else "",
+        sound=sound,
+        gist="It is not that of the axis, as published: it is that of a line "
+        f"{1e3 * radius:.0f} mm beside the axis of a magnet "
+        f"{array.rings * array.ring_length_m:.3g} m long.",
+        numbers=(("median error in the fringe, in the paper and here",
+                  f"{paper:.2f} → {here:.3f}"),))
+
+
 def _step_or_length(answers: list[Answer]) -> list[str]:
     """Return a sentence on the answers in which only the step, or only the length, is open."""
     alone = {key.key: each.registration for each in answers for key in (STEP, LENGTH)
@@ -360,25 +391,25 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{best.registration.chi2:.2g} per reading that was fitted and "
                 f"{best.registration.held_out_chi2:.2g} per reading that was held out, if a "
                 "position is uncertain by 1 mm."]
-        further = ["registration/registration.html: the poses and the probe",
-                   "inferred/report.html: the updated magnet"]
+        further = ["[Poses and probe](registration/registration.html)",
+                   "[The updated magnet](inferred/report.html)"]
         if not arguments.quick:
             left += diagnosed(best, data, session, folder / "diagnosis")
-            further.append("diagnosis/diagnosis.html: what the registered model lacks")
+            further.append("[What the registered model lacks](diagnosis/diagnosis.html)")
+        else:
+            left.append("make study-faser-diagnosis compares more answers and all poses.")
     write_summary(answers, poses, folder / "profile.json")
-    asked = "What is the published FASER profile a profile of?"
     columns = column_table(fitted, best.update)
     write_files(Page(
-        "register", asked, read_study(STUDY), PageAnswer(
-            asked, found[0], " ".join(found[1:]),
-            "make study-faser-diagnosis compares more answers, all poses and what is left."
-            if arguments.quick else "Read what is left, and the further pages below."), {}, [
+        "register", "What its published profile shows", read_study(STUDY),
+        answer_page(best, found, published, arguments.quick), {}, [
             Section([Text(
                 "Every fifth reading (index 5, 10, ..., 155) was set aside before anything was "
                 "fitted. Errors are medians of |predicted / measured - 1| of B_x over these, as "
                 "the paper defines them: in its fringe field (index 1-35 and 121-156) and in its "
                 "homogeneous field. Odds are by the evidence of the readings that were fitted, "
-                "with all blocks integrated out.", "small"), Table(rows)], "What was compared"),
+                "with all blocks integrated out.", "small"),
+                Table(rows, "turned" if arguments.quick else "")], "What was compared"),
             Section([Table(columns)] if columns else [], "What the column may hold"),
             Section([] if arguments.quick else [
                 Table(pose_table(poses)), Table(place_table(poses), "numbers")],

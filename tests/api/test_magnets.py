@@ -134,7 +134,11 @@ def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator
     points = np.vstack([np.column_stack([0.01 * np.cos(angle), 0.01 * np.sin(angle),
                                          np.full(24, z)]) for z in (-0.02, -0.01, 0.0, 0.01, 0.02)])
     readings = truth.getB(points) + 2e-5 * generator.standard_normal(points.shape)
-    result = hf.infer(magnet, hf.field_map(points, readings, sigma_T=2e-5))
+    result = hf.infer(magnet, points, readings, sigma_T=2e-5)
+    of_a_map = hf.infer(magnet, hf.field_map(points, readings, sigma_T=2e-5))
+    assert np.array_equal(result.posterior.mean, of_a_map.posterior.mean)
+    with pytest.raises(hf.HalbachError, match=r"shapes \(n, 3\).*received \(119, 3\) and"):
+        hf.explain(magnet, points[1:], readings, sigma_T=2e-5)
     sizes = np.linalg.norm(result.posterior.mean.reshape(-1, 3), axis=1) / np.linalg.norm(
         magnet.nominal_magnetization.reshape(-1, 3), axis=1)
     assert sizes[2] == pytest.approx(0.98, abs=2e-3)
@@ -143,6 +147,17 @@ def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator
     for one in (magnet, magnet.study, result, result.magnet):
         assert "\n" not in repr(one)
         assert len(repr(one)) < 500
+
+
+def test_a_study_of_keys_names_all_that_are_missing():
+    """In the words of a study file, and no error of pydantic. Control: a whole study is one."""
+    with pytest.raises(StudyError, match=r"`name`, `array`, `mesh`, `observation` of study must be "
+                                         r"given; instead received nothing\. Add the keys\.$"):
+        hf.Study(dimension=2)
+    with pytest.raises(StudyError, match="by name"):
+        hf.Study({"name": "a"})
+    whole = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).study
+    assert hf.Study(**whole.model_dump()) == whole
 
 
 @pytest.mark.parametrize(("call", "said"), [

@@ -16,6 +16,7 @@ import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import EXIT_CODES
+from halbach_fe.geo.iron_bodies import Sizes
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
@@ -247,11 +248,15 @@ class Case:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(getdp):
-    """Find GetDP once, and measure once how fast this machine is, which estimates ask for."""
-    speed = machine_speed()
+    """Find GetDP once, and measure once how fast this machine is, which estimates ask for.
+
+    Elements of iron are three times as large as usual: only keys are tried here.
+    """
+    speed, fine = machine_speed(), Sizes.of
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("halbach_fe.response.resource_estimate.machine_speed", lambda: speed)
         patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
+        patch.setattr(Sizes, "of", lambda size, coarseness=1.0: fine(size, 3.0 * coarseness))
         yield
 
 

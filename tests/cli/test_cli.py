@@ -56,6 +56,8 @@ angles = 10
 name = "bore"
 sigma_T = 1e-4
 """
+IN_VACUUM = STUDY.replace("recoil_permeability = 1.05", "recoil_permeability = 1.0")
+"""For what needs no finite elements."""
 
 
 @pytest.fixture
@@ -134,6 +136,7 @@ def test_infer_writes_everything(study, measured, tmp_path, capsys):
 
 def test_infer_with_a_second_map(study, measured, tmp_path, capsys):
     """Which is only predicted; its errors name its file."""
+    study.write_text(IN_VACUUM)
     out, other = tmp_path / "out", tmp_path / "other.csv"
     write_map(field_map(circle(0.02, 6), np.tile([0.55, 0.0, np.nan], (6, 1))), other)
     arguments = ["infer", str(study), "--measurements", str(measured), "--held-out", str(other),
@@ -180,6 +183,7 @@ def test_prior_of_measured_blocks(study, table, tmp_path, capsys):
 
 
 def test_infer_with_measured_blocks(study, table, measured, tmp_path, capsys):
+    study.write_text(IN_VACUUM)
     out = tmp_path / "out"
     arguments = ["infer", str(study), "--measurements", str(measured), "-o", str(out), "--json"]
     assert main([*arguments, "--blocks", str(table)]) == 0
@@ -611,6 +615,7 @@ def is_running(process):
 
 def test_every_exit_code_is_documented():
     text = parser().format_help()
+    assert "Most people need new, explain, solve, infer and diagnose." in text
     page = (ROOT / "docs" / "reliability.md").read_text()
     for code, meaning in EXIT_CODES.items():
         assert f"{code:3d}  {meaning}" in text

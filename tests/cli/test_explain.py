@@ -45,6 +45,13 @@ def test_a_map_that_the_update_explains_needs_nothing_else(study, generator, tmp
     assert "halbach-fe register" not in printed.err
 
 
+def test_a_map_that_is_not_there_is_said_once(study, tmp_path, capsys):
+    assert main(["explain", str(study), str(tmp_path / "no.csv"), "-o", str(tmp_path / "out")]) == 4
+    printed = capsys.readouterr().err
+    assert printed.count("no.csv must be a readable file") == 1
+    assert "cannot be checked" not in printed
+
+
 CHECK = Answer("?", "Passed.", "Yes.", "")
 GOOD, BAD = (replace(CHECK, sound=sound) for sound in (True, False))
 REGISTERED = replace(GOOD, command="halbach-fe infer DIR/study.registered.toml -o DIR")

@@ -34,7 +34,7 @@ IMPORTS = 0.3
 def test_killed_and_run_again(verb, tmp_path):
     study, campaign, alone = tmp_path / "study.toml", EXAMPLE / "campaign", tmp_path / "alone"
     study.write_text((EXAMPLE / "study.toml").read_text().replace(
-        "block_size_m = 0.003\nbore_size_m = 0.002", "block_size_m = 0.005\nbore_size_m = 0.004"))
+        "block_size_m = 0.003\nbore_size_m = 0.002", "block_size_m = 0.008\nbore_size_m = 0.006"))
     took = undisturbed(command(verb, study, campaign, alone), environment_of(tmp_path / "cache"))
     generator, hits, earliest = np.random.default_rng(), 0, min(IMPORTS * took, 1.0)
     for number in range(5 * MOMENTS):

@@ -10,7 +10,7 @@ import xarray as xr
 
 from halbach_fe.cli import main
 from halbach_fe.measurement.field_map import field_map, write_map
-from tests.cli.test_cli import STUDY
+from tests.cli.test_cli import IN_VACUUM
 
 ANGLE = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 POINTS = np.column_stack([0.03 * np.cos(ANGLE), 0.03 * np.sin(ANGLE), 0 * ANGLE])
@@ -18,9 +18,12 @@ POINTS = np.column_stack([0.03 * np.cos(ANGLE), 0.03 * np.sin(ANGLE), 0 * ANGLE]
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A study, and the map of a uniform field with ten times the study's noise in a column."""
+    """A study without permeability, and the map of a uniform field.
+
+    A column has ten times the study's noise.
+    """
     folder = tmp_path_factory.mktemp("files")
-    (folder / "study.toml").write_text(STUDY)
+    (folder / "study.toml").write_text(IN_VACUUM)
     field = np.column_stack([0 * ANGLE + 0.55, 0 * ANGLE, 0 * ANGLE])
     field[:, :2] += 1e-3 * np.random.default_rng(1).standard_normal((12, 2))
     data = field_map(POINTS, field, sigma_T=np.full((12, 3), 1e-3))

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import tomlkit
 
+import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.design.assembly import cad
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks, write_blocks
-from halbach_fe.report.assembly import drawing, height_mm, sheets, spacers
+from halbach_fe.report.assembly import drawing, height_mm, labels_in_words, sheets, spacers
 from halbach_fe.report.page import rendered
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_delivery
@@ -161,7 +162,7 @@ def test_a_drawing_explains_the_marks_that_it_has(there):
     found = [drawing(sheet, "") for sheet in sheets(plan)]
     page = rendered("assembly.html.j2", study=plan.magnet.study, answer=None, pictures=[],
                     provenance={},
-                    sheets=found, holder=plan.holder, prefix="", measured=False, kinds=[],
+                    sheets=found, holder=plan.holder, labels="", measured=False, kinds=[],
                     plates=[], diameters="", spacers="", files=[])
     for words, key in EXPLAINED.items():
         assert (words in page) == (key == there)
@@ -198,6 +199,17 @@ def test_the_sheet_names_the_kind_that_was_ordered():
     assert any("upside down" in row["kind"] for row in rows)
     assert not any("upside down" in row["kind"]  # the control
                    for rows in drawing(sheet, "").tables for row in rows)
+
+
+def test_labels_are_said_to_be_what_they_are():
+    """Of free blocks they are names, and no slots. Control: blocks of rings have slots."""
+    free = cad(hf.magnet_of_blocks({
+        "name": ["left", "right"], "shape": ["cuboid"] * 2, "x_m": [0.03, -0.03], "y_m": [0.0] * 2,
+        "z_m": [0.0] * 2, "size_x_m": [0.01] * 2, "size_y_m": [0.01] * 2, "size_z_m": [0.01] * 2,
+        "remanence_T": [1.3] * 2}))
+    assert labels_in_words(sheets(free), "") == "The label of a block is its name."
+    ring = cad(hf.halbach_ring(inner_radius_m=0.03, outer_radius_m=0.05, length_m=0.03))
+    assert labels_in_words(sheets(ring), "") == "The label of a block is its slot."
 
 
 def test_heights_that_are_zero_but_for_rounding_are_zero():

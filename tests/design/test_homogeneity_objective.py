@@ -112,7 +112,7 @@ def field_of(unit_fields, bodies):
 
 def test_drawn_magnets_are_as_homogeneous_as_magpylibs(study, session, unit_fields, tmp_path):
     """Kolmogorov and Smirnov find no difference between 300 magnets of the campaign's own law and
-    2000 of ours at a level of 0.1 %; they do when blocks vary twice as much.
+    1000 of ours at a level of 0.1 %; they do with 300 when blocks vary twice as much.
     """
     generator, nominal = np.random.default_rng(3), magnet_of(study)
     direct = ppm_of(vacuum_field(nominal.bodies, POINTS))
@@ -120,12 +120,12 @@ def test_drawn_magnets_are_as_homogeneous_as_magpylibs(study, session, unit_fiel
     assert ppm_of(field_of(unit_fields, nominal.bodies)) == pytest.approx(direct, rel=1e-6)
     built = np.array([ppm_of(field_of(unit_fields, draw_magnet(
         study, nominal, generator).mounted.bodies)) for _ in range(300)])
-    found = tolerance(build_magnet(study), session, draws=2000, limit_ppm=float(np.median(built)))
+    found = tolerance(build_magnet(study), session, draws=1000, limit_ppm=float(np.median(built)))
     assert found.ordered.rms_ppm == pytest.approx(direct, rel=1e-5)
     assert ks_2samp(found.rms_ppm, built).pvalue > 1e-3
-    assert found.share == pytest.approx(0.5, abs=0.1)  # three sd's of 300 magnets
+    assert found.share == pytest.approx(0.5, abs=0.1)  # three sd's of 300 magnets and of 1000
     wide = study.with_(prior__magnitude_sd=0.04)
-    assert ks_2samp(tolerance(build_magnet(wide), session, draws=2000).rms_ppm,
+    assert ks_2samp(tolerance(build_magnet(wide), session, draws=300).rms_ppm,
                           built).pvalue < 1e-3
     text = page(write_report(found, tmp_path / "report"))
     assert "ppm" in text
@@ -241,8 +241,8 @@ def design_ppm(study, unit_fields):
 
 @pytest.fixture
 def few_starts(monkeypatch):
-    """Search from 4 random orders in place of 20: what is found is hardly worse."""
-    monkeypatch.setattr("halbach_fe.design.sorting.STARTS", 4)
+    """Search from 2 random orders in place of 20: what is found is hardly worse."""
+    monkeypatch.setattr("halbach_fe.design.sorting.STARTS", 2)
 
 
 @pytest.mark.parametrize("turns", [False, True])

@@ -23,6 +23,8 @@ from halbach_fe.geometry.mounting import mountings, turns_in_slot
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.hidden_effects import EFFECTS as HIDDEN
+from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import circle
 from tests.diagnosis.campaign import drawn, field
 from tests.support.cuboids import DOCUMENT, NOISE_T
@@ -220,6 +222,32 @@ def test_assembly_of_rings(array, change, name, place, session, generator):
     assert after.nominal_magnetization.reshape(-1, 3) == pytest.approx(expected, abs=1.0)
     mounted = [matrix @ before[number] for number, matrix in mountings(after)]
     assert np.array(mounted) == pytest.approx(expected, abs=1.0)
+
+
+def test_a_ring_that_was_filled_from_another_slot_on(session):
+    """Bars along the magnetization turn with their slots, so that only their own errors move.
+
+    The control has no such error; in rings whose slots turn as their places (all cases above) a
+    ring so filled is a turned one.
+    """
+    array = {"rings": 2, "block": {
+        "shape": "cuboid", "width_m": 0.03, "orientation": "magnetization"}}
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | array})
+    expected = {(): [], ((HIDDEN["rings_turned"], (1.0, 1.0)),): [
+        ("rings_turned", "the blocks of ring 1 by +1 slot each")]}
+    for hidden, names in expected.items():
+        campaign = simulate_campaign(study, 45, hide=hidden)
+        blocks = campaign.blocks
+        result = infer(build_magnet(study), campaign.readings, session, blocks)
+        search = score_hypotheses(
+            study, (), result, result.prior.mean, Campaign.of(study, campaign.readings),
+            NominalSolver(session), RIVALS, (), {})
+        found = identify_effects(study, search)
+        assert names_of(found) == names
+    after = build_magnet(apply_effects(study, found))
+    assert [block.mounted_from for block in after.blocks[:2]] == [(1, 12), (1, 1)]
+    assert after.nominal_magnetization == pytest.approx(
+        build_magnet(study).nominal_magnetization, abs=1.0)
 
 
 def test_exchanged_blocks_bring_their_remanence_along():

@@ -114,8 +114,8 @@ def dipole_fields(folder, **changes):
     their own: blocks of 1 % take from all signatures what they can explain.
     """
     study = parse_study(changed(
-        DIPOLE, dimension=3, array__rings=2, array__ring_length_m=0.083,
-        **{"array__recoil_permeability": 1.0} | changes))
+        DIPOLE, dimension=3, array__ring_length_m=0.083,
+        **{"array__rings": 2, "array__recoil_permeability": 1.0} | changes))
     points = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.2, 0.2, 7)])
     magnet = build_magnet(study)
     session = replace(Session.open(folder), cache=Cache(folder / "cache"))
@@ -142,7 +142,7 @@ def with_iron(tmp_path_factory):
     iron = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}
     return dipole_fields(
         tmp_path_factory.mktemp("iron"), iron_ring=iron, array__recoil_permeability=1.05,
-        mesh={"block_size_m": 0.12, "growth": 1.7})
+        array__rings=1, array__blocks_per_ring=8, mesh={"block_size_m": 0.12, "growth": 1.7})
 
 
 @pytest.mark.parametrize("name", ["iron_saturation", "recoil_permeability_across"])

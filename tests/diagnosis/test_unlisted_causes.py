@@ -40,8 +40,9 @@ UNLISTED = {1: ("readings", "z", "smooth"), 2: ("positions", "angle", "rough"),
 
 @pytest.fixture(scope="module")
 def small():
-    """The study of the benchmark on fewer points."""
-    return parse_study(STUDY.model_dump() | {"observation": {
+    """The study of the benchmark with two of its three rings, on fewer points."""
+    document = STUDY.model_dump()
+    return parse_study(document | {"array": document["array"] | {"rings": 2}, "observation": {
         "quantity": "flux_density", "positions": {
             "kind": "circles", "radius_m": [0.03, 0.05, 0.07], "angles": 12,
             "z_min_m": -0.15, "z_max_m": 0.15, "count": 9}}})

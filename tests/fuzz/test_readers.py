@@ -18,7 +18,7 @@ from tests.fuzz.contract import BrokenError, Reader, refusal
 from tests.fuzz.mutation import made
 from tests.fuzz.readers import NAMES, by_name
 
-INPUTS = 150
+INPUTS = 75
 """For each reader, the same in every run. `make fuzz` tries others, and many more."""
 
 some = settings(max_examples=INPUTS, derandomize=True, database=None,

@@ -37,6 +37,7 @@ from tests.support.short_dipole import (
     TEXT,
     campaign_study,
     measured,
+    polarization_of,
     reading,
     truth,
 )
@@ -114,8 +115,9 @@ def distance_of_truth(result, magnet_of):
         centre = np.mean([block.z_min, block.z_max])
         angle = position_angle_deg(result.study.array, block.slot)
         (source,) = [each for each in magnet_of.sources if np.isclose(each.position[2], centre)
-                     and abs((np.mean(each.dimension[3:]) - angle + 180) % 360 - 180) < 1]
-        right[number] = source.polarization / MU_0
+                     and abs((np.degrees(np.arctan2(*each.position[1::-1])) - angle + 180)
+                             % 360 - 180) < 1]
+        right[number] = polarization_of(source) / MU_0
     error = result.posterior.mean - right.ravel()
     root = root_matrix(result.posterior.root)
     covariance = np.asarray((root @ root.T).todense() if sparse.issparse(root) else root @ root.T)

@@ -468,7 +468,8 @@ def test_a_map_in_the_wrong_unit_is_refused_as_a_map(short_dipole, session):
 
 def test_readings_that_vanish_by_symmetry(short_dipole, session):
     """B_y on the axis is zero; neither the checks nor the report may stumble over it."""
-    study = short_dipole(noise=NOISE, observation__components=["y"])
+    study = short_dipole(noise=NOISE, observation__components=["y"], array__rings=1,
+                         array__blocks_per_ring=8, mesh__meridian_size_m=0.04)
     points = np.column_stack([np.zeros((5, 2)), np.linspace(-0.1, 0.1, 5)])
     fields = np.tile([0.1, 0.0, 0.0], (5, 1))
     update = infer(build_magnet(study), field_map(points, fields), session)

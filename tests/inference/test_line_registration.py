@@ -20,9 +20,10 @@ from halbach_fe.report.registration import answer, by_hypothesis, sentences
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.support.short_dipole import TEXT as CIRCLES
-from tests.support.short_dipole import truth
+from tests.support.short_dipole import sectors, truth
 
 TEXT = CIRCLES.replace("scan_lines_every = 5", "every = 5").replace(
+    'shape = "cuboid"\nwidth_m = 0.016', 'shape = "sector"').replace(
     "magnitude_sd = 0.01", "magnitude_sd = 0.003").replace(
     "direction_sd_deg = 0.6", "direction_sd_deg = 0.2").replace("sigma_T = 2e-5", "sigma_T = 5e-5")
 NOISE_T = 5e-5
@@ -58,7 +59,7 @@ def test_a_line_is_told_from_a_map(generator):
 
 
 def test_a_profile_beside_the_axis_with_a_wrong_step(magnet, generator, tmp_path):
-    data = profile(truth(generator, 0.003), generator)
+    data = profile(sectors(truth(generator, 0.003)), generator)
     found = register(magnet, data, Session.open(tmp_path), open_keys=[STEP],
                      alternatives=[()], pose=SMALL_TURNS)
     best = found[0]
@@ -113,7 +114,7 @@ def test_a_profile_of_another_magnet_is_not_explained(magnet, generator, tmp_pat
 
 def test_the_command_compares_what_may_be_open(generator, tmp_path, capsys):
     (tmp_path / "study.toml").write_text(TEXT)
-    write_map(profile(truth(generator, 0.003), generator), tmp_path / "map.csv")
+    write_map(profile(sectors(truth(generator, 0.003)), generator), tmp_path / "map.csv")
     arguments = ["register", str(tmp_path / "study.toml"), "--measurements",
                  str(tmp_path / "map.csv"), "-o", str(tmp_path / "out"), "--turn-rad", "0.01"]
     assert main([*arguments, "--fit", "instrument.z_scale=0.03",

@@ -56,7 +56,7 @@ kind = "froehlich_kennelly"
 initial_relative_permeability = 1000.0
 saturation_polarization_T = 2.0
 [mesh]
-block_size_m = 0.02
+block_size_m = 0.04
 [observation]
 quantity = "flux_density"
 components = ["x", "y"]

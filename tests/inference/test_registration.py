@@ -43,7 +43,7 @@ from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
-from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth
+from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, polarization_of, truth
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +249,7 @@ def test_an_update_after_a_registration_is_no_surer_than_it_may_be(magnet, gener
         1 - np.eye(3)) * generator.standard_normal((3, 3))
     data = measured(source, generator, Rotation.from_rotvec([0.01, -0.005, 0.02]),
                     np.array([1e-3, -5e-4, -0.045]), mixing)
-    magnetizations = np.ravel([each.polarization for each in source.sources]) / MU_0
+    magnetizations = np.ravel([polarization_of(each) for each in source.sources]) / MU_0
     best = min(register(magnet, data, Session.open(tmp_path)),  # the magnet turned over is alike
                key=lambda each: np.linalg.norm(each.instrument.rotation_rad))
     # the probe is that before the map, the pose is found

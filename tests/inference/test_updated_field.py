@@ -23,7 +23,7 @@ from halbach_fe.response.multipoles import circle_models
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
-from tests.support.short_dipole import BODY, NOISE_T, TEXT, field_of, reading, truth
+from tests.support.short_dipole import BODY, NOISE_T, TEXT, reading, truth
 
 GAIN_SD = 0.02
 STRAIGHT = (Rotation.identity(), np.zeros(3))
@@ -46,7 +46,7 @@ def drawn(generator):
 def true_field(magnet_of, result):
     """magpylib's field at the places and along the directions of `InferenceResult.field`."""
     places, number = np.unique(result.field.places, axis=0, return_inverse=True)
-    return np.sum(field_of(magnet_of, places)[number.ravel()] * result.field.along, axis=1)
+    return np.sum(magnet_of.getB(places)[number.ravel()] * result.field.along, axis=1)
 
 
 def said_field(result):
@@ -92,12 +92,10 @@ def test_mean_and_sd_are_those_of_magpylib_s_blocks(generator, tmp_path):
     # which are near those of the map, and not the same
     assert 1e-4 < np.abs(places - result.observation.positions[some]).max() < 2e-3
     rows = []
-    blocks = [(source.dimension, source.position) for source in truth(generator).sources]
-    for dimension, position in blocks:
+    for source in truth(generator).sources:
         for axis in np.eye(3):
-            one = SimpleNamespace(sources=[SimpleNamespace(
-                dimension=dimension, position=position, polarization=MU_0 * axis)])
-            rows.append(np.sum(field_of(one, places) * along, axis=1))
+            source.polarization = source.orientation.inv().apply(MU_0 * axis)
+            rows.append(np.sum(source.getB(places) * along, axis=1))
     columns = np.array(rows).T
     mean = columns @ result.posterior.mean
     sd = np.sqrt(np.einsum("ij,jk,ik->i", columns, result.posterior.covariance, columns))
@@ -163,7 +161,7 @@ def test_circles_that_the_mapper_has_moved_are_none_of_the_magnet(generator, tmp
         "count": 2}}
     magnet_of = truth(generator)
     for shift, count in (([0, 0, 0], 2), ([0, 0, 0.05], 0), ([1e-3, 0, 0], 0)):
-        field = field_of(magnet_of, points + np.array(shift))
+        field = magnet_of.getB(points + np.array(shift))
         data = field_map(points, field + NOISE_T * generator.standard_normal(field.shape))
         result = updated(tmp_path / str(shift), data, observation=observed, inference={},
                          instrument={"translation_m": shift})
@@ -179,7 +177,7 @@ def test_fourier_coefficients_are_no_field_at_a_place(generator, tmp_path):
     """They are sums over circles; their place alone is known."""
     angle = 2 * np.pi * np.arange(16) / 16
     ring = 0.01 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    data = field_map(ring, field_of(truth(generator), ring))
+    data = field_map(ring, truth(generator).getB(ring))
     result = updated(tmp_path, data, inference={}, observation={
         "quantity": "fourier_coefficients", "harmonics": 3, "positions": {
             "kind": "circles", "radius_m": 0.01, "angles": 16}})

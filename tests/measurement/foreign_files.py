@@ -275,6 +275,77 @@ FILES = [
     Foreign("units that nobody knows", "x[ft],y[ft],z[ft],Bx[T],By[T],Bz[T]\n" + table(",", mm_T(
         1 / 0.3048)), {"columns": (*(f"{n}[12 inch]" for n in "xyz"), *SIX[3:])},
         ("'ft' is none of", "--columns")),
+    # notations
+    Foreign("Tecplot", 'VARIABLES = "x [m]", "y [m]", "z [m]", "Bx [T]", "By [T]", "Bz [T]"\n'
+            "ZONE I=3 J=3 K=5\n" + CARTESIAN),
+    Foreign("Superfish, units in brackets below", "   X   Y   Z   Bx   By   Bz\n  (cm)  (cm)  "
+            "(cm)  (G)  (G)  (G)\n" + table("  ", mm_T(100, 1e4))),
+    Foreign("MAD-X, tfs", "@ NAME %05s \"MAP\"\n* X Y Z BX BY BZ\n$ %le %le %le %le %le %le\n"
+            + CARTESIAN, {"length_unit": "m", "field_unit": "T"}, UNITS),
+    Foreign("ROOT, a scan of a tree", "*" * 60 + "\n*  Row * x * y * z * Bx * By * Bz *\n" + "*"
+            * 60 + "\n" + with_text(table(" * "), "*  {n} * ", " *") + "*" * 60 + "\n",
+            MM_T_OPTIONS, UNITS),
+    Foreign("a table of Markdown", "| x [mm] | y [mm] | z [mm] | Bx [T] | By [T] | Bz [T] |\n"
+            "|---|---|---|---|---|---|\n" + with_text(table(" | "), "| ", " |")),
+    Foreign("lists of lists", "{" + with_text(table(", "), "{{", "}},").replace(
+        "\n", " \n") + "}\n", {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("lists of points and fields", "".join(
+        f"[{x:g}, {y:g}, {z:g}] [{b:.9g}, {c:.9g}, {d:.9g}]\n"
+        for x, y, z, b, c, d in np.column_stack(mm_T())), {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("Fortran, columns of fixed width", "x y z Bx By Bz\n" + table(
+        "", number="{:10.4f}"), MM_T_OPTIONS, UNITS),
+    Foreign("JMAG", "X Coordinate[mm],Y Coordinate[mm],Z Coordinate[mm],X Component[T],"
+            "Y Component[T],Z Component[T],Absolute[T]\n" + table(",", [*mm_T(), LENGTH])),
+    Foreign("MagNet", "X (mm);Y (mm);Z (mm);B x-component (T);B y-component (T);B z-component (T)\n"
+            + table(";")),
+    Foreign("two lines of names above units", "Place\t\t\tField\t\t\nx\ty\tz\tx\ty\tz\nmm\tmm\tmm\t"
+            "T\tT\tT\n" + table("\t")),
+    Foreign("units after in", "x in mm;y in mm;z in mm;Bx in mT;By in mT;Bz in mT\n" + table(
+        ";", mm_T(1e3, 1e3))),
+    Foreign("units after blanks", "x mm;y mm;z mm;Bx mT;By mT;Bz mT\n" + table(
+        ";", mm_T(1e3, 1e3))),
+    Foreign("units in angle brackets", "x <mm>;y <mm>;z <mm>;Bx <T>;By <T>;Bz <T>\n" + table(";")),
+    Foreign("German names", "Lage X [mm];Lage Y [mm];Lage Z [mm];Flussdichte Bx [T];Feld Y [T];"
+            "Magnetfeld Bz [T]\n" + table(";")),
+    Foreign("French names", "Position X (mm);Position Y (mm);Coordonnée Z (mm);Champ Bx (T);"
+            "Champ By (T);Induction Bz (T)\n" + table(";")),
+    Foreign("Chinese names and brackets", (
+        "X坐标（mm），Y坐标（mm），Z坐标（mm），"
+        "Bx（T），By（T），磁场Z（T）\n"
+            + table(",")).encode("gbk"), {"encoding": "gbk"}, ("gbk",)),
+    Foreign("Japanese names", "X座標[mm],Y座標[mm],Z座標[mm],Bx[T],By[T],"
+            "磁束密度Bz[T]\n" + table(",")),
+    Foreign("quoted decimal commas", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + "".join(
+        ",".join(f'"{comma(cell)}"' for cell in row.split(",")) + "\n"
+        for row in table(",").splitlines()), {"decimal_comma": True}, ("--decimal-comma",)),
+    Foreign("typographic minus", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",").replace(
+        "-", "\u2212")),
+    Foreign("thousands by apostrophes", "x[um];y[um];z[um];Bx[uT];By[uT];Bz[uT]\n" + thousands(
+        mm_T(1e6, 1e6)).replace('","', ";").replace('"', "").replace(",", "'")),
+    Foreign("thousands by points, decimal commas", "x[um];y[um];z[um];Bx[uT];By[uT];Bz[uT]\n"
+            + thousands(mm_T(1e6, 1e6)).replace('","', ";").replace('"', "").translate(
+                str.maketrans(",.", ".,")), {"decimal_comma": True}, ("--decimal-comma",)),
+    Foreign("thousands by narrow blanks", "x[um];y[um];z[um];Bx[uT];By[uT];Bz[uT]\n"
+            + thousands(mm_T(1e6, 1e6)).replace('","', ";").replace('"', "").translate(
+                str.maketrans(",.", "\u202f,")), {"decimal_comma": True}, ("--decimal-comma",)),
+    Foreign("marks at the end", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
+            + "\x1a\0\0\0"),
+    Foreign("words where nothing was read", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
+            + "1,1,1,N/A,#N/A,0.1\n1,1,2,NULL,---,0.1\n1,1,3,NA,#NV,0.1\n",
+            points=np.vstack([POINTS, [[1e-3, 1e-3, n * 1e-3] for n in (1, 2, 3)]]),
+            field=np.vstack([FIELD, [[np.nan, np.nan, 0.1]] * 3])),
+    Foreign("planes with z in a comment", "".join(
+        f"# z = {1e3 * z:g} mm\n# x[mm] y[mm] Bx[T] By[T] Bz[T]\n" + table(" ", [
+            column[POINTS[:, 2] == z] for column in (*mm_T()[:2], *FIELD.T)]) for z in AXES[2])),
+    Foreign("half-plane of a field with symmetry", "R (cm)  Z (cm)  Br (G)  Bz (G)\n" + table(
+        " ", [100 * LINE[:, 2], 0 * LENGTH, 1e4 * FIELD[:, 0], 1e4 * FIELD[:, 2]]), {
+            "columns": ("x[cm]", "z[cm]", "Bx[G]", "Bz[G]"), "at": {"y": 0.0}},
+        ("x for r", "--at y=0"), LINE[:, [2, 0, 1]], FIELD * [1, np.nan, 1]),
+    Foreign("VTK, points in the header", "# vtk DataFile Version 3.0\nB\nASCII\nDATASET "
+            "STRUCTURED_POINTS\nDIMENSIONS 3 3 5\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 45\n"
+            "VECTORS B double\n" + table(" ", FIELD.T), {
+                "skip_lines": 9, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
+            ("--skip-lines",)),
     Foreign("the middle twice", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
             + "0,0,0,0.1,1e-6,0.05\n", points=np.vstack([POINTS, [[0, 0, 0]]]),
             field=np.vstack([FIELD, [[0.1, 1e-6, 0.05]]])),

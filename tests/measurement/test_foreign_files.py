@@ -9,11 +9,14 @@ from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
-from tests.measurement.foreign_files import FIELD, FILES, POINTS, Foreign, mm_T, table
+from tests.measurement.foreign_files import FIELD, FILES, LENGTH, POINTS, Foreign, mm_T, table
 
 ROUNDED = 2e-6
 """Largest error in T: FLUKA's fixed columns and MATLAB's text hold four to eight digits, all others
 nine or more."""
+
+
+HEADER = "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n"
 
 
 def ordered(points, field):
@@ -46,6 +49,57 @@ def test_what_people_have(tmp_path, case: Foreign):
     found = import_map(path, DeclaredFormat(**stated)).data
     assert same(found, case.points, case.field)
     assert not same(found, case.points, case.field[:, ::-1])
+
+
+@pytest.mark.parametrize(("text", "asked"), [
+    (b"\x1f\x8b\x08\0" + bytes(40), "gzip.*Unpack it"),
+    (b"\x93NUMPY\x01\0v\0" + bytes(40), "NumPy.*numpy.savetxt"),
+    (b"\x5e\xa4\x02\0" + bytes(range(256)), "binary file. Unpack"),
+    (b"MATLAB 5.0 MAT-file" + bytes(200), "MATLAB.*savetxt"),
+    (HEADER + table(",") + "1,1,1,9999,9999,9999\n", "9999, which looks like .* write nan"),
+    (HEADER + table(",") + "1,1,1,1e30,1e30,1e30\n", "1e.30 T.*write nan"),
+    (HEADER + table(",") + "1,1,1,1e38,1e38,1e38\n", "1e.38, which looks like .* write nan"),
+    (HEADER + table(",") + "1,1,1,OL,0,0\n", "write nan"),
+    (HEADER + table(",") + "Mean,,,1,2,3\n", "begin it with #"),
+    (HEADER + table(",") + "END\n", r"begin it with #\.$"),
+    (HEADER + "10 mm,0 mm,0 mm,0.1 T,0 T,0 T\n" * 2, r"its unit in the header, as in Bx\[mT\]"),
+    (HEADER + "10,0,0,0.1±0.01,0±0.01,0±0.01\n" * 2, "sigma_Bx"),
+    ("r[mm],theta[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,30,40,0.1\n", "--positions TABLE"),
+    (",-10,0,10\n-10,1,2,3\n0,1,2,3\n10,1,2,3\n", "matrix .* a row x, y, B"),
+    ('[{"x": 0, "y": 0, "z": 0, "Bx": 0.1}]', "x, y, z, Bx, By, Bz of numbers for each point"),
+], ids=str)
+def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
+    path = tmp_path / "file.txt"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(MeasurementError, match=asked):
+        import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize("last", ["999,0,0", "9.99,1,0", "0,0,0.099"])
+def test_nines_beside_others_of_their_size_are_readings(tmp_path, last):
+    """Negative control of placeholders: what the others are a third of may have been read."""
+    path = tmp_path / "file.txt"
+    path.write_text(HEADER.replace("T", "mT") + "0,0,0,900,0,0\n1,0,0,5,4,1\n2,0,0," + last + "\n")
+    assert import_map(path, DeclaredFormat()).data.sizes["point"] == 3
+
+
+@pytest.mark.parametrize(("text", "asked", "stated"), [
+    ('X, Y, Z, Scalar data "Mag_B"\n' + table(" ", [*mm_T(1.0)[:3], LENGTH]), "unit of Babs",
+     {"length_unit": "m", "field_unit": "T"}),
+    ("x[mm],y[mm],z[mm],f[MHz]\n" + table(",", [*mm_T()[:3], LENGTH / 0.0234872]),
+     r"Babs\[0.0234872 T\]", {"columns": ("x[mm]", "y[mm]", "z[mm]", "Babs[0.0234872 T]")}),
+    ("x_mm,y_mm,z_mm,Magnetic_Field_Reading\n" + table(",", [*mm_T()[:3], LENGTH]),
+     "--component abs", {"component": "abs", "field_unit": "T"}),
+    ("x_mm,y_mm,z_mm,NMR field (T)\n" + table(",", [*mm_T()[:3], LENGTH]), "", {})])
+def test_magnitudes(tmp_path, text, asked, stated):
+    path = tmp_path / "file.txt"
+    path.write_text(text)
+    if asked:
+        with pytest.raises(MeasurementError, match=asked):
+            import_map(path, DeclaredFormat())
+    found = import_map(path, DeclaredFormat(**stated)).data
+    np.testing.assert_allclose(found["Babs_T"], LENGTH, atol=ROUNDED)
+    np.testing.assert_allclose(points_of(found), POINTS, atol=1e-8)
 
 
 def test_number_of_files():

@@ -83,7 +83,7 @@ def test_other_columns_are_no_noise(tmp_path, name):
 
 @pytest.mark.parametrize(("cells", "asked"), [
     (("0.1", "0"), "standard deviation of Bx in reading 2"), (("0.1", ""), "instead received none"),
-    (("0.1", "n/a"), "sigma in line 3"), (("0.5", "5000"), "in reading 2")])
+    (("0.1", "wide"), "sigma in line 3"), (("0.5", "5000"), "in reading 2")])
 def test_absurd_noise_is_refused(tmp_path, cells, asked):
     text = "x[mm];y[mm];z[mm];Bx[mT];err\n" + "".join(
         f"0;0;{n};100;{cell}\n" for n, cell in enumerate(cells))

@@ -42,7 +42,7 @@ def moment_matrix(shape: Shape, permeability: Floats, mesh: Any = None, order: i
                             symmetric=True)
     preconditioner = ngs.Preconditioner(form, "bddc")
     form.Assemble()
-    inverse = ngs.solvers.CGSolver(form.mat, preconditioner, maxiter=1000, tol=1e-12)
+    inverse = ngs.solvers.CGSolver(form.mat, preconditioner, maxiter=1000, tol=1e-9)
     volume = ngs.Integrate(ngs.CF(1.0), mesh, definedon=inside, order=8)
     columns = []
     for axis in np.eye(3):

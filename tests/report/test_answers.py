@@ -149,7 +149,8 @@ def test_errors_of_readings_and_of_the_vector_are_told_apart(dipole, session):
     """A Fourier coefficient is off by less than B at a point: each answer says what is meant."""
     for quantity, settings in (("flux_density", {}), (
             "fourier_coefficients", {"observation__harmonics": 5})):
-        magnet = build_magnet(dipole(observation__quantity=quantity, **settings))
+        magnet = build_magnet(dipole(
+            observation__quantity=quantity, mesh__block_size_m=0.04, **settings))
         solved, verified = hf.solve(magnet, session), hf.verify(magnet, session)
         coefficient = quantity == "fourier_coefficients"
         said = solution.answer(solved).said

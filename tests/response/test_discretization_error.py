@@ -62,7 +62,7 @@ def test_dual_formulations_bracket_the_modes(short_dipole, session):
     exact, lie within it nearly everywhere (measured: at all readings of these, at 98 % of others),
     and it is short beside the reaction (measured 16 % on this coarse mesh).
     """
-    changes = {"array__rings": 1,
+    changes = {"array__rings": 1, "array__blocks_per_ring": 8,
                "mesh": {"block_size_m": 0.04, "layers_per_ring": 3, "growth": 1.7}}
     study = short_dipole(solver__route="scalar_potential", **changes)
     points = np.vstack([circle(0.05, 7, z, 0.2 + z) for z in (-0.12, -0.03, 0.0, 0.05, 0.11)])
@@ -70,7 +70,8 @@ def test_dual_formulations_bracket_the_modes(short_dipole, session):
     parts = finite_element_part(build_magnet(study), points, session, columns=False)
     part, stated = parts.nominal, reading_errors(build_magnet(study), observation, parts, session)
     truth = finite_element_part(build_magnet(short_dipole(
-        array__rings=1, mesh__meridian_size_m=0.01)), points, session, columns=False).nominal
+        array__rings=1, array__blocks_per_ring=8, mesh__meridian_size_m=0.01)), points, session,
+        columns=False).nominal
     assert np.mean(np.abs(part - truth).ravel() <= stated) > 0.95
     assert stated.max() < 0.3 * np.abs(part).max()
 

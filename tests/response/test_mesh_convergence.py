@@ -26,7 +26,7 @@ IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 
 @pytest.mark.parametrize("iron", [None, IRON], ids=["air", "iron"])
 def test_stated_error_covers_the_true_one(dipole, session, method, iron):
     """In 2D the truth is a closed form. An estimate within a factor of 30 above is of use."""
-    study = dipole(iron_ring=iron, solver={"method": method}, mesh__block_size_m=0.012)
+    study = dipole(iron_ring=iron, solver={"method": method}, mesh__block_size_m=0.016)
     points = points_from(study.observation.positions)
     tube = None if iron is None else (0.19, 0.2, 1000.0)
     expected = layered_bore_field(ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
@@ -42,7 +42,7 @@ def test_coarse_meshes_are_told_from_fine_ones(short_dipole, session):
     observation = {"quantity": "flux_density", "positions": {
         "kind": "circles", "radius_m": 0.05, "angles": 5, "z_min_m": -0.1, "z_max_m": 0.1,
         "count": 3}}
-    study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.012, observation=observation)
+    study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.016, observation=observation)
     fine, coarse = verify(build_magnet(study), session), verify(
         refined(build_magnet(study), 0.4), session)
     assert fine.route == "azimuthal_modes"

@@ -208,6 +208,7 @@ def accepted(request, short_dipole, getdp, tmp_path_factory):
     """
     route, order = request.param
     study = short_dipole(solver={"route": route, "edge_order": order},
+                         array__rings=1, array__blocks_per_ring=8,
                          mesh__block_size_m=0.06, mesh__meridian_size_m=0.03, mesh__growth=3.0)
     points = circle(0.05, 5, 0.013)
     folder = tmp_path_factory.mktemp("accepted")

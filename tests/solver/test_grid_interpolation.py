@@ -57,7 +57,7 @@ def test_readings_on_grid_lines_have_columns_that_add_up(short_dipole, session, 
     lines = np.unique(np.round(verify_mesh(build_meridian(
         magnet, make_folder(session.folder / "mesh"))).points[:, 1], SAME_LINE))
     on_lines = lines[np.abs(lines) < 0.16]
-    points = np.vstack([circle(0.03, 4, z, 0.1) for z in on_lines])
+    points = np.vstack([circle(0.015, 4, z, 0.1) for z in on_lines])
     observation = observe(magnet.study, points, np.ones_like(points, bool))
     found = response_matrix(magnet, observation, session.within("both"))
     assert found.superposition_error < 1e-11  # rounding; measured 2e-13 for such a magnet

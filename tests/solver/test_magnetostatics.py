@@ -184,14 +184,14 @@ def test_superposition_check_can_fail(generator):
 def test_stored_response_is_used_only_for_the_same_inputs(dipole, session):
     points = circle(0.075, 4)
     measured = np.ones((4, 3), bool) & [True, True, False]
-    study = dipole()
+    study = dipole(mesh__block_size_m=0.06)
     first = response_matrix(build_magnet(study), observe(study, points, measured), session)
     stored = session.folder / "response.h5"
     stamp = stored.stat().st_mtime_ns
     again = response_matrix(build_magnet(study), observe(study, points, measured), session)
     assert stored.stat().st_mtime_ns == stamp
     np.testing.assert_array_equal(first.matrix, again.matrix)
-    other = dipole(array__recoil_permeability=1.1)
+    other = dipole(array__recoil_permeability=1.1, mesh__block_size_m=0.06)
     changed = response_matrix(build_magnet(other), observe(other, points, measured), session)
     assert np.abs(changed.matrix - first.matrix).max() > 0
     stored.write_bytes(b"damaged")
@@ -203,8 +203,8 @@ def test_stored_response_is_used_only_for_the_same_inputs(dipole, session):
 @pytest.mark.parametrize("route", ["edge_elements", "scalar_potential", "azimuthal_modes"])
 def test_one_point_alone(short_dipole, session, route):
     """GetDP's interpolation of a table of one line gives nothing; a study of one point works."""
-    study = short_dipole(solver__route=route, mesh__meridian_size_m=0.03,
-                         mesh__block_size_m=0.06, mesh__growth=3.0)
+    study = short_dipole(solver__route=route, array__rings=1, array__blocks_per_ring=8,
+                         mesh={"meridian_size_m": 0.03, "block_size_m": 0.06, "growth": 3.0})
     points = in_bore(5)
     alone = solve_nominal(build_magnet(study), points[:1], session)
     np.testing.assert_allclose(alone[0], solve_nominal(build_magnet(study), points, session)[0],

@@ -15,7 +15,8 @@ from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 
 POINTS = circle(0.07, 8)
-COARSE = {"mesh__block_size_m": 0.06, "mesh__meridian_size_m": 0.02}
+COARSE = {"array__rings": 1, "array__blocks_per_ring": 8, "mesh__block_size_m": 0.06,
+          "mesh__meridian_size_m": 0.02}
 ROUNDING = 1e-9
 """Of the largest field: sums in another order, 1.4e-11 of the solution measured with edge elements
 of a conditioned gauge; conjugate gradients stop at 1e-10 of the residual."""

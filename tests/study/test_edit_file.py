@@ -82,7 +82,7 @@ def with_effects(study, names, generator):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@settings(max_examples=12, deadline=None, derandomize=True,
+@settings(max_examples=6, deadline=None, derandomize=True,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(names=st.lists(st.sampled_from(sorted(EFFECTS)), max_size=6, unique=True),
        seed=st.integers(0, 1000))

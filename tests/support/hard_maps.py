@@ -15,7 +15,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.field_map import field_map
 from tests.support import cube_dipole
-from tests.support.short_dipole import field_of, truth
+from tests.support.short_dipole import truth
 
 ROLL_RAD, LAG_M, APART_M, GAIN, DRIFT = 0.02, 1e-3, 2e-3, 0.02, 0.02
 """Usual sizes of one error of a probe."""
@@ -47,12 +47,12 @@ def _within(radius: float) -> Callable[[Floats], Floats]:
 
 
 def dipole(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], Floats]:
-    """Two rings of sectors of 20 mm, a bore of 40 mm, through their ends."""
+    """Two rings of cuboids of 20 mm, a bore of 40 mm, through their ends."""
     magnets, step = truth(generator), generator.choice([0.005, 0.0055, 0.006])
     across = step * np.arange(-3, 4)
     points = serpentine(across, across, 0.008 * np.arange(-2, 6),
                         _within(generator.uniform(0.016, 0.018)))
-    return lambda at: field_of(magnets, at), points
+    return magnets.getB, points
 
 
 def cubes(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], Floats]:

@@ -254,12 +254,26 @@ def solids(body, dimension=3, **material):
 
 
 @pytest.mark.parametrize("key", PlacedIron.model_fields)
-def test_iron_of_another_place_or_material_is_refused(key):
-    change = {"centre_m": [0.0, 0.0, 0.1], "rotation_deg": [0.0, 0.0, 5.0],
+@pytest.mark.parametrize("base", [
+    POLE, TUBE, {"kind": "box", "size_m": [0.02, 0.1, 0.05]}, {"kind": "sphere", "radius_m": 0.03}],
+    ids=lambda body: body["kind"])
+def test_place_and_material_of_a_body_of_iron(base, key, generator):
+    """A body in another place fills the same space as the model's, and another one than at home; a
+    material of its own is that of the model.
+    """
+    change = {"centre_m": [0.21, 0.01, 0.1], "rotation_deg": [20.0, -40.0, 5.0],
               "relative_permeability": 10.0, "curve": {"kind": "steel", "name": "aisi_1010"}}[key]
-    study = study_of(RING | {"rings": 1}, 3, iron={"bodies": [POLE | {key: change}]} | IRON)
-    with pytest.raises(StudyError, match=r"iron.bodies\[0\].*to simulate a campaign"):
-        magnet_of(study)
+    away = {"centre_m": [0.2, 0.0, 0.0]} if base["kind"] in ("box", "sphere") else {}
+    points = generator.uniform(-0.3, 0.3, (20_000, 3))
+    inside, laws = [], []
+    for body in (base | away | {key: change}, base | away):
+        (ours, *_), (theirs, *_) = solids(body)[0].bodies, solids(body)[1]
+        np.testing.assert_array_equal(ours.holds(points), theirs.contains(points))
+        inside.append(ours.holds(points))
+        laws.append(solids(body)[0].laws)
+    moved = key == "centre_m" or (key == "rotation_deg" and base["kind"] != "sphere")
+    assert (inside[0] != inside[1]).any() == moved
+    assert (laws[0] != laws[1]) == (key in ("relative_permeability", "curve"))
 
 
 @pytest.mark.parametrize("key", [

@@ -217,7 +217,8 @@ def test_reaction_in_3d(short_dipole, session, iron):
 
     Measured, with elements of 27 mm in NGSolve: 2.5e-5 T, rms 6e-6 T, and 1.3e-5 T, rms 4e-6 T.
     """
-    study = short_dipole(iron_ring=tube(IRONS[iron]), array__rings=1, array__ring_length_m=0.05,
+    thick = tube(IRONS[iron]) and tube(IRONS[iron]) | {"outer_radius_m": 0.22}
+    study = short_dipole(iron_ring=thick, array__rings=1, array__ring_length_m=0.05,
                          mesh={"block_size_m": 0.02, "meridian_size_m": 0.008, "growth": 1.5})
     theirs = finite_element_part(build_magnet(study), POINTS, session, columns=False).nominal
     ours = reaction_field(magnet_of(study), POINTS)

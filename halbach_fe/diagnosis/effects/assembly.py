@@ -256,16 +256,17 @@ class RingsMovedEffect(AssemblyEffect):
         to one that is turned, and exchanged halves to turned ones.
         """
         kinds = KINDS[:KINDS.index(self.move)]
-        return [_moved(move) for kind in kinds
+        return [_moved(magnet, move) for kind in kinds
                 for move in moves_of_rings(magnet, kind).values()]
 
     def sources(self, magnet: Magnet, place: Place) -> Sources:
-        return _moved(moves_of_rings(magnet, self.move)[place.words])
+        return _moved(magnet, moves_of_rings(magnet, self.move)[place.words])
 
 
-def _moved(move: Move) -> Sources:
+def _moved(magnet: Magnet, move: Move) -> Sources:
     """Return which blocks are where after a move of rings."""
-    return [(to, source, np.array(move.turn)) for to, source in move.pairs]
+    return [(to, source, magnet.blocks[to].carried_from(magnet.blocks[source])
+             if move.turn is None else np.array(move.turn)) for to, source in move.pairs]
 
 
 EFFECTS = (

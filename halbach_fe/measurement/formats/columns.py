@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.table import ForeignTable, with_units
 from halbach_fe.measurement.formats.text import (
+    RUN_TOGETHER,
     Line,
     cells_of,
     comma_hint,
@@ -36,10 +38,14 @@ from halbach_fe.measurement.formats.text import (
     numbers_among,
     rows_of,
     uncommented,
+    undecorated,
 )
 from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
 
+MARKED = re.compile(r"(?i)^(variables\s*=|[;*$]\s)\s*|\s\*$")
+"""What stands before a header: of Tecplot, of MAD-X, and of comments in other programs."""
 VECTOR = re.compile(r"(?i)vector data\b.*\bB_Vector\b.*")
+SCALAR = re.compile(r"(?i)scalar data\b.*\bMag_?B\b.*")
 RECOGNIZED = 2
 """Smallest number of recognized names in a header. Fewer may be words of a sentence."""
 OWN_COLUMNS = frozenset((*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS))
@@ -51,6 +57,9 @@ MEANING = re.compile(
 CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+"
                     r"y[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+z[\s=:]{0,3}([-+\d.e]+)\s*(\w+)")
 """A point with its coordinates and their unit: centre in lab: x 1 mm, y 2 mm, z 3 mm."""
+COORDINATE = re.compile(
+    r"(?i)([xyz])\s*[=:]\s*([-+\d.e]{1,30})\s*[\[(]?\s*([^\W\d]{1,12})?\W?")
+"""A comment that is a coordinate of the rows below it."""
 MAX_COUNTS = 4
 MAX_HEADER = 20_000
 """Number of characters of a line that are read as names of columns."""
@@ -66,12 +75,17 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
     MeasurementError
         If there are no numbers, or lines of different length.
     """
-    return read_lines(lines_of(raw, declared, where), declared, where)
+    lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
+    return read_lines([one for one in lines if one[1]], declared, where)
 
 
 def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> ForeignTable:
     """Read a table of columns from lines, as `read` does."""
     start = _first_numbers(lines, declared, where)
+    if delimiter_of(lines[start][1], declared) is None and any(
+            RUN_TOGETHER.search(line) for _, line in lines[start:]):
+        lines = [*lines[:start], *((number, line if is_comment(line) else RUN_TOGETHER.sub(
+            r"\1 ", line)) for number, line in lines[start:])]
     first = _below_counts(lines, start, declared, where)
     counts, preface = lines[start:first], lines[:first]
     header = {line.strip() for _, line in preface}  # repeated above every part of some files
@@ -98,10 +112,41 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
     own = {column.text for column in columns} <= OWN_COLUMNS
+    stated = [names.parse(text, stated=True) for text in declared.columns] or columns
+    added, more = _in_comments(preface, body, {column.quantity for column in stated})
+    if added:
+        columns, values = (*columns, *added), np.column_stack([values, *more])
+        remarks += (f"{' and '.join(column.quantity for column in added)} of the rows "
+                    f"{'is that' if len(added) == 1 else 'are those'} of the comment above them.",)
     return ForeignTable(
-        columns, values, where, comments="" if own else comments_of(preface), texts=texts,
+        columns, values, where, added=len(added), texts=texts,
+        comments="" if own else comments_of(preface),
         attributes=attributes_of(preface) if own else {},
         remarks=remarks if own else remarks + unused_lines(preface, columns))
+
+
+def _in_comments(
+    preface: Sequence[Line], body: Sequence[Line], known: set[str]
+) -> tuple[list[ColumnName], list[list[float]]]:
+    """Return coordinates that comments among the rows state, as "# z = 10 mm" above each plane.
+
+    The second list has their values by row. Those that are in ``known`` or never change are no such
+    coordinates.
+    """
+    at: dict[str, tuple[float, str]] = {}
+    by_row: list[dict[str, tuple[float, str]]] = []
+    for number, (_, line) in enumerate([*preface, *body]):
+        found = COORDINATE.fullmatch(uncommented(line)[:MAX_LINE])
+        if found:
+            with suppress(ValueError):
+                at = at | {found[1].lower(): (float(found[2]), found[3] or "")}
+        elif number >= len(preface) and not is_comment(line):
+            by_row.append(at)
+    axes = [axis for axis in names.POSITIONS[:3] if axis not in known
+            and all(axis in row for row in by_row) and len({row[axis] for row in by_row}) > 1
+            and len({row[axis][1] for row in by_row}) == 1]
+    return ([ColumnName(axis, axis, by_row[0][axis][1]) for axis in axes],
+            [[row[axis][0] for row in by_row] for axis in axes])
 
 
 def _below_counts(
@@ -194,11 +239,12 @@ def _first_numbers(lines: Sequence[Line], declared: DeclaredFormat, where: str) 
         if found == len(cells):
             return index
         before = (index, len(cells)) if 2 * found > len(cells) else None
-    hint = next((comma for _, line in lines for mark in (";", "\t", None)
-                 for cell in cells_of(line, mark) if (comma := comma_hint(cell))), "")
+    hint = next((comma for _, line in lines for mark in (";", "\t", ",", None)
+                 for cell in cells_of(line[:MAX_HEADER], mark) if (comma := comma_hint(cell))), "")
     raise MeasurementError(must_be(
-        "content", where, "a table with lines of numbers", "none", hint or "State what separates "
-        "the numbers: --delimiter comma, semicolon, tab or spaces."))
+        "content", where, "a table with lines of numbers", "none", hint or "Write it with a row "
+        "x, y, z, Bx, By, Bz of numbers for each point, as CSV; if there are such rows, state "
+        "what separates the numbers: --delimiter comma, semicolon, tab or spaces."))
 
 
 def _refuse_lost_rows(
@@ -214,8 +260,8 @@ def _refuse_lost_rows(
                 cells, declared.decimal_comma):
             raise MeasurementError(must_be(
                 f"line {position}", where, "either a reading or a header",
-                f"'{line.strip()[:60]}'",
-                f"If it is neither, begin it with #, or add --skip-lines {position}."))
+                f"'{line.strip()[:60]}'", next(filter(None, map(comma_hint, cells)), "")
+                or f"If it is neither, begin it with #, or add --skip-lines {position}."))
 
 
 def _header(
@@ -250,8 +296,10 @@ def _splits(line: str, delimiter: str | None) -> list[list[str]]:
     A header may be separated by spaces even if its rows are separated by commas.
     """
     text = (uncommented(line) if is_comment(line) else line.strip())[:MAX_HEADER]
-    marks = [mark for mark in (delimiter, ",", ";", "\t") if mark and mark in text]
-    split = [cells_of(text, mark) for mark in dict.fromkeys(marks)]
+    text = MARKED.sub("", text).strip("| ") if text.count("|") > 2 else MARKED.sub("", text)
+    marks = [mark for mark in (delimiter, ",", ";", "\t", " |", " * ") if mark and mark in text]
+    split = [[cell.strip() for cell in text.split(mark)] if mark[0] == " " else cells_of(text, mark)
+             for mark in dict.fromkeys(marks)]
     return [_spaced(text), *split] if delimiter is None else [*split, _spaced(text)]
 
 
@@ -259,6 +307,8 @@ def _with_vector(cells: list[str]) -> list[str]:
     """Return names in which a last one of a vector, as of Ansys Maxwell, is that of components."""
     if cells and VECTOR.fullmatch(cells[-1][:MAX_LINE]):
         return [*cells[:-1], *names.FIELDS[:3]]
+    if cells and SCALAR.fullmatch(cells[-1][:MAX_LINE]):
+        return [*cells[:-1], names.TOTAL]
     return cells
 
 
@@ -267,7 +317,7 @@ def _spaced(text: str) -> list[str]:
     found: list[str] = []
     depth = 0
     for word in text.split():
-        if found and (depth > 0 or word[0] in "[("):
+        if found and (depth > 0 or (word[0] in "[(" and found[-1][0] not in "[(")):
             found[-1] += word
         else:
             found.append(word)

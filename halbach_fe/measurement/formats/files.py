@@ -140,7 +140,8 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
         raise MeasurementError(must_be("content", where, f"{len(table.values)} rows, one for each "
                                        f"reading of {table.where}", str(len(found.values))))
     return replace(table, columns=(*table.columns, *(found.columns[n] for n in order)),
-                   values=np.hstack([table.values, found.values[:, order]]))
+                   values=np.hstack([table.values, found.values[:, order]]),
+                   added=table.added + len(order))
 
 
 def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedFile | None:

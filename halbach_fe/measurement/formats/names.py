@@ -35,16 +35,21 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
     "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
     "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
-    "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B"} | {
+    "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B", "magneticfield": "B",
+    "magneticfieldreading": "B", "fieldreading": "B", "nmrfield": TOTAL} | {
     spelling.format(axis): name for axis, name in zip("xyz", FIELDS[:3], strict=True)
-    for spelling in ("b0{}", "b{}re", "reb{}", "b{}real", "field{}", "{}field", "bfield{}", "mag{}",
-                     "magneticfield{}", "fluxdensity{}", "magneticfluxdensity{}", "b{}mean",
-                     "meanb{}", "b{}avg")} | {
-    spelling.format(axis): axis for axis in "xyz"
-    for spelling in ("position{}", "{}position", "coord{}", "{}coord", "{}coordinate", "stage{}",
-                     "probe{}", "point{}", "points{}", "location{}")} | {
+    for spelling in ("b0{}", "b{}re", "reb{}", "b{}real", "b{}mean", "meanb{}", "b{}avg", *(
+        around.format(word) for word in (
+            "field", "bfield", "mag", "magneticfield", "fluxdensity", "magneticfluxdensity",
+            "component", "feld", "magnetfeld", "flussdichte", "champ", "induction", "磁场",
+            "磁場", "磁感应强度", "磁束密度")
+        for around in ("{}{{}}", "{{}}{}", "{}b{{}}", "b{{}}{}")))} | {
+    around.format(word).format(axis): axis for axis in "xyz" for word in (
+        "position", "coord", "coordinate", "stage", "probe", "point", "points", "location", "lage",
+        "koordinate", "coordonnée", "坐标", "座標", "位置") for around in ("{}{{}}", "{{}}{}")} | {
     f"{of}:{number}": name for of, each in (("points", "xyz"), ("b", FIELDS[:3]))
     for number, name in enumerate(each)}
+"""Quantities by the names of columns, without blanks and in lower case, in several languages."""
 MAGNITUDES = frozenset(("magnitude", "mag", "total", "vectorsum"))
 """Names of |B| beside columns x, y and z of a field."""
 
@@ -63,7 +68,7 @@ OF_FIELD = re.compile(r"\((B\w{0,4})\)")
 """The component in brackets in sigma(Bx)."""
 
 MAX_NAME = 60
-BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*")
+BRACKETS = re.compile(r"(.*?)\s*[\[(<]([^\[\]()<>]*)[\])>]\s*")
 PREFIX = re.compile(r"[a-z]\w*\.")  # of mf.Bx; -mf.Bx keeps its sign and is not recognized as Bx
 
 
@@ -163,7 +168,7 @@ def split_unit(text: str) -> tuple[str, str]:
     """Split a name into the quantity and the unit, which is empty if the name has none."""
     if found := BRACKETS.fullmatch(text):
         return found[1], found[2]
-    for mark in ("/", "_", ","):
+    for mark in ("/", "_", ",", " in ", " "):
         base, _, unit = text.rpartition(mark)
         if base and (unit_symbol(unit) or (
                 _key(base) in TIME_NAMES and (unit in TIMES or CLOCK.fullmatch(unit)))):

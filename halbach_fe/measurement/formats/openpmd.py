@@ -95,8 +95,10 @@ def _describe(node: Any, attributes: Mapping[str, Any]) -> None:
 def _only_mesh(file: Any, where: str) -> Any:
     """Return the group of the single field mesh."""
     if "externalFieldPath" not in file.attrs:
-        raise MeasurementError(must_be("attribute", where, "`externalFieldPath`, of a field mesh "
-                                       "of openPMD-beamphysics", "a file without it"))
+        raise MeasurementError(must_be(
+            "attribute", where, "`externalFieldPath`, of a field mesh of openPMD-beamphysics",
+            "a file without it", "Write other HDF5 as CSV with a row x, y, z, Bx, By, Bz for each "
+            "point, by h5py and numpy.savetxt."))
     path = str(_text(file.attrs["externalFieldPath"]))
     base, wild, _ = path.partition("%T")
     names = sorted(file[base]) if wild else [""]

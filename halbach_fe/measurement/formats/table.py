@@ -6,6 +6,7 @@ all missing statements and the options that provide them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -29,6 +30,8 @@ OPTIONS = {"length": "--length-unit m, cm, mm, um or inch",
 MAX_NUMBER = 1e30
 """Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
 would overflow."""
+NMR = "1 MHz of protons in water is a field of 0.0234872 T: Babs[0.0234872 T]"
+PLACEHOLDER = "Where nothing was read, write nan."
 MOST_RAD = 4 * np.pi
 """Largest angle of a position, two turns: larger ones are in degrees."""
 
@@ -57,6 +60,8 @@ class ForeignTable:
         Attributes of a map in halbach-fe's own columns.
     remarks : tuple of str
         Sentences for the user about what the file says of its numbers.
+    added : int
+        Number of last columns that the rows of the file do not have.
     """
 
     columns: tuple[ColumnName, ...]
@@ -69,6 +74,7 @@ class ForeignTable:
     texts: dict[int, dict[int, Line]] = field(default_factory=dict)
     attributes: dict[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    added: int = 0
 
 
 @dataclass(frozen=True)
@@ -168,11 +174,24 @@ def _in_si(used: dict[str, int], unit_of: dict[str, str], table: ForeignTable) -
             line, cell = min(table.texts[column].values())
             raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
                                            f"'{cell[:40]}'", comma_hint(cell) or (
-                    "Where nothing was read, write nan." if name.startswith("B") else "")))
-        if (np.abs(table.values[:, column]) > MAX_NUMBER).any():
-            raise MeasurementError(must_be(name, table.where, f"below {MAX_NUMBER:g}", "more"))
+                    PLACEHOLDER if name.startswith("B") else "If the line is no reading, remove "
+                    "it, or begin it with #.")))
+        _refuse_placeholder(table.values[:, column], name, table.where)
         si[name] = units.in_si(table.values[:, column], unit_of[name])
     return si
+
+
+def _refuse_placeholder(values: Floats, name: str, where: str) -> None:
+    """Raise MeasurementError for a number that is none, as 1e30, or 9999 far above all others."""
+    size = np.nan_to_num(np.abs(values))
+    row = int(np.argmax(size))
+    far_above = 3.0  # times the next largest number, from which one of nines alone is no reading
+    nines = name.startswith("B") and re.fullmatch(r"9{3,}(\.9*)?", f"{size[row]:.12g}")
+    if size[row] > MAX_NUMBER or (nines and size[row] > far_above * max(
+            size[size < size[row]], default=size[row])):
+        raise MeasurementError(must_be(
+            f"{name} of reading {row + 1}", where, f"a reading, below {MAX_NUMBER:g}",
+            f"{values[row]:g}, which looks like a placeholder", PLACEHOLDER))
 
 
 def _noise(
@@ -327,7 +346,7 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
     """Return the file's columns with the names and units that the user states instead."""
     if not declared.columns:
         return _of_h(table.columns)
-    count = len(table.columns) - (len(COMPONENTS) if declared.positions is not None else 0)
+    count = len(table.columns) - table.added
     more = declared.columns[count:]  # delimiters at the ends of lines have no column in the table
     if len(declared.columns) < count or any(text != "-" for text in more):
         raise MeasurementError(must_be(
@@ -378,6 +397,12 @@ def _used(
     for index, column in enumerate(columns):
         if not column.quantity:
             continue
+        if column.quantity in used and column.quantity == "phi":
+            raise MeasurementError(must_be(
+                "positions", table.where, "x, y, z or r, phi, z", "r with two angles, "
+                f"'{columns[used['phi']].text}' and '{column.text}'",
+                "Compute x, y and z, give them by --positions TABLE, and state - for r and the "
+                "angles in --columns."))
         if column.quantity in used:
             missing.append(f"its one column {column.quantity}: '"
                            f"{columns[used[column.quantity]].text}' or '{column.text}' (--columns, "
@@ -414,16 +439,23 @@ def _missing(
     if not any(column.quantity for column in columns):
         shown = ", ".join(f"'{column.text}'" for column in columns if column.text)
         return [f"what its {len(columns)} columns {f'({shown}) ' if shown else ''}are "
-                "(--columns x,y,z,Bx,By,Bz, - to ignore a column)"] + [
+                "(--columns x,y,z,Bx,By,Bz, - to ignore a column"
+                + ("; if there are no positions, --columns Bx,By,Bz and --positions TABLE"
+                   if len(columns) == len(COMPONENTS) else "")
+                + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
+                   if _is_matrix(table.values) else "") + ")"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
-    missing = []
+    missing: list[str] = []
     if (hint := _of_field(used, columns)) is not None:
         return [hint]
     wanted = ("r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
     absent = [name for name in wanted if name not in used and name not in declared.at
               and f"d{name}" not in used]
+    if absent == ["phi"]:
+        return [*missing, "phi (--columns); if the field has rotational symmetry, state its "
+                "half-plane: x for r and Bx for Br in --columns, and --at y=0"]
     if absent:
         missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
     if "B" in used:
@@ -431,13 +463,25 @@ def _missing(
                        "(--component abs), or that nobody knows (--component unknown: halbach-fe "
                        "register then tries all three)")
     elif not {*names.FIELDS, names.TOTAL} & set(used):
-        missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns)")
+        others = [column.text for column in columns if column.text and not column.quantity]
+        missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns"
+                       + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
+                          if others else "")
+                       + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "") + ")")
     half = {"Br", "Bphi"} - set(used)
     if len(half) == 1:
         missing.append(f"{half.pop()}, without which the other is no Bx or By (--columns)")
     if table.anchor and declared.origin_m is None:
         missing.append(f"where {table.anchor} is along the magnet's axes (--origin-m=X,Y,Z)")
     return missing
+
+
+def _is_matrix(values: Floats) -> bool:
+    """Return whether the first row and column of numbers (n, m) grow or fall all along."""
+    fewest = 3  # cells of an axis
+    return min(values.shape) >= fewest and all(
+        np.all(steps > 0) or np.all(steps < 0)
+        for steps in (np.diff(values[0, 1:]), np.diff(values[1:, 0])))
 
 
 def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None:
@@ -568,7 +612,7 @@ def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) ->
     farthest = float(np.abs(points).max())
     if not largest <= MAX_FIELD_T:
         raise MeasurementError(must_be("flux densities", where, f"below {MAX_FIELD_T:g} T",
-                                       f"{largest:g} T", "Is the unit right?"))
+                                       f"{largest:g} T", f"Is the unit right? {PLACEHOLDER}"))
     if not farthest <= 10 * MAX_LENGTH_M:
         raise MeasurementError(must_be("positions", where, f"within {10 * MAX_LENGTH_M:g} m",
                                        f"{farthest:g} m", "Is the unit right?"))
@@ -584,5 +628,6 @@ def _contradiction(table: ForeignTable, what: str, file: str, user: str) -> Meas
 
 def with_units(columns: Sequence[ColumnName], units_below: Sequence[str]) -> tuple[ColumnName, ...]:
     """Return columns without a unit of their own with the units of a line below the header."""
-    return tuple(replace(column, unit=column.unit or unit.strip().strip("[]()"))
-                 for column, unit in zip(columns, units_below, strict=True))
+    return tuple(column if column.unit else replace(
+        names.parse(f"{column.text} [{unit.strip().strip('[]()')}]"), text=column.text)
+        for column, unit in zip(columns, units_below, strict=True))

@@ -19,8 +19,27 @@ from halbach_fe.measurement.formats.declared import DELIMITERS, DeclaredFormat
 
 COMMENTS = "#%!"
 """Characters that begin a comment."""
-THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3}){1,9}\.\d{1,30}", re.ASCII)
-"""A number whose thousands are separated by commas; the point says that they are no decimals."""
+THOUSANDS = {
+    False: re.compile(r"[-+]?\d{1,3}(,\d{3}){1,9}\.\d{1,30}", re.ASCII),
+    True: re.compile(r"[-+]?\d{1,3}(\.\d{3}){1,9},\d{1,30}", re.ASCII)}
+"""Numbers without and with a decimal comma whose thousands are separated by the other mark."""
+GROUPED = re.compile(r"(?<=\d)['\u2019\u00a0\u2009\u202f](?=\d{3}(?!\d))")
+"""An apostrophe or a narrow blank before three digits, which separates thousands."""
+MISSING = frozenset((
+    "", "nan", "+nan", "-nan", "na", "n/a", "#n/a", "#nv", "null", "none", "nil", "-", "--", "---",
+    "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind"))
+"""Cells in lower case by which programs say that there is no number."""
+MARKS = str.maketrans("\uff08\uff09\uff0c\uff1b\uff1a\u2212\u3000", "(),;:- ")
+"""Wide brackets, commas and blanks of Chinese and Japanese text, and the typographic minus."""
+SIGNATURES = {
+    b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip, as NumPy's .npz", b"\x93NUMPY": "NumPy",
+    b"MATLAB 5.0 MAT": "MATLAB", b"\x89HDF\r\n\x1a\n": "HDF5", b"%PDF": "PDF", b"\x89PNG": "PNG",
+    b"SDDS": "binary SDDS"}
+"""First bytes of files that are not text."""
+RUN_TOGETHER = re.compile(r"(\.\d+(?:[eEdD][-+]\d+)?)(?=[-+]\d*\.\d)")
+"""A number that another one follows without a blank, as in columns of fixed width."""
+IN_LISTS = frozenset("0123456789+-.,;eE*^|[]{}() \t")
+"""Characters of rows of numbers in the brackets of lists or between bars."""
 MAX_COMMENTS = 2000
 """Largest number of characters of comments that are kept."""
 
@@ -38,6 +57,8 @@ def lines_of(raw: bytes, declared: DeclaredFormat, where: str) -> list[Line]:
     """
     marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     default = declared.encoding == DeclaredFormat.encoding
+    if default and not marked:
+        _refuse_binary(raw, where)
     try:
         text = raw.decode("utf-16" if marked and default else declared.encoding)
     except LookupError:
@@ -46,12 +67,38 @@ def lines_of(raw: bytes, declared: DeclaredFormat, where: str) -> list[Line]:
     except ValueError:
         raise MeasurementError(must_be(
             "encoding", where, declared.encoding.removesuffix("-sig").upper(), "other bytes",
-            "Is it text? Then name its encoding (--encoding latin-1, utf-16).")) from None
+            "Is it text? Then name its encoding (--encoding latin-1, utf-16, gbk or "
+            "shift_jis).")) from None
+    text = text.rstrip("\0\x1a\r\n").translate(MARKS)  # some programs mark the end
     found = [(number, line) for number, line in enumerate(text.splitlines(), 1)
              if line.strip() and number > declared.skip_lines]
     if not found:
         raise MeasurementError(must_be("content", where, "a table of readings", "blank lines"))
     return found
+
+
+def _refuse_binary(raw: bytes, where: str) -> None:
+    """Raise MeasurementError for a file that is not text, whatever its encoding."""
+    kind = next((name for start, name in SIGNATURES.items() if raw.startswith(start)), "")
+    if kind and (raw[:2000].isascii() and b"\0" not in raw[:2000]):
+        kind = ""  # as the ASCII variant of SDDS
+    if not kind and raw[:2000].rstrip(b"\0").count(b"\0") < 2:
+        return
+    raise MeasurementError(must_be(
+        "content", where, "text", f"a binary file{f' ({kind})' if kind else ''}",
+        "Unpack it, or write it as CSV with a row x, y, z, Bx, By, Bz for each point; in Python: "
+        "numpy.savetxt('map.csv', table, delimiter=',', comments='', "
+        "header='x[m],y[m],z[m],Bx[T],By[T],Bz[T]')."))
+
+
+def undecorated(line: str) -> str:
+    """Return a row of numbers without the brackets, bars and stars that some programs print."""
+    starred = line.strip().startswith("* ") and line.rstrip().endswith(" *")
+    listed = any(mark in line for mark in "|[]{}") and IN_LISTS.issuperset(line)
+    if len(line) > MAX_COMMENTS or not (starred or listed):
+        return line
+    numbers = re.sub(r"[\[\](){}|]|(?<!\S)\*(?!\S)", " ", line)
+    return " ".join(re.sub(r"[,;]\s", " ", f"{numbers} ").split())
 
 
 def text_of_table(raw: bytes, where: str) -> bytes:
@@ -95,6 +142,8 @@ def delimiter_of(line: str, declared: DeclaredFormat) -> str | None:
     """
     if declared.delimiter:
         return DELIMITERS[declared.delimiter]
+    if '","' in line.replace(" ", ""):  # quoted, so that decimal commas do not matter
+        return ","
     for mark in ";\t" if declared.decimal_comma else ";\t,":
         if mark in line:
             return mark
@@ -112,16 +161,18 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
 
 
 def number_in_cell(cell: str, decimal_comma: bool = False) -> float:
-    """Return the number in a cell, NaN if the cell is empty or ``nan``; else raise ValueError."""
+    """Return the number in a cell, NaN if it says that there is none; else raise ValueError."""
+    if cell.lower() in MISSING:
+        return np.nan
+    if not (cell.isascii() and cell.replace("-", "").replace(".", "").isdigit()) or decimal_comma:
+        cell = GROUPED.sub("", cell[:MAX_CELL + 1]).replace("*^", "e")  # as Mathematica writes
+        if THOUSANDS[decimal_comma].fullmatch(cell):
+            cell = cell.replace("." if decimal_comma else ",", "")
     if decimal_comma:
         if "." in cell:  # 1.234 could be 1234, or a number with a decimal point
             raise ValueError(cell)
         cell = cell.replace(",", ".")
-    elif THOUSANDS.fullmatch(cell):
-        cell = cell.replace(",", "")
-    if not cell or cell.lower() == "nan":
-        return np.nan
-    return number_in(cell.replace("*^", "e"))  # as Mathematica writes exponents
+    return number_in(cell)
 
 
 def numbers_among(cells: Sequence[str], decimal_comma: bool = False) -> int:
@@ -177,9 +228,10 @@ def rows_of(
         if len(cells) != columns:
             raise MeasurementError(must_be(
                 f"line {position}", where, f"{columns} values", str(len(cells)),
-                "Is the file cut short? Else remove the line, or begin it with #; if the table "
-                f"begins below it, add --skip-lines {position}; if cells are separated otherwise, "
-                "--delimiter."))
+                "Is the file cut short? Else remove the line, or begin it with #"
+                + ("." if position == lines[-1][0] else
+                   f"; if the table begins below it, add --skip-lines {position}; if cells are "
+                   "separated otherwise, --delimiter.")))
         row = [_number_or_none(cell, declared.decimal_comma) for cell in cells]
         for column, value in enumerate(row):
             if value is None:
@@ -191,7 +243,15 @@ def rows_of(
 
 
 def comma_hint(cell: str) -> str:
-    """Return a hint for a cell that may be a number with a decimal comma, else an empty string."""
-    if len(cell) <= MAX_CELL and re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", cell.strip()):
+    """Return what to do with a cell that is nearly a number, else an empty string."""
+    cell = cell.strip()
+    if len(cell) > MAX_CELL:
+        return ""
+    if re.fullmatch(r"[-+]?[\d.'\u2019\u00a0\u2009\u202f]*,\d+([eE][-+]?\d+)?", cell):
         return "If its comma is a decimal comma, add --decimal-comma."
+    if re.fullmatch(r"[-+\d.,eE]+\s*(\u00b1|\+/?-).*", cell):
+        return ("Write the number alone, and its standard deviation in a column of its own, "
+                "sigma_Bx.")
+    if re.fullmatch(r"[-+]?[\d.]*\d([eE][-+]?\d+)?\s*[^\W\d_]{1,5}", cell):
+        return "Write the number alone, and its unit in the header, as in Bx[mT]."
     return ""

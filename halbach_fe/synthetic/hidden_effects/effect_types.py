@@ -16,7 +16,8 @@ from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import Component
 from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
-from halbach_fe.synthetic.true_magnet import TrueMagnet, Vector
+from halbach_fe.synthetic.shapes import Vector
+from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "vacuum", "few blocks",
                "x", "y", "z", "circles"]

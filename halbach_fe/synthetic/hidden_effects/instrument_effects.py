@@ -24,7 +24,9 @@ from halbach_fe.synthetic.hidden_effects.effect_types import (
     log_uniform,
     signed_log_uniform,
 )
-from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, Vector, vector
+from halbach_fe.synthetic.iron import Ball
+from halbach_fe.synthetic.shapes import Vector
+from halbach_fe.synthetic.true_magnet import Body, TrueMagnet, vector
 
 
 def _with(values: Vector, index: int, more: float) -> Vector:
@@ -312,6 +314,7 @@ def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
                            centre=vector(np.add(body.centre, (0, 0, number * pitch))))
                    for body in last]
     iron = magnet.iron and replace(magnet.iron, bodies=tuple(
+        body if isinstance(body, Ball) or any(body.turn) else
         replace(body, half_length=body.half_length + more * pitch / 2)
         for body in magnet.iron.bodies))
     return replace(magnet, iron=iron, bodies=tuple(
