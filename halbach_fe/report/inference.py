@@ -325,7 +325,10 @@ def _profiles(result: InferenceResult) -> Figures:
         figures["profile.png"] = partial(prediction_profile_figure, result), profile
     if has_residual_maps(result):
         figures["residual_maps.png"] = (
-            partial(residual_maps_figure, result), "Measured less predicted over the map, before "
+            partial(residual_maps_figure, result.observation, {
+                name: result.readings - each.mean for name, each in (
+                    ("before", result.prediction_prior), ("after", result.prediction_posterior))}),
+            "Measured less predicted over the map, before "
             "and after the update: what remains should be noise, without a pattern")
     return figures
 

@@ -24,6 +24,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
+    chart,
     csv_file,
     figure_of,
 )
@@ -483,8 +484,7 @@ def _maps(points: Floats, field: Floats, check: MapCheck) -> Figure:
 
 def _readings(check: MapCheck) -> Figure:
     """Draw the residuals of every column in the order of the map."""
-    figure = figure_of(4)
-    axis = figure.subplots()
+    figure, axis = chart(4)
     number = np.arange(1, len(check.residual_T) + 1)
     for values, name, colour in zip(check.residual_T.T, COMPONENTS,
                                     (POSTERIOR, SECOND, MEASURED), strict=True):
@@ -492,7 +492,6 @@ def _readings(check: MapCheck) -> Figure:
                   color=colour, label=f"B{name}")
     axis.set_xlabel("row of the map")
     axis.set_ylabel("residual in µT")
-    axis.grid(alpha=0.3)
     figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3,
                   frameon=False, markerscale=4)
     return figure

@@ -383,6 +383,14 @@ def figure_of(height_in: float, width_in: float = WIDEST_IN) -> Figure:
     return Figure(figsize=(min(width_in, WIDEST_IN), height_in), layout="constrained")
 
 
+def chart(height_in: float, width_in: float = WIDEST_IN) -> tuple[Figure, Axes]:
+    """Return a figure with a single grid, and its axes."""
+    figure = figure_of(height_in, width_in)
+    axis = figure.subplots()
+    axis.grid(alpha=0.3)
+    return figure, axis
+
+
 def legend_above(figure: Figure, *axes: Axes, columns: int = 2) -> None:
     """Put the names of what is drawn above a figure, where they hide nothing.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,13 +21,14 @@ from halbach_fe.inference.result import (
     InferenceResult,
     Prediction,
 )
+from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
     PUBLISHED,
-    figure_of,
+    chart,
     legend_above,
     stacked_axes,
 )
@@ -175,13 +176,12 @@ def has_residual_maps(result: InferenceResult) -> bool:
     return len(points) >= FEWEST_ON_A_LINE and curve(points) is None
 
 
-def residual_maps_figure(result: InferenceResult) -> Figure:
-    """Draw measured less predicted, before and after the update, over the points of the map."""
-    observation = result.observation
+def residual_maps_figure(
+    observation: Observation, residuals: Mapping[str, Floats]
+) -> Figure:
+    """Draw measured less predicted (readings,) in T, by name, over the points of the map."""
     points, number = np.unique(observation.positions.round(9), axis=0, return_inverse=True)
-    before, after = result.readings - np.array(
-        [result.prediction_prior.mean, result.prediction_posterior.mean])
-    factor, unit = unit_for(float(np.abs(before).max()))
+    factor, unit = unit_for(max(float(np.abs(each).max()) for each in residuals.values()))
     labels = np.array(observation.labels)
 
     def at_points(label: str, residual: Floats) -> Floats:
@@ -191,7 +191,7 @@ def residual_maps_figure(result: InferenceResult) -> Figure:
         return values
 
     return residual_figure(points, {label: {
-        "before": at_points(label, before), "after": at_points(label, after)}
+        name: at_points(label, residual) for name, residual in residuals.items()}
         for label in dict.fromkeys(observation.labels)}, unit)
 
 
@@ -227,8 +227,7 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     out, they are those of the training readings for the prior, which does not depend on them.
     """
     drawn_quantiles = 2000  # largest number of quantiles that are drawn
-    figure = figure_of(5.4, 5.2)
-    axis = figure.subplots()
+    figure, axis = chart(5.4, 5.2)
     unseen = result.held_out.any()
     chosen = result.held_out if unseen else ~result.held_out
     count = int(chosen.sum())
@@ -247,7 +246,6 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     axis.set(xlabel="normal quantile", ylabel="whitened residual, "
              + ("held-out readings" if unseen else "training readings"))
     _scale(axis, np.concatenate(found))
-    axis.grid(alpha=0.3)
     legend_above(figure, axis, columns=1)
     return figure
 

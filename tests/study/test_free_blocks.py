@@ -119,7 +119,7 @@ def test_many_polygons_are_compared_in_parts(monkeypatch, generator):
     polygons = generator.uniform(-1, 1, (300, 4, 2))
     whole = crossing(polygons)
     assert 0.1 < whole.mean() < 0.9
-    monkeypatch.setattr("halbach_fe.study.polygons.MAX_PAIRS", 100)
+    monkeypatch.setattr("halbach_fe.study.types.MAX_PAIRS", 100)
     assert np.array_equal(crossing(polygons), whole)
 
 
