@@ -43,6 +43,7 @@ from halbach_fe.core.errors import (
     printable,
 )
 from halbach_fe.core.files import InputFile
+from halbach_fe.core.numbers import decimals
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def print_estimate(estimate: Estimate, as_json: bool) -> int:
             "memory": f"{estimate.memory_GiB:.2g} GiB in all processes together"
             + ("" if available is None else f", of {available:.2g} GiB available"),
             "disk": f"{estimate.disk_GiB:.2g} GiB at most",
-            "time": f"{estimate.seconds:.2g} s, within a factor of about {TIME_FACTOR:g}",
+            "time": f"{decimals(estimate.seconds, 2)} s, within a factor of about {TIME_FACTOR:g}",
         }.items()], f"{estimate.study}, estimated")
     if estimate.warning is not None:
         say(f"warning: {estimate.warning}")

@@ -78,8 +78,8 @@ def guarded(run: Callable[[], int]) -> int:
                 if signal.getsignal(number) is not signal.SIG_IGN}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("once", HalbachWarning)
-            warnings.showwarning = lambda message, *_: say(f"warning: {message}")
+            warnings.simplefilter("always", HalbachWarning)
+            warnings.showwarning = _say_once(set())
             claim_buffers()  # before there is a thread, which takes memory for its own
             with _ended_in_time(set(previous)):
                 return run()
@@ -123,6 +123,16 @@ def _ended_in_time(numbers: Set[int]) -> Iterator[None]:
         thread.join()
         os.close(reading)
         os.close(writing)
+
+
+def _say_once(said: set[str]) -> Callable[..., None]:
+    """Return what shows a warning; the filter "once" forgets at any change of the filters."""
+    def show(message: Warning | str, *_: object) -> None:
+        if str(message) not in said:
+            said.add(str(message))
+            say(f"warning: {message}")
+
+    return show
 
 
 def _exit_code(error: BaseException) -> int:

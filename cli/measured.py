@@ -574,7 +574,13 @@ def explain(arguments: argparse.Namespace) -> int:
     explained, as far as there are such, and explanation.html, which joins their pages.
     """
     from halbach_fe.explanation import follow
+    from halbach_fe.study.reader import read_study
 
+    if read_study(arguments.study).maps:
+        raise StudyError(must_be(
+            "`maps`", f"study {arguments.study}", "left out for explain, which takes one map",
+            "a list of maps", "Of maps that a study lists, run halbach-fe check, register, infer "
+            "and diagnose; they take all of them."))
     steps = _Explanation(arguments, arguments.study, arguments.map)
     follow(steps)
     common.say("")

@@ -35,7 +35,7 @@ from halbach_fe.cli.options import (
     whole,
     within,
 )
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import ACROSS, DENSITY, DRAWS, HIGHEST_DEGREE
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
            help="number of points of a line (default: 201)"),
     option("--across-m", type=finite_number, nargs=2, default=(0.0, 0.0), metavar=("U", "V"),
            help="half widths of a grid of parallel lines: of a line along z those along x and y"),
-    option("--lines", type=positive, default=5, metavar="N",
+    option("--lines", type=positive, metavar="N",
            help="number of lines along each half width (default: 5)"),
     POSTERIOR, option("--inside", action="store_true", help="points may lie inside blocks"))
 def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
@@ -140,7 +140,11 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.types import COMPONENTS
 
-    offsets = tuple(np.linspace(-half, half, arguments.lines) if half else np.zeros(1)
+    if arguments.lines and not any(arguments.across_m):
+        raise StudyError(must_be("--lines", "the command line", "beside --across-m, the half "
+                                 "widths of the grid of lines", "given alone", "Add --across-m "
+                                 "U V, or leave it out."))
+    offsets = tuple(np.linspace(-half, half, arguments.lines or 5) if half else np.zeros(1)
                     for half in arguments.across_m)
     lines = Lines(np.array(arguments.from_m), np.array(arguments.to_m), (offsets[0], offsets[1]),
                   arguments.count)
@@ -180,7 +184,8 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
         for axis in COMPONENTS], "Integrals of B along the middle line")
     if doubt:
         say(doubt)
-    say(f"Wrote {lines.points.shape[0]} lines of {lines.count} points: {folder}")
+    several = "1 line" if len(lines.points) == 1 else f"{len(lines.points)} lines"
+    say(f"Wrote {several} of {lines.count} points: {folder}")
     return 0
 
 

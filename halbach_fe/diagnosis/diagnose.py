@@ -350,9 +350,9 @@ def _diagnose(
         unknown = describe_unknown(judgement, update, search, identified)
         if unknown is None:
             further = Further.of(judgement)
-            imitation = imitated(judgement, further, update, search)
             if answer == number + 1:
                 suspected = suspicions(judgement, further, corrected, search)
+            imitation = imitated(judgement, further, update, search, suspected)
     if unknown is not None and unknown.alone and not start and not position_noise:
         update, search = first
     identified = with_rivals(search, identified)
@@ -364,8 +364,8 @@ def _diagnose(
     return Diagnosis(
         corrected_study=corrected, before=first[0], after=update,
         study=with_position_noise(with_uncertain_effects(
-            corrected, identified, [each for one in suspected for each in one.fitted]),
-            position_noise),
+            corrected, identified, [each for one in (*suspected, imitation) if one
+                                    for each in one.fitted]), position_noise),
         identified=identified, unknown=unknown,
         probabilities=probabilities(
             first[1].evidence, first[1].candidates,

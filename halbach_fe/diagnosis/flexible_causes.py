@@ -201,7 +201,8 @@ def field_family(
     seen : callable, optional
         Returns what the maps show (k, n, 3) in T of fields (k, n, 3) in T.
     """
-    terms = harmonic_fields(points)
+    waves_in_plane = 4  # of a source outside the bore, with which the field falls off in a radius
+    terms = harmonic_fields(points, in_plane=waves_in_plane)
     return _of_smooth_terms("field", "", replace(terms, fields=seen(terms.fields)), noise_T, False,
                             np.ptp(points[:, 2]))
 

@@ -100,6 +100,8 @@ class GrossError:
         Rms difference from the nominal magnet, relative to the map's rms.
     map : str or None
         Name of the map among those that the study lists; None if it lists none.
+    factor : float or None
+        Factor of all readings that explains the map as well, if there is one.
     """
 
     convention: MapConvention
@@ -107,6 +109,7 @@ class GrossError:
     misfit_before: float
     misfit_after: float
     map: str | None = None
+    factor: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -270,8 +273,19 @@ class _Search:
                     return None
                 return GrossError(convention, self.distinct(convention, [
                     each for _, each in others]), before.relative,
-                    self.misfit(convention).relative)
+                    (after := self.misfit(convention)).relative,
+                    factor=self.factor_as_good(after) if convention.is_only_elsewhere else None)
         return None
+
+    def factor_as_good(self, after: _Misfit) -> float | None:
+        """Return the factor of all readings that explains the map as well as a correction does
+        that leaves a misfit; None if none does.
+        """
+        _, nominal = self.nominal_of(MapConvention())
+        found = nominal and self.compared(
+            MapConvention(), nominal.field(0.0), nominal.variance, np.inf)
+        return found[2] if found and float(np.sqrt(np.mean(found[0]**2))) <= (
+            INDISTINGUISHABLE_MISFIT_RATIO * after.standard) else None
 
     def hidden_by_symmetry(self, nominal: _Misfit) -> GrossError | None:
         """Return the single error that changes nothing in the nominal magnet, but in the measured
@@ -466,7 +480,7 @@ class _Search:
         found = self.residual(convention, measured_blocks)
         if found is None:
             return INFINITE_MISFIT
-        residual, relative = found
+        residual, relative, _ = found
         return _Misfit(float(np.sqrt(np.mean(residual**2))), relative)
 
     def with_a_wrong_block(self, convention: MapConvention) -> _Misfit:
@@ -491,8 +505,9 @@ class _Search:
 
     def residual(
         self, convention: MapConvention, measured_blocks: bool = False
-    ) -> tuple[Floats, float] | None:
-        """Return standardized residuals (values,), and their rms relative to that of the map.
+    ) -> tuple[Floats, float, float] | None:
+        """Return standardized residuals (values,), their rms relative to that of the map, and the
+        common factor of the readings.
 
         None if points are inside material, or less than `MIN_USED` of the observed values remain.
         """
@@ -505,12 +520,14 @@ class _Search:
         return self.compared(convention, field, nominal.variance)
 
     def compared(
-        self, convention: MapConvention, field: Floats, variance: Floats
-    ) -> tuple[Floats, float] | None:
-        """Compare the map with a field (n, 3) in T of given variance, see `residual`."""
-        # Largest relative change of the whole field that iron, permeability and temperature may
-        # cause.
-        max_scale_change = 0.1
+        self, convention: MapConvention, field: Floats, variance: Floats,
+        max_scale_change: float = 0.1,
+    ) -> tuple[Floats, float, float] | None:
+        """Compare the map with a field (n, 3) in T of given variance, see `residual`.
+
+        Iron, permeability and temperature may cause a relative change of the whole field, of 0.1 at
+        most.
+        """
         # Standard deviation that effects of usual size add to a reading, relative to the main
         # field.
         effect_field_sd = 0.003
@@ -527,7 +544,8 @@ class _Search:
         scale = np.clip(weighted @ (shown / sd) / max(float(weighted @ weighted), 1e-300),
                         1 - max_scale_change, 1 + max_scale_change)
         difference = shown - scale * field
-        return difference / sd, float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole)
+        return (difference / sd, float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole),
+                float(scale))
 
     def of_measured_blocks(self, convention: MapConvention, nominal: Floats) -> Floats:
         """Return B (n, 3) in T of the measured blocks.

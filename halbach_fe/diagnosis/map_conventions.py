@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations, product
 
@@ -105,6 +105,11 @@ class MapConvention:
             shift = ", ".join(f"{1e3 * component:.1f}" for component in self.shift_m)
             found.append(("wrong_line", f"points displaced by ({shift}) mm"))
         return tuple(found)
+
+    @property
+    def is_only_elsewhere(self) -> bool:
+        """Whether it changes nothing but the radius of the points, or their place."""
+        return replace(self, radius=1.0, offset_m=0.0, shift_m=(0.0, 0.0, 0.0)).errors == ()
 
     @property
     def names(self) -> tuple[str, ...]:

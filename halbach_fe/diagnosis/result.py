@@ -152,8 +152,8 @@ class Suspicion:
 class Imitation:
     """Effects that may be missing without any reading to show it, as the blocks imitate them.
 
-    With one of them the magnetizations of an update are off by more than their error bars: their
-    chi-squared per parameter is above 2.
+    With one of them the magnetizations of an update without it are off by more than their error
+    bars.
 
     Attributes
     ----------
@@ -163,11 +163,14 @@ class Imitation:
         Names of the likeliest of them.
     shares : tuple of float
         Probability of each of these.
+    fitted : tuple of IdentifiedEffect
+        The effects at their likeliest places, with the amplitudes that they would have.
     """
 
     probability: float
     effects: tuple[str, ...]
     shares: tuple[float, ...]
+    fitted: tuple[IdentifiedEffect, ...] = ()
 
 
 @dataclass(frozen=True)

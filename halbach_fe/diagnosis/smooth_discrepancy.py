@@ -40,7 +40,9 @@ class SmoothTerms:
     fineness: Floats
 
 
-def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> SmoothTerms:
+def harmonic_fields(
+    points: Floats, orders: int = 6, waves: int = 10, in_plane: int = 0
+) -> SmoothTerms:
     """Return fields without sources at the points, each with an rms magnitude of 1.
 
     Parameters
@@ -50,13 +52,15 @@ def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> SmoothT
         Largest azimuthal order.
     waves : int
         Largest number of half waves over the length of the map.
+    in_plane : int
+        The same of a map in one plane, over its diameter: the field varies along z there, too.
     """
     radius = np.hypot(points[:, 0], points[:, 1])
     angle = np.arctan2(points[:, 1], points[:, 0])
     z = points[:, 2] - points[:, 2].mean()
     # longer than the map, on which the terms must not be periodic
-    length = max(np.ptp(z), 1e-9) * 1.2
-    scale = max(radius.max(), 1e-9)
+    flat, scale = not np.ptp(z), max(radius.max(), 1e-9)
+    length = (2 * scale if flat else max(np.ptp(z), 1e-9)) * 1.2
     along, across = np.eye(3)[2], np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     around = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
     found: list[Floats] = []
@@ -75,7 +79,7 @@ def harmonic_fields(points: Floats, orders: int = 6, waves: int = 10) -> SmoothT
             add(power * np.cos(order * angle - phase), -power * np.sin(order * angle - phase),
                 0 * radius, order, 0)
     add(0 * radius, 0 * radius, np.ones_like(radius), 0, 0)
-    for wave in range(1, waves + 1 if np.ptp(z) else 1):
+    for wave in range(1, (in_plane if flat else waves) + 1):
         k = wave * np.pi / length
         for order in range(orders + 1):
             bessel, slope = special.iv(order, k * radius), special.ivp(order, k * radius)

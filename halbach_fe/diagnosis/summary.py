@@ -39,6 +39,7 @@ from halbach_fe.inference.result import (
     TRAINING,
     InferenceResult,
 )
+from halbach_fe.measurement.doubted_terms import factor_in_words
 from halbach_fe.study.model import Study
 
 STUDY_FILE = "study.diagnosed.toml"
@@ -284,7 +285,8 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
         found.append(OtherFinding(
             " and ".join(error.names), error.convention.text, "gross error",
             f"misfit {100 * error.misfit_before:.3g} % → {100 * error.misfit_after:.2g} %",
-            f"Gross error: {error.text}.", EMPTY_CELL if error.map is None else f"map {error.map}",
+            f"Gross error: {error.text}.{_or_a_factor(error)}",
+            EMPTY_CELL if error.map is None else f"map {error.map}",
             instead=", ".join(dict.fromkeys(instead)) or EMPTY_CELL))
     for pose in diagnosis.poses:
         others = "" if not pose.others else (
@@ -325,6 +327,12 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             f"The probe's positions{f' in {where}' if where else ''} have random errors of {size} "
             "along each axis.", where or EMPTY_CELL, noise.log_bayes_factor))
     return found
+
+
+def _or_a_factor(error: GrossError) -> str:
+    """Say which factor of all readings explains a map as well as points elsewhere; or nothing."""
+    said = factor_in_words(error.factor) if error.factor else ""
+    return said and f" Or, as well: {said[0].lower()}{said[1:]}"
 
 
 def _rows_in_words(rows: Sequence[int]) -> str:
@@ -394,7 +402,8 @@ def diagnosis_summary(
         "numerical": asdict(diagnosis.solver_error) if diagnosis.solver_error else None,
         "vibration": _vibration_entry(diagnosis.position_noise),
         "suspected": [_suspicion(one) for one in diagnosis.suspected],
-        "imitated": asdict(diagnosis.imitated) if diagnosis.imitated else None,
+        "imitated": {key: getattr(diagnosis.imitated, key) for key in (
+            "probability", "effects", "shares")} if diagnosis.imitated else None,
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
         "groups": {"before": _groups(diagnosis.groups_before),

@@ -61,8 +61,9 @@ MANY = 3
 SUSPECTED = 0.5
 """Probability from which an effect that is not certain enough to be named is suspected."""
 
-IMITATED = 0.1
-"""Probability of something that blocks imitate from which an update is called uncertain."""
+IMITATED = 0.2
+"""Expected chi-squared per parameter of an update's blocks, beyond that of their error bars, from
+which what they imitate has to be in the model: the mean is to be below 1.2."""
 
 
 @dataclass(frozen=True)
@@ -341,10 +342,8 @@ def suspicions(
     likeliest = int(np.argmax(odds))
     best_of = [max((number for number, one in enumerate(candidates) if one.effect == name),
                    key=lambda number: odds[number]) for name in named]
-    beside = [SelectedEffect(candidates[number], 0.0, 0.0, ()) for number in best.effects]
-    fitted = [amplitudes(search, [*beside, SelectedEffect(
-        candidates[number], float(odds[number] - competition.prior[number]),
-        float(odds[number]), ())]) for number in best_of if number not in search.rough]
+    fitted = [_beside(judgement, further, search, number)
+              for number in best_of if number not in search.rough]
     return (Suspicion(
         tuple(named), probability, search.hypotheses[likeliest], tuple(named.values()),
         float(odds[likeliest] - competition.prior[likeliest]),
@@ -353,34 +352,53 @@ def suspicions(
 
 
 def imitated(
-    judgement: Judgement, further: Further, update: InferenceResult, search: Search
+    judgement: Judgement, further: Further, update: InferenceResult, search: Search,
+    suspected: Sequence[Suspicion] = ()
 ) -> Imitation | None:
     """Return what may be missing that blocks imitate, so that an update is less sure than its bars.
 
     An effect J theta that the study lacks changes the posterior mean of the blocks by ``C H' J
     theta``, the chi-squared of which is ``theta' J' H C H' J theta``. What an effect changes of
-    the magnetizations themselves is no error of the update.
+    the magnetizations themselves is no error of the update, and what is suspected is in the study.
+    Of the rest, weighed with its probability, as much is returned as leaves less than `IMITATED`.
     """
     candidates, best = search.candidates, judgement.best
     if best.terms:
         return None
     beside = with_candidates(search.evidence, [candidates[k] for k in best.effects])
-    count, wrong = len(update.magnet.parameter_names), {}
+    count, expected = len(update.magnet.parameter_names), {}
+    known = {name for suspicion in suspected for name in suspicion.effects}
     for number in np.flatnonzero(further.probabilities > SHOWN_PROBABILITY).tolist():
         candidate, hypothesis = candidates[number], search.hypotheses[number]
-        if number in search.rough or candidate.is_binary:
+        if number in search.rough or candidate.is_binary or candidate.effect in known:
             continue
         fit = with_wide_priors(beside, [candidate]).fit(candidate.free)
         taken = search.absorbed[:, list(candidate.free)]
         chi2 = float(np.sum((taken @ fit.mean)**2) + np.sum((taken @ fit.covariance) * taken))
-        if chi2 > count and not _is_of_magnetizations(hypothesis, update.study):
-            wrong[number] = chi2 / count
-    by_name = further.by_effect(candidates, wrong)
-    probability = sum(by_name.values())
-    if probability < IMITATED:
+        if not _is_of_magnetizations(hypothesis, update.study):
+            expected[number] = float(further.probabilities[number]) * chi2 / count
+    rest, chosen = sum(expected.values()), []
+    for number in sorted(expected, key=lambda each: -expected[each]):
+        if rest < IMITATED:
+            break
+        chosen.append(number)
+        rest -= expected[number]
+    if not chosen:
         return None
-    shown = _together(by_name)
-    return Imitation(probability, tuple(shown), tuple(shown.values()))
+    named = further.by_effect(candidates, chosen)
+    return Imitation(sum(named.values()), tuple(named), tuple(named.values()), tuple(
+        _beside(judgement, further, search, number)[-1] for number in chosen))
+
+
+def _beside(
+    judgement: Judgement, further: Further, search: Search, number: int
+) -> tuple[IdentifiedEffect, ...]:
+    """Return the effects of the best explanation, and one more candidate, with their amplitudes."""
+    candidates, odds = search.candidates, further.odds[number]
+    return amplitudes(search, [
+        *(SelectedEffect(candidates[own], 0.0, 0.0, ()) for own in judgement.best.effects),
+        SelectedEffect(candidates[number], float(odds - judgement.competition.prior[number]),
+                       float(odds), ())])
 
 
 def _is_of_magnetizations(hypothesis: Hypothesis, study: Study) -> bool:

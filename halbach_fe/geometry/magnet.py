@@ -458,7 +458,7 @@ def _check_overlaps(
         if pair is not None:
             first, second = (blocks[number].name for number in pair[:2])
             raise StudyError(
-                f"Input `array` of study must leave blocks apart; instead blocks {first} and "
+                f"Input `array` of the study must leave blocks apart; instead blocks {first} and "
                 f"{second} overlap by at least {1e3 * pair[2]:.3g} mm{where}. Make the blocks "
                 "smaller, or move them apart.")
         reach = max(abs(end) for block in placed for end in (block.z_min, block.z_max))
@@ -466,6 +466,6 @@ def _check_overlaps(
         found = block_in_iron(blocks, solids, tolerance) if solids else None
         if found is not None:
             raise StudyError(
-                f"Input `iron` of study must leave the blocks room; instead block "
+                f"Input `iron` of the study must leave the blocks room; instead block "
                 f"{blocks[found[0]].name} and body {found[1] + 1} of iron overlap by at least "
                 f"{1e3 * found[2]:.3g} mm{where}. Move the iron away.")

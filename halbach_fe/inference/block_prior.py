@@ -25,7 +25,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
-from halbach_fe.core.numbers import MAD_TO_SD
+from halbach_fe.core.numbers import MAD_TO_SD, decimals
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
@@ -600,11 +600,14 @@ def _check_near(table: BlockTable, deviations: Floats) -> None:
     raise MeasurementError(must_be(
         f"moment of block {table.serial[row]}", table.source,
         f"within {100 * FAR:g} % of the study's nominal one",
-        f"{ratio:.3g} times as large, {angle:.3g} degrees away ({len(far)} such blocks)", hint))
+        f"{decimals(ratio)} times as large, {angle:.3g} degrees away ({len(far)} such blocks)",
+        hint))
 
 
 def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
-    """Raise a MeasurementError if a type has too few samples, or samples without any spread."""
+    """Raise a MeasurementError if a type has too few samples, samples without any spread, or the
+    same sample twice, whose spread is none of theirs.
+    """
     if len(deviations) < MIN_SAMPLES:
         raise MeasurementError(must_be(
             f"blocks of type {label}", table.source,
@@ -616,6 +619,17 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
         raise MeasurementError(must_be(
             f"blocks of type {label}", table.source, "different in every direction",
             f"the same moment {name} in all", "Was that component measured?"))
+    of_type = np.flatnonzero(np.array(table.type) == label)
+    moments = table.moment[of_type]
+    _, first = np.unique(moments, axis=0, return_index=True)
+    if len(first) < len(moments):
+        again = int(np.setdiff1d(np.arange(len(moments)), first)[0])
+        same = int(np.flatnonzero((moments == moments[again]).all(axis=1))[0])
+        raise MeasurementError(must_be(
+            f"blocks of type {label}", table.source, "measured one by one",
+            f"{len(moments) - len(first)} with the moment of another one, digit for digit, such as "
+            f"{table.serial[of_type[again]]} and {table.serial[of_type[same]]}",
+            "Leave the copies out."))
 
 
 OF_OTHER_RINGS = (

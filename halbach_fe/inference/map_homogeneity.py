@@ -173,7 +173,7 @@ def _fitted(
     """Return the homogeneity of the fit of some readings, and its noise over the stated noise.
 
     The third value is the end of a sentence about what the readings do not tell; if that is the
-    homogeneity, there is none.
+    homogeneity, there is none, and no noise if no reading is near enough.
     """
     observation, region = readings.observation, model.region
     centre = np.array(region.centre_m)
@@ -182,6 +182,10 @@ def _fitted(
     # a reading counts if all its sensors are near
     far = np.asarray(abs(operator) @ np.repeat(~near, 3).astype(float)).ravel() > 0
     used = np.flatnonzero(chosen & ~far)
+    if not len(used):
+        return None, np.nan, (f"has no readings within {1e3 * WITHIN * free_m:.3g} mm of the "
+                              "region's centre, where blocks and iron leave room for a fit: it "
+                              "does not tell how homogeneous the field is.")
     operator, sd = operator[used], readings.noise.sd[used]
     seen = np.unique(operator.indices // 3)
     columns = (3 * seen[:, None] + np.arange(3)).ravel()

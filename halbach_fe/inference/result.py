@@ -236,9 +236,9 @@ class Overlap:
     @property
     def disagreement(self) -> str:
         """A sentence if the two maps do not agree, else an empty string."""
-        where = (f"Where they overlap, map {self.name} is {1e3 * self.rms_T:.3g} mT rms off what "
-                 f"map {self.by} predicts (chi² per reading is {decimals(self.chi2)}, where 1 is "
-                 "expected")
+        where = (f"Where they overlap, map {self.name} is {decimals(1e3 * self.rms_T)} mT rms off "
+                 f"what map {self.by} predicts (chi² per reading is {decimals(self.chi2)}, where 1 "
+                 "is expected")
         if self.chi2 > self.limit:
             return (f"{where} and more than {self.limit:.2g} is rare): they are not of the same "
                     "magnet in the same state, or the pose, probe or noise of one of them is not "
@@ -710,6 +710,14 @@ class InferenceResult(ShownInNotebook):
                         "expected): sigma_T is too small, an effect is missing from the model, or "
                         f"these readings are not of this magnet.{unlike and f' {unlike}'}")
         return ""
+
+    @property
+    def common_factor(self) -> str:
+        """A sentence if the training readings are not those of this magnet but for a factor, which
+        all blocks would have to take; else nothing.
+        """
+        return self._unlike(~self.held_out) if any(
+            one.name == ALL_BLOCKS for one in self.doubts) else ""
 
     def _unlike(self, chosen: NDArray[np.bool_], doubted: bool = True) -> str:
         """Say that chosen readings, by a mask (n,), are not like the field that the prior predicts

@@ -202,10 +202,6 @@ def solid_harmonic_fields(points: Floats, degrees: int) -> Floats:
     return np.stack(columns, axis=2)
 
 
-ROUNDING = 1e-13
-"""Smallest penalty in units of the mean information per amplitude, so that maps without noise have
-positive definite matrices too."""
-
 PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
 """Penalties among which the evidence chooses, in units of the mean information per amplitude."""
 
@@ -252,7 +248,9 @@ class FreeField:
     """What the prior field of the charges leaves of readings: ``P = (1 + A A^T / penalty)^-1``.
 
     ``A`` (m, k) are the readings by amplitude, and ``penalty`` is the ratio of the variances of
-    noise and amplitudes. ``P`` follows from the smaller one of A A^T and A^T A, the ``gram``.
+    noise and amplitudes. ``P`` follows from the smaller one of A A^T and A^T A, the ``gram``. The
+    penalty is at least what rounding makes of it, so that maps without noise, and those that read
+    twice at a place, have positive definite matrices too.
     """
 
     def __init__(self, by_amplitude: Floats, penalty: float, gram: Floats | None = None,
@@ -261,8 +259,9 @@ class FreeField:
         self.dual = len(by_amplitude) <= by_amplitude.shape[1] if dual is None else dual
         tall = by_amplitude if self.dual else by_amplitude.T
         self.gram = tall @ tall.T if gram is None else gram
-        self.mean = float(np.trace(self.gram)) / by_amplitude.shape[1]
-        self.penalty = max(penalty, ROUNDING * self.mean)
+        trace = float(np.trace(self.gram))  # no eigenvalue is larger
+        self.mean, self.least = trace / by_amplitude.shape[1], 2 * np.finfo(float).eps * trace
+        self.penalty = max(penalty, self.least)
 
     def of_noise(self, penalty: float) -> FreeField:
         """Return the same for another penalty."""
@@ -273,7 +272,7 @@ class FreeField:
         `LEAST_KNOWN` of what is known before them.
         """
         values, vectors = linalg.eigh(self.gram, check_finite=False)
-        kept = values > LEAST_KNOWN * max(penalty, ROUNDING * self.mean)
+        kept = values > LEAST_KNOWN * max(penalty, self.least)
         if not self.dual:
             return np.asarray(vectors[:, kept])
         return np.asarray(self.by_amplitude.T @ (vectors[:, kept] / np.sqrt(values[kept])))

@@ -706,7 +706,8 @@ def scan_of(
     usable &= ~rough
     off, sd = quadratic_residual(points[usable], field[usable])
     scatter = scatter_around(points, points[usable], off / sd[:, None])
-    return Scan(points, field, _time(data, len(points)), motion(points), scatter), usable, broken
+    time = _time(data, len(points))
+    return Scan(points, field, time, motion(points, time), scatter), usable, broken
 
 
 # --- orientation --------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.core.numbers import MAD_TO_SD
+from halbach_fe.core.numbers import MAD_TO_SD, decimals
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
@@ -337,7 +337,8 @@ def _refuse_disobedient(name: str, check: MapCheck) -> None:
     if not check.suffices or not check.obeys or check.is_displaced:
         raise MeasurementError(must_be(
             f"map '{name}'", "the maps that are joined", "one that obeys Maxwell's equations by "
-            "itself", f"one of which held-out lines are off by {1e3 * check.floor_rms_T:.3g} mT rms"
+            "itself",
+            f"one of which held-out lines are off by {decimals(1e3 * check.floor_rms_T)} mT rms"
             if check.suffices else "one with too few readings to tell",
             "Look at `halbach-fe check` of this map alone: rows that were shuffled, or columns "
             "that are not what they say."))
@@ -373,8 +374,8 @@ def _contradiction(name: str, off_T: float, noise_T: float) -> MeasurementError:
             "in the magnet by `halbach-fe register`."))
     return MeasurementError(must_be(
         f"map '{name}'", "the maps that are joined", "one that overlaps another one of the same "
-        "magnet", f"one whose readings are off those of the others by {1e3 * off_T:.3g} mT in "
-        f"the place where they fit best, of which noise explains {1e3 * noise_T:.3g} mT",
+        "magnet", f"one whose readings are off those of the others by {decimals(1e3 * off_T)} mT "
+        f"in the place where they fit best, of which noise explains {decimals(1e3 * noise_T)} mT",
         "It is of another magnet, mirrored (a position axis counts backwards), was changed, or no "
         "other map reaches into it: such maps can be joined by the magnet only, with `halbach-fe "
         "register`."))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -73,12 +75,25 @@ def _regions(points: Floats) -> Ints:
     return number
 
 
-def motion(points: Floats) -> Floats:
+def is_sorted(points: Floats) -> bool:
+    """Tell whether points (n, 3) are sorted by their coordinates, upwards, in whatever order of
+    the axes; a stage that moves to and fro reads none in such an order.
+    """
+    return any((np.lexsort(points[:, axes].T) == np.arange(len(points))).all()
+               for axes in permutations(range(3)))
+
+
+def motion(points: Floats, time: Floats | None = None) -> Floats:
     """Return the unit vectors (n, 3) along which a stage came to each of its points (n, 3).
 
-    The points are in the order of the scan. The vectors are 0 for the first point of a line, where
-    the stage has stopped. Repeated readings at a point have that of the first one.
+    The points are in the order of the scan, unless times (n,) tell another one. The vectors are 0
+    for the first point of a line, where the stage has stopped. Repeated readings at a point have
+    that of the first one.
     """
+    if time is not None:
+        order, found = np.argsort(time, kind="stable"), np.empty(points.shape)
+        found[order] = motion(points[order])
+        return found
     # Length of a step, relative to the next one along its line, beyond which it is a jump: some
     # rows of a line may be missing, and points are farther apart where the field is smooth.
     jump = 5.0

@@ -29,23 +29,35 @@ A single spike is 2 to 4 times as far off its own as off theirs."""
 
 
 def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
-    """Return the rows that are zero, or repeat the row before them at another position.
-
-    Where the field is uniform, rounded readings repeat by chance. How often all three components do
-    is estimated from rows that repeat only two: they are times the odds that the third one repeats,
-    which rows tell that repeat one of the two. Repetitions count only if there are more.
+    """Return the rows that are zero, or repeat the row before them at another position, or another
+    row at their own position (``copied``).
     """
     zero = (field == 0).all(axis=1)
     alike = field[1:] == field[:-1]
     moved = (points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
-    repeated = np.zeros(len(field), bool)
-    repeated[1:] = alike.all(axis=1) & moved
-    by_chance = max(_all_alike_by_chance(alike[moved][:, order])
-                    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]))
-    if repeated.any() and gammainc(repeated.sum(), by_chance) > CHANCE:  # of Poisson's distribution
-        repeated[:] = False
+    repeated, copied = np.zeros(len(field), bool), np.zeros(len(field), bool)
+    repeated[1:] = _no_chance(alike, moved)
+    order = np.lexsort(np.hstack([field, points]).T)  # copies follow each other, in their order
+    there = (points[order[1:]] == points[order[:-1]]).all(axis=1) & ~zero[order[1:]]
+    copied[order[1:]] = _no_chance(field[order[1:]] == field[order[:-1]], there)
     return {name: (1 + np.flatnonzero(rows)).tolist()
-            for name, rows in (("zero", zero), ("repeated", repeated)) if rows.any()}
+            for name, rows in (("zero", zero), ("repeated", repeated), ("copied", copied))
+            if rows.any()}
+
+
+def _no_chance(alike: NDArray[np.bool_], pairs: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pairs (n,) of rows have all components (n, 3) alike; none if that is chance.
+
+    Where the field is uniform, rounded readings repeat by chance. How often all three components do
+    is estimated from pairs that repeat only two: they are times the odds that the third one
+    repeats, which pairs tell that repeat one of the two. Repetitions count only if there are more.
+    """
+    found = alike.all(axis=1) & pairs
+    by_chance = max(_all_alike_by_chance(alike[pairs][:, order])
+                    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]))
+    if found.any() and gammainc(found.sum(), by_chance) > CHANCE:  # of Poisson's distribution
+        found[:] = False
+    return found
 
 
 def contradicted_rows(data: xr.Dataset) -> tuple[int, ...]:

@@ -200,11 +200,15 @@ class Campaign:
                      if answer.numbers), ())
 
     def _gist(self) -> str:
-        """Say in a sentence each what is known of the magnet and of its map; empty without."""
+        """Say what is known of the magnet and, if large type has room for it, of its map; empty
+        without either.
+        """
         changed = [answer for _, answer in self._used("diagnose") if answer.changes_study]
         magnet = changed[-1:] or [answer for _, answer in self._used("infer")[-1:]]
         of_map = [answer for _, answer in self._used("check", "register")[-1:]]
-        return " ".join(one.headline for one in magnet + of_map)
+        said = [one.headline for one in magnet + of_map]
+        both = Answer("", "", "", "", gist=" ".join(said), numbers=self._numbers())
+        return both.gist if both.headline == both.gist else said[0]
 
     def lead(self) -> Picture | None:
         """Return the picture that says most of all: of the region, or of the last update."""

@@ -12,7 +12,6 @@ from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, MAX_EFFECTS
 from halbach_fe.diagnosis.result import (
     Diagnosis,
     IdentifiedEffect,
-    Imitation,
     Suspicion,
     UnknownCause,
     UnknownPart,
@@ -202,8 +201,9 @@ def answer(diagnosis: Diagnosis) -> Answer:
     only_suspected = diagnosis.suspected and not diagnosis.identified
     sound = not (diagnosis.unknown or only_suspected or diagnosis.solver_error or _fails(
         diagnosis) or diagnosis.after.held_out_conflict or _is_restless(diagnosis))
-    if diagnosis.imitated is not None:
-        doubts.append(_imitated_in_words(diagnosis.imitated, catalogue_titles(diagnosis)))
+    imitation = _imitated_in_words(diagnosis)
+    if imitation and not _has_imitated(diagnosis):
+        doubts.append(imitation)
     if diagnosis.identified and doubts:
         # besides how well the model fits now, and error bars that are too wide
         doubtful = len(doubts) > 1 + bool(diagnosis.after.too_near)
@@ -217,11 +217,19 @@ def answer(diagnosis: Diagnosis) -> Answer:
         doubts[0] = f"{verdict}. {doubts[0]}"
     if exchanged := _also_possible(diagnosis):
         doubts.append(exchanged)
+    if imitation and _has_imitated(diagnosis):
+        doubts.append(imitation)
     if not diagnosis.identified:
         doubts.insert(0, _trust(diagnosis, sound))
     remedies = _remedies(diagnosis) if sound else []
+    step = _next(diagnosis)
+    factor = "" if diagnosis.gross_errors else diagnosis.before.common_factor
+    if factor and (not sound or _unusual(diagnosis)):
+        found.insert(0, factor)
+        step = ("Look at the unit, the sign and the factor of the readings and at the remanence "
+                "first, correct the map or the study, and diagnose again.", _again(diagnosis))
     return Answer("What does the study lack?", " ".join(found), " ".join(doubts) or _trust(
-        diagnosis, sound), *_next(diagnosis), sound, "" if not remedies else (
+        diagnosis, sound), *step, sound, "" if not remedies else (
             f"The magnet was not assembled as designed: {in_a_row(remedies)}, or use "
             f"{STUDY_FILE}, which describes it with these errors."),
         diagnosis.found_anything, numbers=distances(diagnosis.before, diagnosis.after))
@@ -230,7 +238,7 @@ def answer(diagnosis: Diagnosis) -> Answer:
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     """Say whether an answer without named effects can be trusted."""
     chi2 = f"chi² per training reading is {decimals(diagnosis.after.prior_conflict)}"
-    if sound and diagnosis.imitated is not None:
+    if sound and diagnosis.imitated is not None and not _has_imitated(diagnosis):
         return ("Only as far as this map shows: the readings are explained to their noise, with "
                 "the blocks' tolerances integrated out.")
     if sound:
@@ -249,12 +257,18 @@ def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     return f"No: {chi2}."
 
 
+def _again(diagnosis: Diagnosis) -> str:
+    """Return the command that diagnoses again."""
+    maps = "" if diagnosis.before.is_campaign else " --measurements MAP"
+    return f"halbach-fe diagnose STUDY{maps} -o DIR"
+
+
 def _next(diagnosis: Diagnosis) -> tuple[str, str]:
     """Return the next step, and its command."""
     campaign = diagnosis.before.is_campaign
     maps = "" if campaign else " --measurements MAP"
     infer = f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR"
-    again = f"halbach-fe diagnose STUDY{maps} -o DIR"
+    again = _again(diagnosis)
     if diagnosis.solver_error:
         return "Refine `mesh` or move `open_boundary` outwards, and diagnose again.", again
     if diagnosis.unknown is not None:
@@ -290,6 +304,9 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
                        f"stays as it is, update it with {STUDY_FILE}, the study with what was "
                        "found.")
         return f"{changed} {suspicions}".strip(), infer
+    if _has_imitated(diagnosis):
+        return (f"Update the magnet with {STUDY_FILE}, the study with what blocks may imitate.",
+                infer)
     these = "these maps" if diagnosis.after.is_campaign else "this map"
     return f"Update the magnet with {these}.", f"halbach-fe infer STUDY{maps} -o DIR"
 
@@ -314,16 +331,25 @@ def _remedies(diagnosis: Diagnosis) -> list[str]:
             for effect in diagnosis.identified if effect.hypothesis.effect.name in REMEDIES]
 
 
-def _imitated_in_words(imitation: Imitation, titles: dict[str, str]) -> str:
-    """Say what may be missing that no reading shows."""
-    least_share = 0.02  # probability from which something that may be missing is listed
-    parts = [f"{title_of(name, titles)} {100 * share:.0f} %" for name, share in zip(
-        imitation.effects, imitation.shares, strict=True) if share >= least_share]
-    return (f"With a probability of {100 * imitation.probability:.0f} % something is missing that "
-            "no reading shows, as the blocks imitate it"
-            f"{f' ({in_a_row(parts)})' if parts else ''}: the blocks of an update are then off by "
-            "more than their error bars. What is possible belongs into the study as [[uncertain]] "
-            "or [instrument_sd].")
+def _has_imitated(diagnosis: Diagnosis) -> bool:
+    """Tell whether the diagnosed study has all that blocks may imitate as uncertain numbers."""
+    fitted = () if diagnosis.imitated is None else diagnosis.imitated.fitted
+    return bool(fitted) and all(is_uncertain(diagnosis.study, one) for one in fitted)
+
+
+def _imitated_in_words(diagnosis: Diagnosis) -> str:
+    """Say what may be missing that no reading shows; nothing if that is negligible."""
+    imitation, titles = diagnosis.imitated, catalogue_titles(diagnosis)
+    if imitation is None:
+        return ""
+    parts = [f"{title_of(name, titles)} {decimals(100 * share)} %" for name, share in zip(
+        imitation.effects, imitation.shares, strict=True)]
+    return (f"With a probability of {decimals(100 * imitation.probability)} % something is missing "
+            f"that no reading shows, as the blocks imitate it ({in_a_row(parts)}): "
+            "the blocks of an update without it are then off by more than their error bars. "
+            + (f"{STUDY_FILE} has it as uncertain about 0: an update with that study is right "
+               "whether it is there or not." if _has_imitated(diagnosis) else
+               "What is possible belongs into the study as [[uncertain]] or [instrument_sd]."))
 
 
 def _also_possible(diagnosis: Diagnosis) -> str:
@@ -458,9 +484,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
         sentences.append(
             f"{in_a_row(sources).capitalize()} may be how the neighbouring magnet differs from a "
             "copy of this one, which its model is.")
-    unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} ({ratio:.0f} times)"
-               for effect in diagnosis.identified
-               if (ratio := _over_prior_sd(effect)) > UNUSUAL_AMPLITUDE]
+    unusual = [f"{title_of(effect.hypothesis.effect.name, titles)} "
+               f"({_over_prior_sd(effect):.0f} times)" for effect in _unusual(diagnosis)]
     if unusual:
         sentences.append(
             "Far larger than usual (relative to the prior's standard deviation): "
@@ -513,6 +538,11 @@ def _over_prior_sd(identified: IdentifiedEffect) -> float:
     first = int(effect.is_binary or effect.applied_in_full)
     return max((abs(value) / parameter.sd for value, parameter in zip(
         identified.values[first:], identified.parameters[first:], strict=True)), default=0.0)
+
+
+def _unusual(diagnosis: Diagnosis) -> list[IdentifiedEffect]:
+    """Return the effects that are far larger than their priors expect."""
+    return [each for each in diagnosis.identified if _over_prior_sd(each) > UNUSUAL_AMPLITUDE]
 
 
 def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:

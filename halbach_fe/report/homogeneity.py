@@ -110,7 +110,7 @@ def answer(found: HomogeneityResult) -> Answer:
 
 def _better_design(study: Study, rms_ppm: float) -> tuple[str, str]:
     """Say what to do about the deviation of a magnet as designed, and the command for it."""
-    part = f"A deviation of {1e-4 * rms_ppm:.2g} % is that of the "
+    part = f"A deviation of {decimals(1e-4 * rms_ppm, 2)} % is that of the "
     tray = "Small magnets in a tray cannot make up for it."
     if obstacle(study) is not None:  # halbach-fe design would refuse this magnet
         return (f"{part}magnet as designed, not of its errors: move its blocks, or look at a "

@@ -97,7 +97,7 @@ def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
     return [{
         "map": each.name, "as predicted by map": each.by,
         "readings": f"{each.readings}{' held out' if each.held_out else ''}",
-        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "chi²/reading": decimals(each.chi2),
+        "rms difference": f"{decimals(1e3 * each.rms_T)} mT", "chi²/reading": decimals(each.chi2),
         "verdict": "they disagree" if each.disagreement else "they agree"}
         for each in result.overlaps]
 
@@ -106,7 +106,8 @@ def left_out_table(result: InferenceResult) -> list[dict[str, str]]:
     """Return rows of text: how maps, or ends of the only one, are predicted that were left out."""
     return [{
         "left out": each.name or "ends of the map", "readings": str(each.readings),
-        "rms difference": f"{1e3 * each.rms_T:.3g} mT", "over noise": decimals(each.over_noise),
+        "rms difference": f"{decimals(1e3 * each.rms_T)} mT",
+        "over noise": decimals(each.over_noise),
         "chi²/reading": decimals(each.chi2)} for each in result.regions_left_out]
 
 

@@ -250,8 +250,9 @@ def _blocks(result: InferenceResult, start: str = (
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
     start = f"{start} by {fraction(_rms(mean))} rms, the most {place_of(block)}"
     if result.disagreement:  # error bars that are not to be used are not stated
+        sign = "" if mean[worst] < 0 else "+"
         return (f"{start}, which seems to be missing or reversed." if mean[worst] < -1 else
-                f"{start} by {100 * mean[worst]:+.2g}\u00a0%.")
+                f"{start} by {sign}{decimals(100 * mean[worst], 2)}\u00a0%.")
     if mean[worst] < -1:
         return (f"{start}, which is reversed: magnetized the other way round, with "
                 f"{with_error(-100 * (1 + mean[worst]), 100 * sd)}\u00a0% of its strength.")

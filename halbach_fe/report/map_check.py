@@ -13,6 +13,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import SCATTERED_M, VIOLATED, MapCheck, Reach, inner, oriented
 from halbach_fe.measurement.map_join import JoinedMaps, MapPose
+from halbach_fe.measurement.scan_lines import is_sorted
 from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -110,7 +111,7 @@ def _trust(check: MapCheck) -> str:
             f"off by {decimals(reach.times, 2)} times what noise and scattered positions make: "
             "either the field is steeper there than the lines show, as near edges of magnets, or "
             "these readings are wrong. An update of the magnet tells which."
-            + (" DIR/inner_map.csv is the map without them."
+            + (" inner_map.csv beside this page is the map without them."
                if np.isfinite(reach.limit_m) else ""))
     return trust
 
@@ -263,6 +264,7 @@ def _numbers(rows: Sequence[int]) -> str:
 
 BROKEN = {"zero": "all components are zero",
           "repeated": "the readings are those of the row before, at another place",
+          "copied": "another row at the same place again, digit for digit",
           "spike": "far off the field of all others"}
 
 
@@ -270,9 +272,9 @@ def verdict(check: MapCheck) -> str:
     """Return the answer in a sentence, which begins with whether the map passes."""
     if check.is_too_coarse:
         return ("Neither passed nor failed. The map cannot tell: with a spacing of "
-                f"{1e3 * check.spacing_m:.3g} mm the field changes more from point to point than "
-                "its neighbours show: what a field without sources leaves of it changes sign from "
-                "each reading to the next.")
+                f"{decimals(1e3 * check.spacing_m)} mm the field changes more from point to point "
+                "than its neighbours show: what a field without sources leaves of it changes sign "
+                "from each reading to the next.")
     if not check.suffices:
         return ("Neither passed nor failed. The map cannot tell: "
                 f"{100 * (1 - check.redundancy):.0f}\u00a0% of its readings are needed to describe "
@@ -303,7 +305,7 @@ def verdict(check: MapCheck) -> str:
 
 def _where(check: MapCheck, reach: Reach) -> str:
     """Describe the region in which held-out lines are predicted."""
-    limit = f"{1e3 * reach.limit_m:.3g}\u00a0mm"
+    limit = f"{decimals(1e3 * reach.limit_m)}\u00a0mm"
     if reach.along == "r":
         return (f"within {limit} of the line through the middle of the map along "
                 f"{check.windows[0]}")
@@ -386,6 +388,13 @@ def weighted_note(check: MapCheck) -> str:
             "of the map as it is given, where every reading counts alike.")
 
 
+OF_SORTED_ROWS = (
+    "The map states no times, and its rows are sorted by their coordinates. If that is not the "
+    "order in which they were read, it does not tell whether the probe lags behind the stage, nor "
+    "what changed during the scan: keep the rows as they were read, or a column time_s.")
+"""What is said of a map whose rows may have lost their order."""
+
+
 def page(data: xr.Dataset, check: MapCheck) -> Page:
     """Return the page of the check of a map, and the maps that are made of it."""
     points, found, rows = points_of(data), sentences(check), residual_table(check)
@@ -396,14 +405,16 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
     left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
     even = ("Noise alone would be about as large everywhere; here it is not alone"
             if check.uneven is not None else "Noise is about as large everywhere")
+    if "time_s" not in data and is_sorted(points):
+        found.append(OF_SORTED_ROWS)
     return Page(
         "check", TITLE, None, answer(check), check_summary(data, check), [
             Section([*([Items(found)] if found else []), Text(
                 f"{check.readings} readings at {check.points} points, "
-                f"{1e3 * check.spacing_m:.3g} mm apart. No magnet is assumed: the map is compared "
-                "with the field of sources outside the mapped region. A map by itself cannot show "
-                "a common factor or sign of all components, a uniform offset, a shift of the whole "
-                "map, or a position axis that counts backwards.", "small")]),
+                f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "
+                "compared with the field of sources outside the mapped region. A map by itself "
+                "cannot show a common factor or sign of all components, a uniform offset, a shift "
+                "of the whole map, or a position axis that counts backwards.", "small")]),
             Section([Table(rows, "numbers"), *(Text(text, "small") for text in [
                 weighted_note(check)] if text)], "What remains"),
             Section(["Distances of the sensors are along the axes of the stage, and turns of the "

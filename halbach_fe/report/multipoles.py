@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from halbach_fe.api import MultipoleTables
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import atomic
+from halbach_fe.core.numbers import in_a_row
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
@@ -30,7 +32,15 @@ from halbach_fe.report.page import (
     page_of,
 )
 from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
-from halbach_fe.response.multipoles import MultipoleModel, Multipoles, met, plain, text_table
+from halbach_fe.response.multipoles import (
+    DEFAULT_ORDERS,
+    UNITS,
+    MultipoleModel,
+    Multipoles,
+    met,
+    plain,
+    text_table,
+)
 from halbach_fe.study.model import Study
 
 MultipoleTable = tuple[MultipoleModel, Mapping[str, Multipoles]]
@@ -59,10 +69,13 @@ def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, o
             "nominal_main": model.nominal_main, "main_unit": model.unit}
 
 
-def reference_text(model: MultipoleModel, study: Study) -> str:
+def reference_text(model: MultipoleModel, study: Study, absolute: bool = False) -> str:
     """Return sentences that state the reference and the convention of multipoles, and which orders
-    of the magnet as designed are higher than those of the table.
+    of the magnet as designed are higher than those of the table. ``absolute`` ones have no units
+    of the main multipole.
     """
+    units = (f"m{model.unit}, as there is no main multipole" if absolute else
+             "units of 1e-4 of the main multipole")
     own = [model.main + count for count in study.array.blocks_by_ring]
     higher = "" if study.array.free_blocks or min(own) <= max(model.orders) else (
         f" The lowest unwanted order of rings as designed is {min(own)}, not in the table.")
@@ -70,14 +83,16 @@ def reference_text(model: MultipoleModel, study: Study) -> str:
              else "of the cross-section" if model.z is None
              # the middle of a magnet is 0 to rounding
              else f"at z = {1e3 * round(model.z, 9):.4g} mm (Fourier coefficients of B_r)")
-    return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in units "
-            f"of 1e-4 of the main multipole (order {model.main}; European convention, order 1 is "
+    return (f"Multipoles {where}, at the reference radius of {1e3 * model.radius:.4g} mm, in "
+            f"{units} (order {model.main}; European convention, order 1 is "
             "the dipole). b_n and a_n are the normal and the skew one of order n, in axes turned "
             "about z such that the main multipole of the nominal magnet is normal."
             f"{higher}")
 
 
-def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> Figure:
+def multipole_figure(
+    magnets: Mapping[str, Multipoles], limit: float | None, unit: str = "units of 1e-4",
+) -> Figure:
     """Draw b_n and a_n of magnets by name, with error bars of two standard deviations."""
     figure = figure_of(3.8)
     axes = figure.subplots(1, 2, sharey=True)
@@ -95,7 +110,7 @@ def multipole_figure(magnets: Mapping[str, Multipoles], limit: float | None) -> 
                          label="limit of |c_n|" if sign > 0 else None)
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("units of 1e-4")
+    axes[0].set_ylabel(unit)
     if limit is not None or len(magnets) > 1 or "" not in magnets:
         legend_above(figure, axes[1], columns=4)
     return figure
@@ -202,6 +217,7 @@ def answer(
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
+    said += only_of_orders(tables[0][0])
     lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
     if all(lacking):
         return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY")
@@ -260,6 +276,20 @@ def of_no_main(question: str, said: str, trust: str, command: str) -> Answer:
         f"halbach-fe {command} --at-z-m Z -o DIR", sound=False)
 
 
+def _absolute(known: Multipoles) -> Multipoles:
+    """Return multipoles in mT, or mT m if integrated, instead of units of the main one."""
+    each = 1e3 * known.main / UNITS
+    return replace(known, mean=each * known.mean, root=each * known.root,
+                   error=each * known.error)
+
+
+def only_of_orders(model: MultipoleModel) -> str:
+    """Say of which orders multipoles are, if not of all that are given without being asked for."""
+    if {*DEFAULT_ORDERS} - {model.main} <= {*model.orders}:
+        return ""
+    return f" Only order {in_a_row([str(order) for order in model.orders])} was asked for."
+
+
 def lacks_main(known: Multipoles) -> bool:
     """Tell whether the main multipole is 0 within its error, as of an undulator along its axis.
 
@@ -316,24 +346,29 @@ def page(found: MultipoleTables) -> Page:
     """Return the page of the multipoles of a magnet."""
     study, tables = found.magnet.study, found.tables
     files = [f"multipoles_{_location(model)}.png" for model, _ in tables]
-    rows = [multipole_rows(magnets) for _, magnets in tables]
+    lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
+    shown = [{name: _absolute(known) if lacks else known for name, known in magnets.items()}
+             for (_, magnets), lacks in zip(tables, lacking, strict=True)]
+    units = [f"m{model.unit}" if lacks else "units of 1e-4"
+             for (model, _), lacks in zip(tables, lacking, strict=True)]
+    rows = [multipole_rows(magnets) for magnets in shown]
     sections = [Section([
-        f"{reference_text(model, study)} ± is the standard deviation, including the error of the "
-        "solver; |c_n| is the size of b_n and a_n together.", Table(table, "numbers"),
+        f"{reference_text(model, study, lacks)} ± is the standard deviation, including the error "
+        "of the solver; |c_n| is the size of b_n and a_n together.", Table(table, "numbers"),
         Drawn(file)], _location(model).capitalize())
-        for (model, _), table, file in zip(tables, rows, files, strict=True)]
+        for (model, _), lacks, table, file in zip(tables, lacking, rows, files, strict=True)]
     return Page(
         "multipoles", "multipoles", study,
         answer(tables, found.limit, found.disagreement, faults_in_words(study)),
         _summary(study, tables, found.limit),
         [*sections, Section([*found.left_out, *linearized(study)])],
-        {"Multipoles in units of 1e-4, " + (
+        {f"Multipoles in {unit}, " + (
             "integrated along z" if model.integrated else
             "of the cross-section" if model.z is None else f"on {place_of(model)}"): table
-         for (model, _), table in zip(tables, rows, strict=True)},
+         for (model, _), unit, table in zip(tables, units, rows, strict=True)},
         figures={file: (
-            partial(multipole_figure, magnets, found.limit), "Unwanted multipoles, normal (left) "
-            "and skew (right); bars are two standard deviations")
-            for file, (_, magnets) in zip(files, tables, strict=True)},
+            partial(multipole_figure, magnets, None if lacks else found.limit, unit),
+            "Unwanted multipoles, normal (left) and skew (right); bars are two standard deviations")
+            for file, magnets, lacks, unit in zip(files, shown, lacking, units, strict=True)},
         shown=tuple(files),
         files={"multipoles.csv": partial(write_multipole_csv, study, tables)})

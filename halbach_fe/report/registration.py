@@ -155,12 +155,8 @@ def answer(
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{own} -o DIR")), sound=sound,
         changes_study=not _is_as_assumed(best, assumed or Instrument()), gist="" if not sound else
-        f"{f'Map {name}' if name else 'The map'} lies at ({_in_mm(best)}) mm in the magnet.")
-
-
-def _in_mm(best: Registration) -> str:
-    """Return where the middle of a map lies, in mm and without error bars."""
-    return ", ".join(f"{1e3 * value:.3f}" for value in best.middle_m.round(6) + 0.0)
+        f"By the coordinates of {f'map {name}' if name else 'the map'}, the middle of the magnet "
+        f"is at {_magnet_on_stage(best)}.")
 
 
 def is_sound(best: Registration) -> bool:
@@ -186,8 +182,10 @@ def _doubts(best: Registration) -> list[str]:
     """Say what lies far from its prior, and what a common factor of the readings tells."""
     if not best.doubts:
         return []
-    return [each for each in (doubts_in_words(best.doubts),
-                              factor_in_words(best.factor, best.likeness)) if each]
+    factor = factor_in_words(best.factor, best.likeness)
+    if _are_alike(best) and not (best.explains or known_factor(best.factor)):
+        factor = ""  # where no pose explains the map, a factor is that of a wrong place
+    return [each for each in (doubts_in_words(best.doubts), factor) if each]
 
 
 def _are_alike(best: Registration) -> bool:
@@ -208,7 +206,8 @@ def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
         return (f"Is the component really B{_measured(best)[0]}, along the map's own axes? If that "
                 f"is not certain, name its column {UNDIRECTED_COLUMN} (import-map: --component "
                 "unknown), and register finds which one it is.", again)
-    if _are_alike(best) and factor_in_words(best.factor):
+    if _are_alike(best) and factor_in_words(best.factor) and (
+            best.explains or known_factor(best.factor)):
         return ("Look at the unit, the sign and the factor of the readings, correct the map (or "
                 "instrument.flux_density_unit_T in the study), and register it again.", again)
     return ("Look whether rows, axes, components and units of the map are what its columns say "
@@ -525,6 +524,7 @@ def page(
         data = directed(data, best.component)
         files = {MAP_FILE: partial(write_map, data)}
     updated = ", or the blocks as the maps before have updated them" if name else ""
+    most_turned = 4  # poses beside each other on a page
     doubts = doubt_table(best)
     return Page(
         "register", f"where {'map ' + name if name else 'the map'} lies in the magnet", study,
@@ -540,7 +540,8 @@ def page(
             Section([Table(doubts)] if doubts else [], "Far from what was known before"),
             Section(["The pose is where the middle of the map lies in the magnet, and how the map "
                      "is turned about the axes of the magnet, once its own axes were put along "
-                     "those above.", Table(places, "numbers")]),
+                     "those above.", Table(
+                         places, "turned" if len(places) <= most_turned else "numbers")]),
             Section(["± is the standard deviation: rms over all terms of a kind. “Bx sees By” is "
                      "the angle by which the Bx sensor is turned towards y. A sensor's place is "
                      "from the probe's own point.", Table(probe_table(best))],

@@ -18,6 +18,7 @@ from halbach_fe.report.multipoles import (
     lacks_main,
     main_in_words,
     of_no_main,
+    only_of_orders,
     reference_summary,
     reference_text,
 )
@@ -112,6 +113,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
         said = (f"{made}{said[0].lower() if made else said[0]}{said[1:]} That is the magnet as "
                 f"designed ({decimals(ordered)} units with blocks as ordered), to which their "
                 "tolerances add little.")
+    said += only_of_orders(found.model)
     share = found.share
     if share is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "

@@ -48,6 +48,7 @@ from halbach_fe.solver.separate_blocks import (
     solve_separate,
 )
 from halbach_fe.solver.session import NOT_KEPT, Session
+from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.solver import CELLS_PER_SIDE
 
@@ -492,7 +493,7 @@ def check_points(
     -----
     HalbachWarning
         If points are on a face, so far away that they may be in mm, or so near to the outer
-        boundary that its condition affects their field.
+        boundary that its condition affects their field; if iron does not answer to external fields.
     """
     if magnet.dimension == 2 and np.ptp(points[:, 2]) > 0:
         raise StudyError(
@@ -512,7 +513,8 @@ def check_points(
     route = choose_route(magnet, points)
     # only meshes have a boundary, beyond which the solve refuses points
     mesh = None if magnet.is_vacuum and magnet.study.solver.method == "reaction" else route.mesh
-    for remark in (places.on_faces(), places.far_away() if mesh is None else None):
+    for remark in (places.on_faces(), places.far_away() if mesh is None else None,
+                   _external_past_iron(magnet, points, route)):
         if remark is not None:
             warnings.warn(remark, HalbachWarning, stacklevel=2)
     if mesh is None:
@@ -535,6 +537,16 @@ def check_points(
                 f"{z:g}) m. Enlarge `open_boundary` of study {magnet.name}.", HalbachWarning,
                 stacklevel=2)
     return points
+
+
+def _external_past_iron(magnet: Magnet, points: Floats, route: Route) -> str | None:
+    """Return the sentence about an external field that iron does not answer to, None without."""
+    if not magnet.iron or magnet.external == External() or not len(points) or (
+            route is Route.MOMENTS and external_acts(magnet)):
+        return None
+    size = np.linalg.norm(external_field(magnet, points), axis=1).max()
+    return (f"The field of `external`, up to {1e3 * size:.3g} mT at the points, is added as if the "
+            f"iron of study {magnet.name} were not there. Iron may change it by as much as it is.")
 
 
 def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:

@@ -228,7 +228,12 @@ def _hdf5(path: Path, where: str) -> _Content:
 
 
 def _check_columns(header: Sequence[str], where: str) -> None:
-    """Refuse unknown and repeated columns."""
+    """Refuse unknown and repeated columns, and tables of something else."""
+    if "serial" in header and "mx_A_m2" in header:
+        raise StudyError(must_be(
+            "header", where, "that of where blocks are", "a table of measured moments",
+            "Give it to halbach-fe prior, infer or sort, beside the study of the magnet; "
+            "halbach-fe export STUDY --format blocks writes a table of where its blocks are."))
     for number, name in enumerate(header, start=1):
         if name in COLUMNS:
             if header.index(name) < number - 1:

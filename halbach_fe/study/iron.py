@@ -14,7 +14,7 @@ from halbach_fe.study.types import (
     Gap,
     Length,
     Line,
-    Point,
+    Places,
     Rotation,
     StudyModel,
     crossing,
@@ -142,7 +142,7 @@ class PlacedIron(StudyModel):
     the magnet. Either ``relative_permeability`` or ``curve`` replaces the material of all bodies.
     """
 
-    centre_m: Point = (0.0, 0.0, 0.0)
+    centre_m: Places = (0.0, 0.0, 0.0)
     rotation_deg: Rotation = (0.0, 0.0, 0.0)
     relative_permeability: RelativePermeability | None = None
     curve: IronCurve | None = None

@@ -8,7 +8,6 @@ from __future__ import annotations
 import difflib
 import math
 import types
-import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -222,6 +221,9 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
         advice = f"Did you mean '{near[0]}'?" if near else ""
         if kind == "union_tag_not_found":
             advice = f"Add the key, as one of {', '.join(map(repr, tags))}."
+    elif kind == "model_type" and isinstance(value, list) and all(
+            isinstance(one, dict) for one in value):
+        advice = f"Write [{key}] for [[{key}]], and all keys in that one table."
     elif kind == "tuple_type" and isinstance(value, dict) and _holds_tables(model, first["loc"]):
         advice = f"Write [[{key}]] for [{key}], and once more for each further one."
     else:
@@ -232,9 +234,7 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
 def _holds_tables(model: type[BaseModel] | None, location: tuple[int | str, ...]) -> bool:
     """Return whether a key of a model is a list of tables."""
     field = model.model_fields.get(str(location[-1])) if model else None
-    return field is not None and any(
-        isinstance(item, type) and issubclass(item, BaseModel)
-        for item in typing.get_args(field.annotation))
+    return field is not None and any(map(_models_in, get_args(field.annotation)))
 
 
 def _more(errors: list[Any]) -> str:

@@ -9,6 +9,7 @@ import argparse
 import json
 import os
 import shutil
+import warnings
 from dataclasses import replace
 
 import gmsh
@@ -16,9 +17,10 @@ import pytest
 import tomlkit
 
 from halbach_fe.cli import main
+from halbach_fe.cli.guard import guarded
 from halbach_fe.cli.options import orders
 from halbach_fe.cli.verbs import with_values
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.core.files import InputFile
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import loose_blocks
@@ -202,6 +204,48 @@ def test_orders_of_assembly(campaign, tmp_path, capsys, names, said):
     assert code == 4
     assert said in sentence
     assert str(order) in sentence
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"plan__candidates": {"kind": "points", "points_m": [[0.0, 0.0, 0.0]]}},
+     "Write [[plan.candidates]] for [plan.candidates]"),
+    ({"instrument": [{"gain": [0.01, 0.0, 0.0]}]}, "Write [instrument] for [[instrument]]"),
+    ({"iron_ring": None, "iron": {"relative_permeability": 100.0, "bodies": [
+        {"kind": "sphere", "radius_m": 0.01, "centre_m": [0.0, 0.0, 90.0]}]}},
+     "in millimetres? Then write 0.09.")])
+def test_tables_and_places_that_are_meant_otherwise(changes, said):
+    with pytest.raises(StudyError) as refusal:
+        parse_study(changed(BASE, **changes))
+    assert said in str(refusal.value)
+
+
+def test_what_is_given_to_another_command(campaign, tmp_path, capsys):
+    """A table of moments as that of places, lines without a grid, several maps to explain."""
+    study, measured, blocks = campaign
+    document = dict(BASE) | {"maps": [{"name": "a", "file": str(measured)}]}
+    (tmp_path / "maps.toml").write_text(tomlkit.dumps(document))
+    for said, command in (
+            ("a table of measured moments", ["new", tmp_path / "n.toml", "--free-blocks",
+                                                 blocks]),
+            ("Add --across-m U V", ["field", study, "--from-m", 0, 0, -0.1, "--to-m", 0, 0, 0.1,
+                                       "--lines", 3, "-o", tmp_path / "f"]),
+            ("takes one map", ["explain", tmp_path / "maps.toml", measured, "-o",
+                                  tmp_path / "e"])):
+        found, sentence = refused(command, capsys)
+        assert found == 3
+        assert said in sentence
+
+
+def test_a_warning_is_said_once(tmp_path, capsys):
+    def run():
+        for _ in range(2):
+            warnings.warn("twice", HalbachWarning, stacklevel=1)
+            with warnings.catch_warnings():  # what makes Python forget
+                warnings.simplefilter("ignore")
+        return 0
+
+    assert guarded(run) == 0
+    assert capsys.readouterr().err.count("warning: twice") == 1
 
 
 def test_a_result_as_input(campaign, tmp_path, capsys):

@@ -106,6 +106,7 @@ def test_a_main_multipole_that_cancels(tmp_path, capsys, angle, cancels):
     assert ("there is no main multipole, of order 1, but for errors" in said) == cancels
     assert ("Only as absolute numbers" in said) == cancels
     assert ("µT m itself" in said.replace("\u00a0", " ")) == cancels
+    assert ("in mT m, as there is no main multipole" in said) == cancels
     # the other commands that state such units (sort takes only blocks that are alike)
     options = [*command[1:-2], "--json", "-o"]
     run(capsys, "simulate-measurement", study, "-o", tmp_path / "campaign", "--json")

@@ -69,7 +69,6 @@ def test_permeability_and_iron_against_ngsolve(short_dipole, session):
     """
     study = short_dipole(
         array__recoil_permeability=1.1, demagnetization=COLD, array__rings=1,
-        array__blocks_per_ring=8,
         mesh={"block_size_m": 0.04, "growth": 1.7},
         iron_ring={"inner_radius_m": 0.2, "outer_radius_m": 0.23, "relative_permeability": 1e3})
     found = demagnetization_map(build_magnet(study), session, 3)

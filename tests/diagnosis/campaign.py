@@ -49,18 +49,20 @@ def field(study: Study, polarizations: np.ndarray, points: np.ndarray) -> np.nda
     return total
 
 
-def table_of(study: Study, polarizations: np.ndarray, generator: np.random.Generator) -> BlockTable:
+def table_of(
+    study: Study, polarizations: np.ndarray, generator: np.random.Generator, sd: float = 1e-3
+) -> BlockTable:
     """The blocks (n, 3) in T as a coil would have measured them, each to 0.1 %."""
     blocks = build_magnet(study).blocks
     volume, count, ones = blocks[0].volume, len(blocks), np.ones(len(blocks))
     moments = volume / MU_0 * np.array([
         Rotation.from_euler("z", -block.angle_deg, degrees=True).apply(polarization)
         for block, polarization in zip(blocks, polarizations, strict=True)])
-    sd = 1e-3 * np.linalg.norm(moments, axis=1)
+    sds = sd * np.linalg.norm(moments, axis=1)
     return BlockTable(
         tuple(map(str, range(count))), ("",) * count, np.array([block.ring for block in blocks]),
         np.array([block.slot for block in blocks]),
-        moments + sd[:, None] * generator.standard_normal(moments.shape), sd, volume * ones,
+        moments + sds[:, None] * generator.standard_normal(moments.shape), sds, volume * ones,
         np.nan * ones)
 
 

@@ -141,7 +141,13 @@ def test_verdicts(flat):
     clean = replace(found, identified=(), imitated=imitation)
     assert answer(clean).trust.startswith("Only as far as this map shows: ")
     assert "With a probability of 30 % something is missing" in answer(clean).trust
-    assert "28 %" in answer(clean).trust  # and not what has 1 %
+    assert "28 %" in answer(clean).trust
+    covered = replace(imitation, fitted=found.identified)  # which the study has as uncertain
+    assert answer(replace(found, imitated=covered)).trust.startswith("Yes. ")
+    there = answer(replace(clean, imitated=covered))
+    assert there.trust.startswith("Yes: ")
+    assert "uncertain about 0" in there.trust
+    assert "study.diagnosed.toml" in there.command
     assert diagnosis_summary(clean)["imitated"]["probability"] == 0.3
     assert answer(replace(clean, imitated=None)).trust.startswith("Yes: ")
     for kind, said in (("block_missing", "Only in part. "), ("ferromagnetic_object", "Yes. ")):

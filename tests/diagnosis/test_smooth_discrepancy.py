@@ -70,3 +70,17 @@ def test_a_ripple_of_one_sensor_is_the_instrument():
 @pytest.mark.parametrize("size", [0.0, 1e-9])
 def test_noise_is_neither(size):
     assert max(factors(size * np.ones_like(POINTS))) < 0
+
+
+def test_a_coil_is_a_field_in_a_plane_too():
+    """Across a magnet its field varies along z as well. The control has terms that do not."""
+    points = np.vstack([circle(radius, 16, 0.0) for radius in (0.02, 0.04, 0.06)])
+    coil = magpylib.current.Circle(current=100, diameter=0.4, position=(0.02, 0, 0.1))
+    field = coil.getB(points).ravel()
+    left = []
+    for waves in (4, 0):
+        terms = harmonic_fields(points, in_plane=waves).fields.reshape(-1, field.size).T
+        rest = field - terms @ np.linalg.lstsq(terms, field, rcond=None)[0]
+        left.append(float(np.linalg.norm(rest) / np.linalg.norm(field)))
+    assert left[0] < 2e-3  # four half waves are no complete set
+    assert left[1] > 0.05

@@ -29,7 +29,7 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.study.uncertain import number_changes, shifted
 from tests.conftest import circle
-from tests.diagnosis.campaign import drawn, field
+from tests.diagnosis.campaign import drawn, field, table_of
 from tests.support.cuboids import DOCUMENT, NOISE_T
 from tests.support.pages import write_result
 
@@ -58,10 +58,10 @@ def hidden(study, name, polarizations):
     return true, np.where(first, turn.apply(polarizations), polarizations)
 
 
-def update(study, shown, polarizations, session):
+def update(study, shown, polarizations, session, blocks=None):
     """Chi-squared per parameter of all blocks against the truth, and the result."""
     magnet = build_magnet(study)
-    result = infer(magnet, shown, session)
+    result = infer(magnet, shown, session, blocks)
     count = len(magnet.parameter_names)
     off = polarizations.ravel() / MU_0 - result.posterior.mean[:count]
     covariance = result.posterior.covariance[:count, :count]
@@ -142,6 +142,35 @@ def test_what_the_map_does_not_tell_apart_is_estimated_together(session, tmp_pat
     first = both.with_(uncertain=both.uncertain[:1])  # the control: the wrong name alone
     assert one.name == "radial_gap"
     assert update(first, shown, polarizations, session.within("first"))[0] > 10
+
+
+def test_what_blocks_imitate_is_estimated_with_them(session):
+    """A gain of 1 % is one of all remanences in a map of By alone, and none in one of all axes."""
+    generator, noise_T, points = np.random.default_rng(2), NOISE_T / 10, POINTS[::3]
+    effects = [one for one in catalogue() if one.name in ("gain_y", "offset_y")]
+    noise = {"regions": [{"name": "all", "sigma_T": noise_T}]}
+    document = DOCUMENT | {"array": DOCUMENT["array"] | SHORT, "noise": noise}
+    for components, gain in ((["y"], 0.01), (["x", "y", "z"], 0.0)):
+        study = parse_study(document | {
+            "observation": DOCUMENT["observation"] | {"components": components}})
+        polarizations = drawn(study, generator, 0.001)
+        table = table_of(study, polarizations, generator, 2e-4)
+        true = field(study, polarizations, points) * [1.0, 1 + gain, 1.0]
+        shown = field_map(points, true + noise_T * generator.standard_normal(true.shape))
+        found = diagnose(study, shown, session.within("diagnosis"), table, effects)
+        said = answer(found)
+        assert not found.identified
+        assert said.trust.startswith("Yes")
+        chi2, _ = update(found.study, shown, polarizations, session.within("update"), table)
+        assert abs(chi2 - 1) < 4 * np.sqrt(2 / polarizations.size)
+        assert (STUDY_FILE in said.command) is bool(gain)
+        if gain:
+            assert "sensitivity of the By sensor" in said.trust
+            assert found.imitated.probability < 0.1  # that before the map: no reading shows it
+            exact, _ = update(study, shown, polarizations, session.within("exact"), table)
+            assert exact > 10  # the control: the study as it was
+        else:
+            assert found.imitated is None
 
 
 def test_only_what_changes_nothing_is_put_beside_a_named_effect():

@@ -33,16 +33,15 @@ SLOW = ("iron_ring", "iron_saturation", "neighbour_magnet")
 """Effects whose signatures take long, and which no test here needs."""
 
 SOME = [effect for effect in catalogue() if effect.name not in SLOW]
-UNLISTED = {1: ("readings", "z", "smooth"), 2: ("positions", "angle", "rough"),
+UNLISTED = {2: ("positions", "angle", "rough"),
             3: ("readings", "field", "smooth"), 4: ("source", "loop", "smooth")}
 """Seeds, and the family of the cause."""
 
 
 @pytest.fixture(scope="module")
 def small():
-    """The study of the benchmark with two of its three rings, on fewer points."""
-    document = STUDY.model_dump()
-    return parse_study(document | {"array": document["array"] | {"rings": 2}, "observation": {
+    """The study of the benchmark on fewer points."""
+    return parse_study(STUDY.model_dump() | {"observation": {
         "quantity": "flux_density", "positions": {
             "kind": "circles", "radius_m": [0.03, 0.05, 0.07], "angles": 12,
             "z_min_m": -0.15, "z_max_m": 0.15, "count": 9}}})

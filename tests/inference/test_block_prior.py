@@ -626,6 +626,18 @@ def test_refusals(vacuum_dipole, generator, placed, change, said):
         prior_from_blocks(build_magnet(study), replace(table, **change(table)))
 
 
+def test_copies_of_a_sample_are_none(vacuum_dipole, generator):
+    study = vacuum_dipole()
+    slots, _, truth = blocks_and_truth(study, generator, copies=2)
+    table = table_of(study, slots, truth)
+    prior_from_blocks(build_magnet(study), table)  # the control
+    first, second = np.flatnonzero(np.array(table.type) == table.type[0])[:2]
+    moment = table.moment.copy()
+    moment[second] = moment[first]
+    with pytest.raises(MeasurementError, match="1 with the moment of another one"):
+        prior_from_blocks(build_magnet(study), replace(table, moment=moment))
+
+
 def test_a_component_that_was_not_measured(vacuum_dipole, generator):
     study = vacuum_dipole()
     slots, _, truth = blocks_and_truth(study, generator, copies=3)

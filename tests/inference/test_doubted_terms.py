@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.api import multipoles
+from halbach_fe.api import diagnose, multipoles
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.core.pace import Pace
@@ -55,6 +55,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes
 from halbach_fe.measurement.instrument_terms import NAMES
 from halbach_fe.measurement.map_check import check_map
+from halbach_fe.report.diagnosis_answer import answer as diagnosis_answer
 from halbach_fe.report.inference_answer import answer as inference_answer
 from halbach_fe.report.multipoles import answer as multipoles_answer
 from halbach_fe.report.registration import (
@@ -226,6 +227,15 @@ def test_half_a_field_weakens_the_blocks(generator, tmp_path):
     right = infer(magnet, quadrupole_map(generator, 1.0), Session.open(tmp_path / "j"))
     assert right.doubts == ()
     assert "ordered" not in inference_answer(right).trust
+    # so does diagnose, first of all, though one sensor's gain is all that is looked for
+    of_half, of_all = (diagnosis_answer(diagnose(
+        magnet, quadrupole_map(generator, factor), Session.open(tmp_path / f"d{factor}"),
+        effects=["gain_x"])) for factor in (0.5, 1.0))
+    assert of_half.said.startswith("The readings are 0.5")
+    assert "times the field expected of the magnet (half)" in of_half.said
+    assert "unit, the sign and the factor" in of_half.step
+    assert not of_half.sound
+    assert "times the field" not in of_all.said
 
 
 def asks_for_mm(asked):
@@ -362,6 +372,7 @@ def test_a_component_that_was_named_wrong_is_doubted(magnet, generator, tmp_path
     assert wrong[0].doubts
     assert not said.sound
     assert said.trust.startswith("No")
+    assert "times the field" not in said.trust  # a factor in a place where the map is not
     assert "--component unknown" in said.step
     # a better chi-squared would not make it right
     pretended = [replace(each, chi2=1.0, at_rest=True) for each in wrong]
@@ -410,9 +421,11 @@ def test_the_axes_of_a_map_are_those_of_a_rotation(generator):
 def test_a_component_that_nobody_named_is_found(magnet, generator, tmp_path, capsys):
     data = cube_dipole.read_map(generator)
     rows = np.column_stack([1e3 * GRID, 1e3 * data["B_T"].values[:, 2]])
-    (tmp_path / "gauss.txt").write_text("x[mm] y[mm] z[mm] B0[mT]\n".replace("B0", "B") + "\n".join(
+    (tmp_path / "gauss.txt").write_text("x[mm] y[mm] z[mm] B0[mT]\n" + "\n".join(
         " ".join(f"{value:.6f}" for value in row) for row in rows))
     (tmp_path / "study.toml").write_text(TEXT)
+    assert main(["import-map", str(tmp_path / "gauss.txt"), "-o", str(tmp_path / "no.csv")]) == 4
+    assert "--component unknown" in capsys.readouterr().err
     assert main(["import-map", str(tmp_path / "gauss.txt"), "--component", "unknown",
                  "-o", str(tmp_path / "map.csv")]) == 0
     assert (tmp_path / "map.csv").read_text().splitlines()[-1].count(",") == 3

@@ -218,6 +218,16 @@ def test_solid_harmonics_are_harmonic_fields(generator):
     assert products == pytest.approx(np.eye(48), abs=1e-12)
 
 
+def test_readings_that_are_all_far_from_the_centre(generator, tmp_path, errors):
+    """A fit about the centre has none of them: nothing is told, and that is said."""
+    data = measured(generator, errors)
+    far = data.isel(point=np.linalg.norm(GRID, axis=1) > 0.06)
+    found = homogeneity(build_magnet(study()), Session.open(tmp_path), REGION, data=far)
+    assert not found.of_map
+    assert "no readings within" in " ".join(found.map_remarks)
+    assert "no readings within" in answer(found).said
+
+
 def test_regions_beyond_the_map_are_refused(generator, tmp_path, errors):
     with pytest.raises(MeasurementError, match="within its points"):
         homogeneity(build_magnet(study()), Session.open(tmp_path), Region.sphere(0.05),

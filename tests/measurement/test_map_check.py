@@ -23,7 +23,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
-from halbach_fe.measurement.scan_lines import held_out_lines
+from halbach_fe.measurement.scan_lines import held_out_lines, is_sorted, motion
 from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows, stands_out
 from halbach_fe.report.map_check import (
     OPEN_SIGN,
@@ -98,8 +98,7 @@ def test_noise_that_a_fit_leaves(generator, monkeypatch):
     left = model.noise_left(at, rows, width2)
     by_amplitude = model.by_amplitude(at, rows).reshape(-1, len(charges))
     information = by_amplitude.T @ by_amplitude
-    prior = max(at.sigma**2 / width2,
-                harmonic_field.ROUNDING * np.trace(information) / len(charges))
+    prior = at.sigma**2 / width2
     fitted = by_amplitude @ np.linalg.solve(
         information + prior * np.eye(len(charges)), by_amplitude.T)
     rest = np.eye(len(fitted)) - fitted
@@ -517,6 +516,38 @@ def test_rounded_readings_repeat_by_chance(generator):
     assert set(range(202, 261)) <= set(broken_rows(points, rounded)["repeated"])
     field[:, 1:] = 0.0  # what is always alike tells nothing
     assert broken_rows(points, field) == {"repeated": [101]}
+
+
+def test_a_place_that_is_read_twice(generator):
+    """Readings of it have the same field, whatever their noise; copies of them are named."""
+    points = np.vstack(2 * [GRID[::4]])
+    field = 1e-3 * points + 1e-5 * generator.standard_normal(points.shape)
+    charges = Charges.around(points, 1.5 * STEP_M)
+    free = harmonic_field.FreeField(charges.fields(points).reshape(3 * len(points), -1), 0.0)
+    assert free.dual
+    assert np.isfinite(free.most_probable(field.ravel()).amplitudes).all()
+    with pytest.raises(np.linalg.LinAlgError):  # the control: a penalty below rounding
+        np.linalg.cholesky(free.gram + 1e-3 * free.least * np.eye(len(free.gram)))
+    assert broken_rows(points, field) == {}
+    half = len(points) // 2
+    field[half + 3:half + 20] = field[3:20]
+    assert broken_rows(points, field) == {"copied": list(range(half + 4, half + 21))}
+    few = np.round(1e3 * field) / 1e3  # of few digits, rows are alike by chance
+    assert broken_rows(points, few).get("copied", []) == []
+
+
+def test_the_stage_moves_in_the_order_of_times(generator):
+    """Rows that were sorted anew have the motion of the scan where times tell it."""
+    to_and_fro = GRID.reshape(5, 7, 9, 3).copy()
+    to_and_fro[:, 1::2] = to_and_fro[:, 1::2, ::-1]
+    points, time = to_and_fro.reshape(-1, 3), np.arange(len(GRID), dtype=float)
+    assert not is_sorted(points)
+    assert is_sorted(GRID)
+    assert is_sorted(GRID[np.lexsort(GRID.T)])
+    order = np.lexsort(points[:, ::-1].T)
+    assert is_sorted(points[order])
+    np.testing.assert_array_equal(motion(points[order], time[order]), motion(points)[order])
+    assert (motion(points[order]) != motion(points)[order]).any()  # the control: without times
 
 
 def test_a_change_during_the_scan_must_predict_lines(generator):

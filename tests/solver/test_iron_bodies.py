@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 
 import numpy as np
@@ -13,6 +14,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import iron_bodies
 from halbach_fe.solver.formulation_choice import (
     Route,
+    check_points,
     choose_route,
     finer_in_words,
     finite_element_part,
@@ -214,3 +216,15 @@ def test_a_turned_box_is_as_in_the_simulated_campaign(session, coarse_mesh):
             body | {"rotation_deg": [0, 0, 0]}, iron=material))))
     assert np.abs(found - truth).max() < 0.2 * np.abs(truth).max()
     assert np.abs(straight - truth).max() > 0.3 * np.abs(truth).max()  # negative control
+
+
+@pytest.mark.parametrize(("iron", "answers"), [
+    (SPHERE, True), ({"kind": "tube", "inner_radius_m": 0.1, "outer_radius_m": 0.11}, False)])
+def test_iron_that_does_not_answer_to_external_fields_is_told(iron, answers):
+    """Earth's field within a coaxial shield is not shielded."""
+    magnet = build_magnet(study_with(iron, external={"background_T": [0.0, 3e-5, 4e-5]}))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        check_points(magnet, POINTS[:1])
+    assert ["up to 0.05 mT at the points, is added as if the iron" in str(one.message)
+            for one in told] == [True] * (not answers)

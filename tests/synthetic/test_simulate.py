@@ -21,6 +21,7 @@ from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.words import flux_density
 from halbach_fe.solver.exact_block_field import demagnetizing_tensors, gradient_of
+from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study, read_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -29,6 +30,7 @@ from halbach_fe.synthetic.reaction import lone_moment_matrix
 from halbach_fe.synthetic.simulate import real_places, simulate_campaign, write_campaign
 from tests.conftest import DIPOLE, changed
 from tests.support.pages import page
+from tests.support.warm_process import PICTURE
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {
@@ -86,9 +88,16 @@ def campaigns(tmp_path_factory):
 
 
 def inferred(study, readings, blocks, out, capsys):
-    """Summary of an inference, and its magnetizations and standard deviations."""
-    assert main(["infer", str(study), "--measurements", str(readings), "--blocks", str(blocks),
-                 "-o", str(out), "--json"]) == 0
+    """Summary of an inference, and its magnetizations and standard deviations.
+
+    The study's response is solved once for all maps, and no picture is drawn.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(FOLDER_VARIABLE, str(study.parent / "cache"))
+        patch.setenv(LIMIT_VARIABLE, "1")
+        patch.setattr("halbach_fe.report.page.png_of", lambda figure: PICTURE)
+        assert main(["infer", str(study), "--measurements", str(readings), "--blocks", str(blocks),
+                     "-o", str(out), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     with xr.open_dataset(out / "posterior.h5", engine="h5netcdf") as data:
         found = data.load()

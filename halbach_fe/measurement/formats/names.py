@@ -36,7 +36,7 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
     "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
     "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
     "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B", "magneticfield": "B",
-    "magneticfieldreading": "B", "fieldreading": "B", "nmrfield": TOTAL} | {
+    "magneticfieldreading": "B", "fieldreading": "B", "b0": "B", "nmrfield": TOTAL} | {
     spelling.format(axis): name for axis, name in zip("xyz", FIELDS[:3], strict=True)
     for spelling in ("b0{}", "b{}re", "reb{}", "b{}real", "b{}mean", "meanb{}", "b{}avg", *(
         around.format(word) for word in (

@@ -464,7 +464,8 @@ def _missing(
                        "register then tries all three)")
     elif not {*names.FIELDS, names.TOTAL} & set(used):
         others = [column.text for column in columns if column.text and not column.quantity]
-        missing.append("which columns are Bx, By or Bz, or Babs for |B| (--columns"
+        missing.append("which columns are Bx, By or Bz, Babs for |B|, or B for a component that "
+                       "nobody knows, with --component unknown (--columns"
                        + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
                           if others else "")
                        + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "") + ")")
