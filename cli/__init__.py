@@ -1,4 +1,4 @@
-"""The command line: one file per verb, each with ``add_arguments`` and ``run``.
+"""The command line: verbs that are declared with their options, see `halbach_fe.cli.options`.
 
 Nothing is imported at the top: Ctrl-C during the imports, which take a second, ends in `main`.
 """

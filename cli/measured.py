@@ -87,6 +87,7 @@ def check(arguments: argparse.Namespace) -> int:
     each map.
     """
     from halbach_fe.measurement.field_map import is_total_field
+    from halbach_fe.report import map_check
 
     files = [arguments.map, *arguments.others]
     if arguments.others:
@@ -98,18 +99,15 @@ def check(arguments: argparse.Namespace) -> int:
     with common.progress_bar("checking") as show:
         if arguments.others:
             from halbach_fe.measurement.map_join import join_maps
-            from halbach_fe.report import map_join
 
             named = dict(zip(arguments.listed_maps, maps, strict=True))
-            page = map_join.page(named, join_maps(named, say, show))
+            page = map_check.joined_page(named, join_maps(named, say, show))
         elif is_total_field(maps[0]):
             from halbach_fe.measurement.total_check import check_total
-            from halbach_fe.report import map_check
 
             page = map_check.total_page(maps[0], check_total(maps[0]))
         else:
             from halbach_fe.measurement.map_check import check_map
-            from halbach_fe.report import map_check
 
             page = map_check.page(maps[0], check_map(maps[0], say, show))
     return common.finish(arguments, page)
@@ -495,7 +493,7 @@ class _Explanation:
         """Run a command into a folder, with the options of this one that it has, and return what
         its page says.
         """
-        from halbach_fe.report.page_record import PAGE_RECORD, PageRecord
+        from halbach_fe.report.answer import PAGE_RECORD, PageRecord
 
         output = self.arguments.output / folder
         words = [verb, *map(str, names), "-o", str(output)]

@@ -46,7 +46,7 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.map_homogeneity import map_homogeneity
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.same_magnet import disagreement_of, distributions_of
+from halbach_fe.inference.storage import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import taking_arrays
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks

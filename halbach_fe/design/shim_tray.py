@@ -28,7 +28,7 @@ from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.geometry.overlaps import block_in_others, overlapping_blocks
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.inference.same_magnet import distributions_of
+from halbach_fe.inference.storage import distributions_of
 from halbach_fe.response.block_variation import distribution_of, with_variations
 from halbach_fe.response.homogeneity import (
     PPM,

@@ -2,12 +2,11 @@
 
 What is to become small are the values of an `halbach_fe.design.objective`: unwanted multipoles in
 units of 1e-4, or deviations of |B| in ppm. They are linear in the magnetizations, and a moved block
-keeps its magnetization in its own axes. The effect of a move is therefore a product of matrices
-that are computed once, and the effects of moves in different slots add up, so that a hundred
-thousand swaps are evaluated quickly. A slot takes part in at most one move. Moves are added one
-after another, each time the one with the largest expected decrease of the sum of squares, until
-this decrease is no larger than its own standard deviation. Then each move is replaced by a better
-one as long as that lowers the sum.
+keeps its magnetization in its own axes. What a block changes in a slot is therefore a product with
+a matrix, as when blocks are sorted, so that a hundred thousand swaps are evaluated quickly. A slot
+takes part in at most one move. Moves are added one after another, each time the one with the
+largest expected decrease of the sum of squares, until this decrease is no larger than its own
+standard deviation. Then each move is replaced by a better one as long as that lowers the sum.
 
 The distribution of the moved blocks is the transformed posterior, which is exact. If the blocks
 were measured before they were mounted, the magnetization of a mounted block is ``p = w + u``. Here
@@ -36,6 +35,7 @@ from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import Known, Objective
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
+from halbach_fe.design.sorting import Slots
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
@@ -52,11 +52,9 @@ GAIN_SDS = 1.0
 """Smallest ratio of the expected gain of a move to the standard deviation of that gain, for which
 the move is made."""
 
-AT_ONCE = 100_000
-"""Number of moves that are evaluated at a time, which limits the memory."""
-
 MOST_NUMBERS = 3e8
-"""Largest number of values of all placements together, and of possible swaps: 2.4 GB."""
+"""Largest number of ways to put a block into a slot, and twice that of possible swaps: more take
+too much memory and time."""
 
 STOPS = {"target": "the limit is met", "uncertainty": "further moves would gain less than the "
          "uncertainty of what they gain", "budget": "the allowed number of moves is reached",
@@ -148,7 +146,7 @@ class Shim(ShownInNotebook):
     before: Any
     steps: tuple[Step, ...]
     stop: str
-    tried: dict[str, int]
+    tried: dict[Kind, int]
     limit: float | None
     within: tuple[float, float] | None
     fields: tuple[Homogeneity, Homogeneity] | None
@@ -282,6 +280,37 @@ class _MoveModel:
         return (self.model.offset + matrix @ self.mean.ravel(),
                 matrix @ self.placed.reshape(self.mean.size, -1))
 
+    @cached_property
+    def slots(self) -> Slots:
+        """What every block changes in every slot, relative to the main multipole or mean field as
+        it is, which moves hardly change.
+        """
+        scaled = self.model.scaled(self.main).reshape(-1, *self.mean.shape)
+        return Slots(np.einsum("qsi,sij->qsj", scaled, self.frames), self.loose_mean,
+                     self.own @ self.own.transpose(0, 2, 1),
+                     self.mounts.turns[:, :self.size, :self.size], self.fits,
+                     np.arange(len(self.mean)), np.arange(len(self.loose_mean)))
+
+    @property
+    def main(self) -> float:
+        """Main multipole or mean field, without moves."""
+        return float(abs(self.start[0][0]))
+
+    @property
+    def frames(self) -> Floats:
+        """`Mounts.frames` reduced to the dimension of the magnet, (S, D, D)."""
+        return self.mounts.frames[:, :self.size, :self.size]
+
+    @cached_property
+    def present(self) -> Floats:
+        """The means of the mounted blocks in the own axes of their slots, (S, D)."""
+        return np.einsum("sij,si->sj", self.frames, self.mean)
+
+    def values(self, chosen: Sequence[Move]) -> Floats:
+        """Return the means of the values (k,) after moves, relative to `main`."""
+        mean, _ = self.products(chosen)
+        return self.model.units(np.concatenate([[self.main], mean[1:]]))
+
     def carried(self, to: Ints, turn: Ints) -> Floats:
         """Return `Mounts.carried` reduced to the dimension of the magnet, (n, D, D)."""
         return self.mounts.carried(to, turn)[:, :self.size, :self.size]
@@ -332,51 +361,6 @@ class _MoveModel:
         return [gain(now, self.model.known(*self.moved(state, move))) for move in further]
 
 
-@dataclass(frozen=True)
-class _CandidateMoves:
-    """All possible moves of a kind.
-
-    Attributes
-    ----------
-    kind : str
-    parts : ndarray of int, shape (n, 1) or, for swaps, (n, 2)
-        Numbers of the placements of each move in `_Placements`. Cycles are too many to be listed,
-        see `_cycles`.
-    count : int
-        Number of possible moves; of cycles without their turns.
-    """
-
-    kind: Kind
-    parts: Ints
-    count: int
-
-
-@dataclass(frozen=True)
-class _Placements:
-    """All possible placements of blocks, and their effects.
-
-    Attributes
-    ----------
-    to, block, turn : ndarray of int, shape (n,)
-        See `Placement`.
-    change : ndarray, shape (n, k)
-        Change of the means of the values.
-    noise : ndarray, shape (n,)
-        Variance that the independent error of the mounted block adds to their sum of squares.
-    """
-
-    to: Ints
-    block: Ints
-    turn: Ints
-    change: Floats
-    noise: Floats
-
-    def move(self, kind: Kind, parts: Ints) -> Move:
-        """Return the move that consists of the placements with the given numbers."""
-        return Move(kind, tuple(Placement(int(self.to[i]), int(self.block[i]), int(self.turn[i]))
-                                for i in parts))
-
-
 def shim(
     result: InferenceResult, model: Objective, generator: np.random.Generator,
     budget: Mapping[Kind, int], limit: float | None = None, stock: BlockTable | None = None,
@@ -416,14 +400,13 @@ def shim(
     if not budget.get("replace"):
         spares = _no_spares()
     move_model = _build_move_model(result, model, mounts, spares)
-    placements = _possible_placements(move_model)
-    candidates = [moves for moves in _candidate_moves(placements, len(mounts.places))
-                  if budget.get(moves.kind)]
+    tried = {kind: count for kind, count in _possible_moves(move_model).items()
+             if budget.get(kind)}
     before = model.of(result.posterior)
     # number of samples from which that probability is estimated, with a standard error of 0.3 %
     draws = 4000
     goal = _Goal(limit, generator.standard_normal((draws, len(before.mean))))
-    chosen, stop = _search(move_model, placements, candidates, budget, goal)
+    chosen, stop = _search(move_model, budget, goal)
     steps = _steps_by_gain(move_model, chosen, goal)
     within = None
     if limit is not None:
@@ -432,8 +415,8 @@ def shim(
     if isinstance(model, DeviationModel):
         shimmed = move_model.magnetizations([step.move for step in steps])
         fields = model.homogeneity.of(result.posterior), model.homogeneity.of(shimmed)
-    return Shim(result, model, mounts, spares.names, before, steps, stop,
-                {moves.kind: moves.count for moves in candidates}, limit, within, fields)
+    return Shim(result, model, mounts, spares.names, before, steps, stop, tried,
+                limit, within, fields)
 
 
 def check_shimming(study: Study) -> None:
@@ -601,71 +584,33 @@ def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spare
                        np.full(len(table), -1))
 
 
-def _possible_placements(move_model: _MoveModel) -> _Placements:
-    """Return all placements of blocks in slots that they fit, without those that change nothing."""
-    stay = np.zeros_like(move_model.fits)
-    every = np.arange(len(move_model.mean))
-    stay[0, every, every] = True
-    turn, to, block = np.nonzero(move_model.fits & ~stay)
-    _refuse_too_many(move_model, turn, to, block)
-    carried = move_model.carried(to, turn)
-    main = float(abs(move_model.start[0][0]))
-    scaled = move_model.model.scaled(main).reshape(-1, *move_model.mean.shape)
-    new = np.einsum("nij,nj->ni", carried, move_model.loose_mean[block]) - move_model.mean[to]
-    change, noise = np.empty((len(to), len(scaled))), np.empty(len(to))
-    for first in range(0, len(to), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
-        columns = np.moveaxis(scaled[:, to[part]], 0, 1)
-        change[part] = np.einsum("nki,ni->nk", columns, new[part])
-        error = columns @ (carried[part] @ move_model.own[block[part]])
-        noise[part] = np.sum(error**2, axis=(1, 2))
-    return _Placements(to, block, turn, change, noise)
+def _possible_moves(move_model: _MoveModel) -> dict[Kind, int]:
+    """Return the number of possible moves of each kind; of cycles without their turns.
 
-
-def _refuse_too_many(move_model: _MoveModel, turn: Ints, to: Ints, block: Ints) -> None:
-    """Raise a StudyError if the placements need more memory than `MOST_NUMBERS` allows."""
+    Raises
+    ------
+    StudyError
+        If there are more than `MOST_NUMBERS` allows.
+    """
     slots = len(move_model.mean)
-    pair = slots * np.minimum(to, block) + np.maximum(to, block)
-    moved = (block < slots) & (block != to)
-    up, down = (np.bincount(pair[moved & side]) for side in (to < block, to > block))
-    shared = min(len(up), len(down))
-    swaps = float(up[:shared].astype(float) @ down[:shared])
-    numbers = float(len(to) * (len(move_model.model.matrix) - 1) + 2 * swaps)
-    if numbers > MOST_NUMBERS:
+    ways = move_model.fits.sum(axis=0, dtype=float)
+    inside = ways[:, :slots] - np.diag(move_model.fits[0].diagonal())  # without those that stay
+    apart = inside - np.diag(inside.diagonal())
+    there = np.minimum(apart, 1)
+    swaps = float(np.sum(apart * apart.T)) / 2
+    if max(move_model.fits.size, 2 * swaps) > MOST_NUMBERS:
         raise StudyError(must_be(
             "magnet", "shim", "one of a few hundred blocks",
-            f"one of {slots} with {len(to)} possible placements and {swaps:.0f} swaps",
+            f"one of {slots} with {swaps:.0f} possible swaps",
             "Sort its blocks before it is assembled (halbach-fe sort), and fill a tray with small "
             "magnets after it is measured (halbach-fe shim-tray)."))
-
-
-def _candidate_moves(placements: _Placements, slots: int) -> list[_CandidateMoves]:
-    """Return all moves of each kind; a swap is a pair of placements that exchange two blocks."""
-    every: dict[Kind, Ints]
-    number = np.arange(len(placements.to))
-    inside = placements.block < slots
-    turns = number[inside & (placements.block == placements.to)]
-    spare = number[~inside]
-    moved = number[inside & (placements.block != placements.to)]
-    # Join the placements of block i in slot j with those of block j in slot i by the pair {i, j}.
-    low = np.minimum(placements.to, placements.block)
-    high = np.maximum(placements.to, placements.block)
-    up = moved[placements.to[moved] < placements.block[moved]]
-    down = moved[placements.to[moved] > placements.block[moved]]
-    key = low * slots + high
-    one, other = _equal(key[up], key[down])
-    every = {"swap": np.column_stack([up[one], down[other]]), "turn": turns[:, None],
-             "replace": spare[:, None]}
-    fits = np.zeros((slots, slots))
-    fits[placements.to[moved], placements.block[moved]] = 1
-    cycles = round(float(np.einsum("ij,ji->", fits @ fits, fits)) / 3)
-    return [_CandidateMoves("cycle", np.zeros((0, 3), int), cycles), *(
-        _CandidateMoves(kind, parts, len(parts)) for kind, parts in every.items())]
+    return {"cycle": round(float(np.einsum("ij,ji->", there @ there, there)) / 3),
+            "swap": round(swaps), "turn": round(float(np.trace(inside))),
+            "replace": round(float(ways[:, slots:].sum()))}
 
 
 def _search(
-    move_model: _MoveModel, placements: _Placements, candidates: Sequence[_CandidateMoves],
-    budget: Mapping[Kind, int], goal: _Goal,
+    move_model: _MoveModel, budget: Mapping[Kind, int], goal: _Goal
 ) -> tuple[list[Move], str]:
     """Return the chosen moves, and the reason for the end of the search (a key of `STOPS`).
 
@@ -675,15 +620,14 @@ def _search(
     stop = "nothing"
     while True:
         count = len(chosen)
-        chosen, stop = _add_moves(move_model, placements, candidates, budget, goal, chosen)
+        chosen, stop = _add_moves(move_model, budget, goal, chosen)
         if len(chosen) == count:
             return chosen, stop
-        chosen = _exchange_moves(move_model, placements, candidates, chosen)
+        chosen = _exchange_moves(move_model, chosen)
 
 
 def _add_moves(
-    move_model: _MoveModel, placements: _Placements, candidates: Sequence[_CandidateMoves],
-    budget: Mapping[Kind, int], goal: _Goal, chosen: list[Move],
+    move_model: _MoveModel, budget: Mapping[Kind, int], goal: _Goal, chosen: list[Move],
 ) -> tuple[list[Move], str]:
     """Add the moves of largest expected gain one by one; return them and why no more are added."""
     # number of moves of each kind, the best by an approximate gain, whose exact gain is computed
@@ -692,12 +636,12 @@ def _add_moves(
         now = move_model.after(chosen)
         if goal.met(now):
             return chosen, "target"
-        left = [moves for moves in candidates
-                if sum(move.kind == moves.kind for move in chosen) < budget[moves.kind]]
-        if (candidates and not left) or not any(budget.values()):
+        left = [kind for kind in budget
+                if sum(move.kind == kind for move in chosen) < budget[kind]]
+        if not left:
             return chosen, "budget"
-        shortlist = [move for moves in left
-                     for move in _best_moves(move_model, placements, moves, chosen, shortlist_size)]
+        shortlist = [move for kind in left
+                     for move in _best_moves(move_model, kind, chosen, shortlist_size)]
         if not shortlist:
             return chosen, "nothing"
         gains = move_model.gains(chosen, shortlist)
@@ -707,10 +651,7 @@ def _add_moves(
         chosen = [*chosen, shortlist[best]]
 
 
-def _exchange_moves(
-    move_model: _MoveModel, placements: _Placements, candidates: Sequence[_CandidateMoves],
-    chosen: list[Move],
-) -> list[Move]:
+def _exchange_moves(move_model: _MoveModel, chosen: list[Move]) -> list[Move]:
     """Replace each move by the best of its kind, given the others, until no move improves."""
     better = True
     # smallest relative decrease of the sum for which a move is replaced by another
@@ -719,8 +660,7 @@ def _exchange_moves(
         better = False
         for move in list(chosen):
             others = [other for other in chosen if other is not move]
-            kind = next(moves for moves in candidates if moves.kind == move.kind)
-            found = _best_moves(move_model, placements, kind, others, 1)
+            found = _best_moves(move_model, move.kind, others, 1)
             now = move_model.after(chosen).expected_square
             if found and move_model.after([*others, found[0]]).expected_square < (
                     1 - least_gain) * now:
@@ -729,67 +669,84 @@ def _exchange_moves(
 
 
 def _best_moves(
-    move_model: _MoveModel, placements: _Placements, candidates: _CandidateMoves,
-    chosen: Sequence[Move], count: int,
+    move_model: _MoveModel, kind: Kind, chosen: Sequence[Move], count: int
 ) -> list[Move]:
     """Return the best moves of a kind, with slots and blocks that no chosen move uses.
 
     They are ranked by the sum of squares of the mean after the move plus the variance that
     mounting adds. The change of the remaining variance is neglected.
     """
-    used = [placement for move in chosen for placement in move.placements]
-    free = ~(np.isin(placements.to, [placement.to for placement in used])
-             | np.isin(placements.block, [placement.block for placement in used]))
-    mean, _ = move_model.products(chosen)
-    # Moves hardly change the main multipole or mean field: use that by which
-    # `_Placements.change` is scaled.
-    now = move_model.model.units(np.concatenate([[abs(move_model.start[0][0])], mean[1:]]))
-    every = (_cycles(placements, now, free, len(move_model.mean)) if candidates.kind == "cycle"
-             else [candidates.parts[free[candidates.parts].all(axis=1)]])
-    kept, scores = np.zeros((0, 1), int), np.zeros(0)
-    for parts in every:
-        for first in range(0, len(parts), AT_ONCE):
-            batch = parts[first:first + AT_ONCE]
-            after = now + placements.change[batch].sum(axis=1)
-            score = np.einsum("ij,ij->i", after, after) + placements.noise[batch].sum(axis=1)
-            kept = np.vstack([kept, batch]) if len(kept) else batch
-            scores = np.append(scores, score)
-            best = np.argsort(scores, kind="stable")[:count]
-            kept, scores = kept[best], scores[best]
-    return [placements.move(candidates.kind, part) for part in kept]
+    used = {number for move in chosen for placement in move.placements
+            for number in (placement.to, placement.block)}
+    free = np.array([number for number in range(len(move_model.own)) if number not in used])
+    own, spares = free[free < len(move_model.mean)], free[free >= len(move_model.mean)]
+    now = move_model.values(chosen)
+    changes = (_swaps(move_model, own, now) if kind == "swap" else
+               _cycles(move_model, own, now) if kind == "cycle" else
+               _single(move_model, own, spares if kind == "replace" else None, now))
+    every = [each for each in changes if len(each[0])]
+    if not every:
+        return []
+    costs, placements = map(np.concatenate, zip(*every, strict=True))
+    best = np.argsort(costs, kind="stable")[:count]
+    return [Move(kind, tuple(Placement(*each) for each in placements[number].tolist()))
+            for number in best if np.isfinite(costs[number])]
 
 
-def _cycles(
-    placements: _Placements, now: Floats, free: NDArray[np.bool_], slots: int
-) -> Iterator[Ints]:
-    """Yield cyclic exchanges of three blocks (n, 3) as numbers of placements.
+Changes = Iterator[tuple[Floats, Ints]]
+"""Changes (n,) of the expected sum of squares by moves, and their placements (n, parts, 3): slot,
+block and turn of each."""
 
-    All possible ones are too many. They begin with the 200 best placements by
-    themselves, i into j; each goes on with every j into m, and every m into i. Those of one
-    beginning come at a time, which limits the memory: of a magnet of 500 blocks with 24 turns they
-    are 300 000, and all together 60 million.
+
+def _single(model: _MoveModel, own: Ints, spares: Ints | None, now: Floats) -> Changes:
+    """Yield the effects of putting spare blocks into slots; without these, of turns."""
+    gradient = model.slots.gradient(now)
+    for slot in own.tolist():
+        blocks = np.array([slot]) if spares is None else spares
+        _, cost, turn = model.slots.placed(
+            np.full(len(blocks), slot), blocks, model.present, gradient)
+        stays = (blocks[:, None] == slot) & (turn == 0)
+        yield np.where(stays, np.inf, cost).ravel(), np.stack([
+            np.full_like(turn, slot), np.broadcast_to(blocks[:, None], turn.shape), turn],
+            axis=-1).reshape(-1, 1, 3)
+
+
+def _swaps(model: _MoveModel, own: Ints, now: Floats) -> Changes:
+    """Yield the effects of exchanging two blocks, by the best of their turns."""
+    gradient, order = model.slots.gradient(now), np.arange(len(model.mean))
+    for slot in own[:-1].tolist():
+        others = own[own > slot]
+        cost, here, there = model.slots.exchanges(
+            slot, slot, others, order, model.present, gradient)
+        this = np.full(len(others), slot)
+        yield cost, np.stack([np.column_stack([this, others, here]),
+                              np.column_stack([others, this, there])], axis=1)
+
+
+def _cycles(model: _MoveModel, own: Ints, now: Floats) -> Changes:
+    """Yield the effects of cyclic exchanges of three blocks.
+
+    All possible ones are too many. They begin with the 200 best placements by themselves, i into j;
+    each goes on with j into every m, and m into i, by the best of their turns.
     """
-    moved = np.flatnonzero(free & (placements.block < slots)
-                           & (placements.block != placements.to))
-    after = now + placements.change[moved]
-    score = np.einsum("ij,ij->i", after, after) + placements.noise[moved]
-    # number of placements, the best by themselves, from which exchanges of three blocks are formed
     first_of_cycles = 200
-    for first in moved[np.argsort(score, kind="stable")[:first_of_cycles]]:
-        i, j = placements.block[first], placements.to[first]
-        second = moved[(placements.block[moved] == j) & (placements.to[moved] != i)]
-        third = moved[(placements.to[moved] == i) & (placements.block[moved] != j)]
-        here, there = _equal(placements.to[second], placements.block[third])
-        yield np.column_stack([np.full(len(here), first), second[here], third[there]])
-
-
-def _equal(first: Ints, second: Ints) -> tuple[Ints, Ints]:
-    """Return the numbers (k,) of all pairs of equal values of two arrays."""
-    order = np.argsort(second, kind="stable")
-    start, stop = (np.searchsorted(second[order], first, side) for side in ("left", "right"))
-    count = stop - start
-    offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return np.repeat(np.arange(len(first)), count), order[np.repeat(start, count) + offset]
+    slots, order = model.slots, np.arange(len(model.mean))
+    to, block = (each.ravel() for each in np.meshgrid(own, own, indexing="ij"))
+    to, block = to[to != block], block[to != block]
+    delta, cost, turn = slots.placed(to, block, model.present, slots.gradient(now))
+    best = np.argsort(cost, axis=None, kind="stable")[:first_of_cycles]
+    for number in best if len(own) > 2 else ():
+        row, column = np.unravel_index(number, cost.shape)
+        j, i = int(to[row]), int(block[row])
+        others = own[(own != i) & (own != j)]
+        after = now + slots.effect[:, j] @ delta[row, column]
+        more, here, there = slots.exchanges(
+            i, j, others, order, model.present, slots.gradient(after))
+        same = np.ones(len(others), int)
+        yield cost[row, column] + more, np.stack([
+            np.column_stack([j * same, i * same, turn[row, column] * same]),
+            np.column_stack([others, j * same, there]),
+            np.column_stack([i * same, others, here])], axis=1)
 
 
 def _steps_by_gain(

@@ -25,7 +25,7 @@ from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
 from halbach_fe.core.result_folder import Record, Results, finished_results
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import block_in_words
-from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, Picture
+from halbach_fe.report.answer import PAGE_RECORD, PageRecord, Picture
 from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study, differences, magnet_description

@@ -20,7 +20,7 @@ from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.result_folder import result_folder, single_file
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import Answer, Picture
 from halbach_fe.report.campaign_folders import (
     OF_MEASURED,
     WRITTEN,
@@ -30,10 +30,8 @@ from halbach_fe.report.campaign_folders import (
     read_chapters,
     versions,
 )
-from halbach_fe.report.magnet_table import in_one_line
 from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
-from halbach_fe.report.page_record import Picture
-from halbach_fe.report.words import counted, in_a_row
+from halbach_fe.report.words import counted, in_a_row, in_one_line
 from halbach_fe.study.model import Study
 
 PAGE, PAGES = "report.html", (".html", ".htm")

@@ -27,6 +27,7 @@ from halbach_fe.report.page import (
     Table,
     Text,
     View,
+    chart,
     csv_file,
     figure_of,
     legend_above,
@@ -233,8 +234,7 @@ def _temperature_figure(found: DemagnetizationMap) -> Figure:
     # the limit temperature of the last of `SHARES`.
     sweep_k = 40.0
     material = found.material
-    figure = figure_of(3.4)
-    axis = figure.subplots()
+    figure, axis = chart(3.4)
     limit = found.limit_temperature(SHARES[-1])
     last = [material.temperature_C, limit if math.isfinite(limit) else material.temperature_C]
     ends = ((min(last) - sweep_k, max(*last, material.reference_temperature_C))
@@ -246,15 +246,13 @@ def _temperature_figure(found: DemagnetizationMap) -> Figure:
                  label=f"temperature of the magnet, {material.temperature_C:g} °C")
     axis.set(xlabel="temperature in °C", ylabel="volume past the knee in %", ylim=(0, None))
     legend_above(figure, axis)
-    axis.grid(alpha=0.3)
     return figure
 
 
 def _slots_figure(found: DemagnetizationMap) -> Figure:
     """Draw the mean and the smallest H of every block by slot."""
     rows = found.by_block()
-    figure = figure_of(3.4)
-    axis = figure.subplots()
+    figure, axis = chart(3.4)
     slots = np.array([row["slot"] for row in rows])
     for key, words, colour, shift in (("mean_H_A_per_m", "mean", POSTERIOR, -0.15),
                                       ("least_H_A_per_m", "smallest", MEASURED, 0.15)):
@@ -265,7 +263,6 @@ def _slots_figure(found: DemagnetizationMap) -> Figure:
     axis.axhline(0, color=PUBLISHED, lw=0.8)
     axis.set(xlabel="slot", ylabel="H along the\nmagnetization in kA/m")
     legend_above(figure, axis, columns=3)
-    axis.grid(alpha=0.3)
     return figure
 
 

@@ -32,8 +32,8 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
 )
-from halbach_fe.report.point_maps import residual_figure, unit_for
-from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings
+from halbach_fe.report.point_maps import unit_for
+from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings, residual_maps_figure
 
 NONE, UNKNOWN, OUTSIDE = "none", "unknown", "outside the catalogue"
 """Names of the probabilities that nothing is missing, and an unlisted cause, and that in words."""
@@ -277,7 +277,9 @@ def profile(diagnosis: Diagnosis) -> Figure:
     Of scattered points it is what remains of each component, over the points.
     """
     if is_scattered(diagnosis.before):
-        return _residual_maps(diagnosis)
+        return residual_maps_figure(diagnosis.before.observation, {
+            state.when: state.update.readings - state.update.prediction_posterior.mean
+            for state in states(diagnosis)})
     shown, before, after = states(diagnosis), diagnosis.before, diagnosis.after
     label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
     harmonic = name == "harmonic" and connected
@@ -327,23 +329,6 @@ def profile(diagnosis: Diagnosis) -> Figure:
     for axis in (top, bottom):
         axis.grid(alpha=0.3)
     return figure
-
-
-def _residual_maps(diagnosis: Diagnosis) -> Figure:
-    """Draw measured less predicted of all readings, before and after, as maps of the components."""
-    update = diagnosis.before
-    points, number = np.unique(update.observation.positions.round(9), axis=0, return_inverse=True)
-    labels = np.array(update.observation.labels)
-    rows: dict[str, dict[str, Floats]] = {}
-    for label in dict.fromkeys(labels.tolist()):
-        mine = labels == label
-        rows[label] = {}
-        for state in states(diagnosis):
-            values = np.full(len(points), np.nan)
-            values[number.ravel()[mine]] = 1e6 * (
-                state.update.readings - state.update.prediction_posterior.mean)[mine]
-            rows[label][state.when] = values
-    return residual_figure(points, rows, "µT")
 
 
 def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Floats, str, bool]:

@@ -14,7 +14,6 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import inference_summary, write_inference
 from halbach_fe.report.inference_answer import answer
-from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
 from halbach_fe.report.page import (
@@ -26,7 +25,6 @@ from halbach_fe.report.page import (
     SMALL,
     Drawn,
     Figures,
-    Items,
     Page,
     Section,
     Table,
@@ -36,17 +34,23 @@ from halbach_fe.report.page import (
     page_of,
 )
 from halbach_fe.report.prediction import (
-    PublishedErrors,
     has_profile,
     has_residual_maps,
     prediction_profile_figure,
-    relative_error_figure,
     residual_maps_figure,
     standardized_residuals_figure,
     whitened_quantiles_figure,
 )
 from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.words import decimals, flux_density, place_of, ppm, relative, with_error
+from halbach_fe.report.words import (
+    decimals,
+    flux_density,
+    magnet_rows,
+    place_of,
+    ppm,
+    relative,
+    with_error,
+)
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.multipoles import circle_models
@@ -179,14 +183,12 @@ ALIKE = 0.03
 """Range of the contractions of all blocks up to which they are said instead of drawn."""
 
 
-def score_table(result: InferenceResult,
-                published: PublishedErrors | None = None) -> list[dict[str, str]]:
+def score_table(result: InferenceResult) -> list[dict[str, str]]:
     """Return the rows, as text, of the table that compares predictions before and after.
 
     Regions have names if there are several. Before the update, chi² is that of all training
     readings together, which the answer states: in their own row, or in one below those of several
-    regions. Beside published errors, which are medians of relative ones, there are such medians of
-    ours.
+    regions.
     """
     rows, largest = [], float(np.abs(result.readings).max())
     training = ~result.held_out
@@ -206,14 +208,6 @@ def score_table(result: InferenceResult,
                 result.prior_conflict if alone and score.part == TRAINING else score.chi2_prior),
             "chi²/reading, after": _chi2(score.chi2_posterior),
         }
-        if published is not None:
-            inside = np.isin(np.round(published.z, 6), np.round(_z_of_readings(
-                result, score.region, score.part), 6))
-            row["median: prior"] = _percent(score.median_relative_error_prior)
-            row["median: posterior"] = _percent(score.median_relative_error_posterior)
-            row[f"{published.label}: prior"] = _percent(float(np.median(published.prior[inside])))
-            row[f"{published.label}: posterior"] = _percent(
-                float(np.median(published.posterior[inside])))
         rows.append(row)
     if not alone:
         off = [flux_density(float(np.sqrt(np.mean(
@@ -263,26 +257,15 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
 
 
 @page_of.register
-def page(
-    result: InferenceResult, published: PublishedErrors | None = None,
-    assumptions: Sequence[str] = (),
-) -> Page:
-    """Return the page of an updated magnet.
-
-    Parameters
-    ----------
-    published : PublishedErrors, optional
-        Relative errors from the literature to compare with.
-    assumptions : sequence of str
-        Sentences that state what the result rests on.
-    """
+def page(result: InferenceResult) -> Page:
+    """Return the page of an updated magnet."""
     multipoles: list[MultipoleTable] = [
         (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
         for model in ([] if result.is_campaign else circle_models(
             result.magnet, result.observation, result.response))]
-    rows, axis, stray = (score_table(result, published), axis_rows(result.magnetic_axis),
+    rows, axis, stray = (score_table(result), axis_rows(result.magnetic_axis),
                          result.stray_field)
-    profiles = _profiles(result, published)
+    profiles = _profiles(result)
     figures = {**profiles, **_pictures(result), **stray_pictures(stray)}
     doubtful = _doubtful(result)
     files: dict[str, Callable[[Path], object] | None] = {
@@ -294,8 +277,7 @@ def page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [
             Section([*doubtful, Table(block_table(result))], "The blocks that deviate most"),
-            _before_and_after(rows, published is not None), *_sections_of_maps(result),
-            Section([Items(assumptions)] if assumptions else [], "Assumptions"),
+            _before_and_after(rows), *_sections_of_maps(result),
             Section([View(lambda: view_of_inference(result), colours_in_words(result))]),
             Section([] if result.magnetic_axis is None else [
                 *doubtful, f"{definition(result.magnetic_axis)} ± is the standard deviation.",
@@ -330,7 +312,7 @@ def _doubtful(result: InferenceResult) -> list[Text]:
     return [Text(f"{what}: these numbers may be off by more than their ±.", "warning")]
 
 
-def _profiles(result: InferenceResult, published: PublishedErrors | None) -> Figures:
+def _profiles(result: InferenceResult) -> Figures:
     """Return the figures of readings and predictions, the first of which leads the page."""
     profile = ("Readings with the predictions of prior and posterior, and the residuals of the "
                "posterior, along the line of the strongest reading")
@@ -344,12 +326,11 @@ def _profiles(result: InferenceResult, published: PublishedErrors | None) -> Fig
         figures["profile.png"] = partial(prediction_profile_figure, result), profile
     if has_residual_maps(result):
         figures["residual_maps.png"] = (
-            partial(residual_maps_figure, result), "Measured less predicted over the map, before "
+            partial(residual_maps_figure, result.observation, {
+                name: result.readings - each.mean for name, each in (
+                    ("before", result.prediction_prior), ("after", result.prediction_posterior))}),
+            "Measured less predicted over the map, before "
             "and after the update: what remains should be noise, without a pattern")
-    if published is not None:
-        figures["relative_error.png"] = (
-            partial(relative_error_figure, result, published), "Relative error of the predictions "
-            "of prior and posterior along the same line")
     return figures
 
 
@@ -378,12 +359,11 @@ def _pictures(result: InferenceResult) -> Figures:
             "about the block")})
 
 
-def _before_and_after(rows: Sequence[Mapping[str, str]], published: bool) -> Section:
+def _before_and_after(rows: Sequence[Mapping[str, str]]) -> Section:
     """Return the section of the table of scores, and what its columns are."""
     most_turned = 5  # largest number of rows of a table that has a column for each
-    medians = ", and medians of relative errors as they are published" if published else ""
     return Section([
-        f"Before and after the update: rms differences of readings and their predictions{medians}. "
+        "Before and after the update: rms differences of readings and their predictions. "
         "Held-out readings did not update the magnet.",
         Table(rows, "turned" if len(rows) <= most_turned else ""), Text(
             "**of the largest reading**: the rms difference after the update, relative to the "
@@ -472,10 +452,6 @@ def _solver_error(result: InferenceResult) -> str:
 
 def _percent(value: float | None) -> str:
     return NOTHING if value is None else f"{100 * value:.3g}\u00a0%"
-
-
-def _z_of_readings(result: InferenceResult, region: str, part: str) -> Floats:
-    return result.observation.positions[result.chosen(region, part), 2]
 
 
 def _figure_height(rings: int) -> float:

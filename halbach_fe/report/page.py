@@ -35,8 +35,15 @@ from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.measurement.tables import write_csv
-from halbach_fe.report.answer import Answer, inputs_of_command
-from halbach_fe.report.page_record import DPI, SMALLEST_PT, WIDEST_IN, Picture, write_record
+from halbach_fe.report.answer import (
+    DPI,
+    SMALLEST_PT,
+    WIDEST_IN,
+    Answer,
+    Picture,
+    inputs_of_command,
+    write_record,
+)
 from halbach_fe.report.words import faults_in_words
 from halbach_fe.study.edit_file import study_text, write_edited
 from halbach_fe.study.model import Study, is_nonlinear
@@ -374,6 +381,14 @@ def _item(value: Any) -> Any:
 def figure_of(height_in: float, width_in: float = WIDEST_IN) -> Figure:
     """Return an empty figure of a height and width in inches, no wider than `WIDEST_IN`."""
     return Figure(figsize=(min(width_in, WIDEST_IN), height_in), layout="constrained")
+
+
+def chart(height_in: float, width_in: float = WIDEST_IN) -> tuple[Figure, Axes]:
+    """Return a figure with a single grid, and its axes."""
+    figure = figure_of(height_in, width_in)
+    axis = figure.subplots()
+    axis.grid(alpha=0.3)
+    return figure, axis
 
 
 def legend_above(figure: Figure, *axes: Axes, columns: int = 2) -> None:

@@ -24,6 +24,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
+    chart,
     csv_file,
     draw_cross_section,
     figure_of,
@@ -181,11 +182,11 @@ def page(plan: MeasurementPlan) -> Page:
                 partial(_positions_figure, magnet, plan), "Candidate positions, chosen positions "
                 "coloured by the order of choice, and the study's own positions as rings"),
             "plan_information.png": (
-                partial(_pattern_figure, plan), "Standard deviation of a pattern of blocks in per "
+                partial(_left_figure, plan), "Standard deviation of a pattern of blocks in per "
                 "cent of the prior's, in the geometric mean over all patterns, against the number "
                 "of positions, for the plan and for evenly spread positions of the study")
             if plan.deviation is None else (
-                partial(_deviation_figure, plan), "Standard deviation of the deviation of |B| in "
+                partial(_left_figure, plan), "Standard deviation of the deviation of |B| in "
                 "the study's region against the number of positions, for the plan and for evenly "
                 "spread positions of the study"),
             "plan_blocks.png": (
@@ -316,41 +317,24 @@ def _draw_points(
     return shown
 
 
-def _pattern_figure(plan: MeasurementPlan) -> Figure:
-    """Draw the geometric mean over all patterns of blocks of the sd after the readings."""
-    def left(gain: Floats) -> Floats:
-        """Return that mean in per cent of the prior's, of information in nats."""
-        return 100 * _pattern_sd(plan, gain)
-
-    figure = figure_of(4)
-    axis = figure.subplots()
-    axis.plot(range(1, len(plan.gain) + 1), left(plan.gain), color=POSTERIOR, label="plan")
-    axis.plot(plan.baseline_counts, left(plan.baseline_gain), color=PRIOR,
+def _left_figure(plan: MeasurementPlan) -> Figure:
+    """Draw what is left unknown against the number of positions: of the deviation of |B|, or of all
+    patterns of blocks in the geometric mean.
+    """
+    if plan.deviation is None:
+        planned, study = (100 * _pattern_sd(plan, gain) for gain in (plan.gain, plan.baseline_gain))
+        label = "sd of a pattern in % of the prior's"
+    else:
+        planned, study = plan.deviation.planned, plan.deviation.baseline
+        label = "sd of the deviation of |B| in ppm rms"
+    figure, axis = chart(4)
+    axis.plot(range(1, len(planned) + 1), planned, color=POSTERIOR, label="plan")
+    axis.plot(plan.baseline_counts, study, color=PRIOR,
               label="as many positions of the study, evenly spread")
-    axis.axhline(left(plan.baseline_gain)[-1], color=MEASURED, lw=1.2, ls=":",
+    axis.axhline(study[-1], color=MEASURED, lw=1.2, ls=":",
                  label=f"all {len(plan.baseline)} positions of the study")
-    axis.set(xlabel="positions", ylabel="sd of a pattern in % of the prior's", xlim=(0, None),
-             yscale="log")
+    axis.set(xlabel="positions", ylabel=label, xlim=(0, None), yscale="log")
     label_logarithmic(axis.yaxis)
-    axis.grid(alpha=0.3)
-    legend_above(figure, axis)
-    return figure
-
-
-def _deviation_figure(plan: MeasurementPlan) -> Figure:
-    """Draw what is left unknown of the deviation of |B| against the number of points."""
-    assert plan.deviation is not None
-    figure = figure_of(4)
-    axis = figure.subplots()
-    axis.plot(range(1, len(plan.gain) + 1), plan.deviation.planned, color=POSTERIOR, label="plan")
-    axis.plot(plan.baseline_counts, plan.deviation.baseline, color=PRIOR,
-              label="as many positions of the study, evenly spread")
-    axis.axhline(plan.deviation.baseline[-1], color=MEASURED, lw=1.2, ls=":",
-                 label=f"all {len(plan.baseline)} positions of the study")
-    axis.set(xlabel="positions", ylabel="sd of the deviation of |B| in ppm rms", xlim=(0, None),
-             yscale="log")
-    label_logarithmic(axis.yaxis)
-    axis.grid(alpha=0.3)
     legend_above(figure, axis)
     return figure
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,13 +21,14 @@ from halbach_fe.inference.result import (
     InferenceResult,
     Prediction,
 )
+from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
     PRIOR,
     PUBLISHED,
-    figure_of,
+    chart,
     legend_above,
     stacked_axes,
 )
@@ -43,26 +44,6 @@ FAR = 12.0
 
 FEWEST_ON_A_LINE = 5
 """Fewest readings of a profile."""
-
-
-@dataclass(frozen=True)
-class PublishedErrors:
-    """Relative errors from the literature for the same readings.
-
-    Attributes
-    ----------
-    label : str
-        Name of the source in legends.
-    z : ndarray, shape (n,), in m
-        Positions, increasing.
-    prior, posterior : ndarray, shape (n,)
-        Relative errors of the predictions at z.
-    """
-
-    label: str
-    z: Floats
-    prior: Floats
-    posterior: Floats
 
 
 @dataclass(frozen=True)
@@ -158,7 +139,7 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
     residual, band = factor * difference, factor * band
     bottom.fill_between(line.place, -band, band, color=POSTERIOR, alpha=0.2, lw=0, step="mid",
                         label="95 % band (prediction and noise)")
-    for part, mask in _parts(result, index):
+    for part, mask in parts_of(result, index):
         for axis, values in ((top, 1e3 * measured), (bottom, residual)):
             axis.plot(line.place[mask], values[mask], ls="none", color=MEASURED, **MARKERS[part],
                       label=f"measured, {part}" if axis is top else None)
@@ -195,13 +176,12 @@ def has_residual_maps(result: InferenceResult) -> bool:
     return len(points) >= FEWEST_ON_A_LINE and curve(points) is None
 
 
-def residual_maps_figure(result: InferenceResult) -> Figure:
-    """Draw measured less predicted, before and after the update, over the points of the map."""
-    observation = result.observation
+def residual_maps_figure(
+    observation: Observation, residuals: Mapping[str, Floats]
+) -> Figure:
+    """Draw measured less predicted (readings,) in T, by name, over the points of the map."""
     points, number = np.unique(observation.positions.round(9), axis=0, return_inverse=True)
-    before, after = result.readings - np.array(
-        [result.prediction_prior.mean, result.prediction_posterior.mean])
-    factor, unit = unit_for(float(np.abs(before).max()))
+    factor, unit = unit_for(max(float(np.abs(each).max()) for each in residuals.values()))
     labels = np.array(observation.labels)
 
     def at_points(label: str, residual: Floats) -> Floats:
@@ -211,31 +191,8 @@ def residual_maps_figure(result: InferenceResult) -> Figure:
         return values
 
     return residual_figure(points, {label: {
-        "before": at_points(label, before), "after": at_points(label, after)}
+        name: at_points(label, residual) for name, residual in residuals.items()}
         for label in dict.fromkeys(observation.labels)}, unit)
-
-
-def relative_error_figure(result: InferenceResult, published: PublishedErrors | None) -> Figure:
-    """Draw the relative error |measured - predicted| / |measured| along the main line."""
-    line = main_line(result)
-    figure, (axis,) = stacked_axes(1)
-    figure.set_figheight(4.5)
-    if published is not None:
-        axis.semilogy(1e3 * published.z, published.prior, ":", color=PUBLISHED, lw=1,
-                      label=f"{published.label}, prior")
-        axis.semilogy(1e3 * published.z, published.posterior, "-", color=PUBLISHED, lw=1,
-                      label=f"{published.label}, posterior")
-    for name, prediction, colour in _predictions(result):
-        error = result.relative_error(prediction)[line.index]
-        axis.semilogy(line.place, error, "-", color=colour, lw=1, label=name)
-        for part, mask in _parts(result, line.index):
-            if part != TRAINING:
-                axis.semilogy(line.place[mask], error[mask], ls="none", color=colour,
-                              label=f"{name}, {part}", **MARKERS[part])
-    axis.set_xlabel(line.axis)
-    axis.set_ylabel(f"|measured − predicted| / |measured| of {line.what}")
-    legend_above(figure, axis)
-    return figure
 
 
 def standardized_residuals_figure(result: InferenceResult) -> Figure:
@@ -243,9 +200,9 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
     crowd = 3000  # number of readings from which smaller, transparent markers are used
     place, label = axis_of_readings(result)
     figure, axes = stacked_axes(2)
-    for axis, (name, prediction, colour) in zip(axes, _predictions(result), strict=True):
+    for axis, (name, prediction, colour) in zip(axes, predictions(result), strict=True):
         scores = result.standardized(prediction)
-        for part, mask in _parts(result, np.arange(len(scores))):
+        for part, mask in parts_of(result, np.arange(len(scores))):
             style = {"marker": ".", "ms": 1.5} if len(scores) > crowd else MARKERS[part]
             axis.plot(place[mask], scores[mask], ls="none", label=part, **style,
                       color=MEASURED if part == TRAINING else colour,
@@ -270,8 +227,7 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
     out, they are those of the training readings for the prior, which does not depend on them.
     """
     drawn_quantiles = 2000  # largest number of quantiles that are drawn
-    figure = figure_of(5.4, 5.2)
-    axis = figure.subplots()
+    figure, axis = chart(5.4, 5.2)
     unseen = result.held_out.any()
     chosen = result.held_out if unseen else ~result.held_out
     count = int(chosen.sum())
@@ -283,25 +239,24 @@ def whitened_quantiles_figure(result: InferenceResult) -> Figure:
         label="95 % band of each quantile,\nif the model is right")
     axis.axline((0, 0), slope=1, color=PUBLISHED, lw=0.8)
     found = []
-    for name, prediction, colour in _predictions(result)[: 2 if unseen else 1]:
+    for name, prediction, colour in predictions(result)[: 2 if unseen else 1]:
         found.append(np.sort(result.whitened(prediction, chosen))[rank - 1])
         axis.plot(normal, found[-1], "." if name == "prior" else "x", color=colour, ms=4, mew=0.8,
                   label=name)
     axis.set(xlabel="normal quantile", ylabel="whitened residual, "
              + ("held-out readings" if unseen else "training readings"))
     _scale(axis, np.concatenate(found))
-    axis.grid(alpha=0.3)
     legend_above(figure, axis, columns=1)
     return figure
 
 
-def _predictions(result: InferenceResult) -> list[tuple[str, Prediction, str]]:
+def predictions(result: InferenceResult) -> list[tuple[str, Prediction, str]]:
     """Return name, prediction and colour of prior and posterior."""
     return [("prior", result.prediction_prior, PRIOR),
             ("posterior", result.prediction_posterior, POSTERIOR)]
 
 
-def _parts(result: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def parts_of(result: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield each part of the readings that is present, and the mask of its readings."""
     parts = np.array(result.parts)[index]
     for part in MARKERS:

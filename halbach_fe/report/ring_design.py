@@ -24,6 +24,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
+    chart,
     csv_file,
     figure_of,
     legend_above,
@@ -141,8 +142,7 @@ def _columns(found: Designed) -> dict[str, Iterable[object]]:
 
 def front_figure(found: Designed) -> Figure:
     """Draw the deviation of all designs over their field."""
-    figure = figure_of(3.6)
-    axis = figure.subplots()
+    figure, axis = chart(3.6)
     field = [1e3 * one.mean_T for one in found.front]
     axis.plot(field, [one.peak_to_peak_ppm for one in found.front], "o-", color=PRIOR,
               label="peak to peak")
@@ -153,7 +153,6 @@ def front_figure(found: Designed) -> Figure:
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))  # others would touch each other
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: ppm(value)))
     axis.yaxis.set_minor_formatter(NullFormatter())
-    axis.grid(alpha=0.3)
     legend_above(figure, axis, columns=3)
     return figure
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,6 +33,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
+    chart,
     draw_cross_section,
     figure_of,
     legend_above,
@@ -40,7 +42,7 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
 from halbach_fe.response.deviations import DeviationModel
-from halbach_fe.response.multipoles import plain, text_table
+from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")
 
@@ -63,7 +65,8 @@ DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change pl
 def _summary(shim: Shim) -> dict[str, object]:
     """Return the content of shim.json."""
     return {
-        "study": shim.study.name, **_content(shim),
+        "study": shim.study.name, **values_summary(shim.model, shim.limit, dict(zip(
+            ("before", "after"), shim.fields or (shim.before, shim.after), strict=True))),
         "moves": [_step_summary(shim, step) for step in shim.steps],
         "stop": shim.stop, "moves_there_are": shim.tried,
         "probability_within_limit": None if shim.within is None else {
@@ -75,15 +78,56 @@ def _summary(shim: Shim) -> dict[str, object]:
     }
 
 
-def _content(shim: Shim) -> dict[str, object]:
-    """Return multipoles or homogeneity, and what they refer to, as entries of shim.json."""
-    if shim.fields is not None:
-        before, after = map(plain_homogeneity, shim.fields)
-        return {"region": asdict(shim.model.homogeneity.region), "limit_ppm": shim.limit,
-                "before": before, "after": after}
-    unit = shim.model.unit
-    return {"reference": reference_summary(shim.model, shim.limit),
-            "before": plain(shim.before, unit), "after": plain(shim.after, unit)}
+class Aim(NamedTuple):
+    """What blocks are moved for, in words: small multipoles, or a homogeneous field."""
+
+    what: str
+    """Subject and verb of what is made small."""
+    unit: str
+    """The unit of a value in names of JSON files."""
+    rms_unit: str
+    """The unit of the rms of all values in sentences."""
+    title: str
+    """Title of the table of the values."""
+    axis: str
+    """Name of their rms in figures."""
+    table: str
+    """Kind of the table, see `Table`."""
+    size: Callable[[float], str]
+    """Text of an rms."""
+    verb: str
+    """The command that shows the values."""
+
+
+def aim_of(model: MultipoleModel | DeviationModel) -> Aim:
+    """Return what a model is of."""
+    if isinstance(model, DeviationModel):
+        region = model.homogeneity.region.text
+        return Aim(f"the deviation of |B| in {region} is", "ppm", "ppm rms",
+                   f"Deviations of |B| in {region}", "the deviation of |B| in ppm", "turned", ppm,
+                   "homogeneity")
+    return Aim("the unwanted multipoles are", "units", "units of 1e-4 rms",
+               "Multipoles in units of 1e-4", "the unwanted multipoles in units of 1e-4", "numbers",
+               "{:.3g}".format, "multipoles")
+
+
+def values_summary(
+    model: MultipoleModel | DeviationModel, limit: float | None, values: Mapping[str, Any],
+) -> dict[str, object]:
+    """Return multipoles or fields by name, and what they refer to, as entries of a JSON file."""
+    if isinstance(model, DeviationModel):
+        return {"region": asdict(model.homogeneity.region), "limit_ppm": limit,
+                **{name: plain_homogeneity(each) for name, each in values.items()}}
+    return {"reference": reference_summary(model, limit),
+            **{name: plain(each, model.unit) for name, each in values.items()}}
+
+
+def values_table(
+    model: MultipoleModel | DeviationModel, values: Mapping[str, Any]
+) -> list[dict[str, str]]:
+    """Return rows of text with multipoles or fields by name."""
+    return (homogeneity_rows(values) if isinstance(model, DeviationModel)
+            else text_table(**values))
 
 
 def _reason_against(shim: Shim) -> str:
@@ -102,22 +146,13 @@ def _gained(shim: Shim) -> float:
     return 1 - shim.after.rms / shim.before.rms
 
 
-def _unit(shim: Shim) -> str:
-    """Return the unit of the values in names of shim.json."""
-    return "units" if shim.fields is None else "ppm"
-
-
-def _size(shim: Shim, rms: float) -> str:
-    """Return an rms of the values as text."""
-    return f"{rms:.3g}" if shim.fields is None else ppm(rms)
-
-
 def _step_summary(shim: Shim, step: Step) -> dict[str, object]:
     """Return a move and its gain as entries of shim.json."""
+    unit = aim_of(shim.model).unit
     return {"kind": step.move.kind,
             "blocks": [_placement_summary(shim, placement) for placement in step.move.placements],
-            f"gain_{_unit(shim)}2": step.gain, f"gain_sd_{_unit(shim)}2": step.gain_sd,
-            f"rms_after_{_unit(shim)}": step.after.rms}
+            f"gain_{unit}2": step.gain, f"gain_sd_{unit}2": step.gain_sd,
+            f"rms_after_{unit}": step.after.rms}
 
 
 def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
@@ -131,19 +166,13 @@ def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
 
 def _move_table(shim: Shim) -> list[dict[str, str]]:
     """Return the rows of the table of moves, as text."""
+    aim = aim_of(shim.model)
     return [{"move": f"{number}: {step.move.kind}",
              "blocks": "; ".join(_placement_text(shim, placement)
                                  for placement in step.move.placements),
-             f"rms after in {_unit(shim)}": _size(shim, step.after.rms),
+             f"rms after in {aim.unit}": aim.size(step.after.rms),
              "gain in its sd": f"{step.gain / step.gain_sd:.1f}" if step.gain_sd else "exact"}
             for number, step in enumerate(shim.steps, start=1)]
-
-
-def _value_table(shim: Shim) -> list[dict[str, str]]:
-    """Return the rows of the table of multipoles or fields before and after, as text."""
-    if shim.fields is None:
-        return text_table(**_compared(shim, shim.before, shim.after))
-    return homogeneity_rows(_compared(shim, *shim.fields))
 
 
 def _compared(shim: Shim, before: T, after: T) -> dict[str, T]:
@@ -186,16 +215,11 @@ def _place_text(shim: Shim, number: int) -> str:
 def answer(shim: Shim) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
     question = "Which blocks should be exchanged, turned or replaced?"
-    before, after = (_size(shim, known.rms) for known in (shim.before, shim.after))
-    if shim.fields is None:
-        what, unit = "the unwanted multipoles are", "units of 1e-4 rms"
-        within = "All unwanted multipoles are within {} units"
-        see = "multipoles"
-    else:
-        region = shim.model.homogeneity.region.text
-        what, unit = f"the deviation of |B| in {region} is", "ppm rms"
-        within = "The deviation is within {} ppm rms"
-        see = "homogeneity"
+    aim = aim_of(shim.model)
+    before, after = (aim.size(known.rms) for known in (shim.before, shim.after))
+    what, unit = aim.what, aim.rms_unit
+    within = ("All unwanted multipoles are within {} units" if shim.fields is None else
+              "The deviation is within {} ppm rms")
     if shim.steps:
         moves = counted(len(shim.steps), "move")
         said = (f"{what} expected to fall from {before} to {after} {unit}, including the "
@@ -243,8 +267,8 @@ def answer(shim: Shim) -> Answer:
             (make,
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
-            (f"See the {see} of the magnet as it is.",
-             f"halbach-fe {see} STUDY --posterior POSTERIOR -o DIR")),
+            (f"See the {aim.verb} of the magnet as it is.",
+             f"halbach-fe {aim.verb} STUDY --posterior POSTERIOR -o DIR")),
         sound=not shim.result.reservation)
 
 
@@ -300,8 +324,8 @@ def _unknown_part(shim: Shim) -> str:
     known = shim.before.rms_of_mean
     if known**2 > shim.before.rms**2 / 2:
         return ""
-    unit = "units" if shim.fields is None else "ppm"
-    return (f", which is most of it: {_size(shim, known)} {unit} are known to be there. Measured "
+    aim = aim_of(shim.model)
+    return (f", which is most of it: {aim.size(known)} {aim.unit} are known to be there. Measured "
             "blocks (--blocks) or a map at more places would tell more")
 
 
@@ -314,13 +338,11 @@ def page(shim: Shim) -> Page:
     """
     against = _reason_against(shim)
     move_title = "Moves that would be made" if against else "Moves"
-    moves, rows = _move_table(shim), _value_table(shim)
-    multipoles = shim.fields is None
-    title = ("Multipoles in units of 1e-4" if multipoles else
-             f"Deviations of |B| in {shim.model.homogeneity.region.text}")
-    sections = [Section([_convention(shim), Table(rows, "numbers" if multipoles else "turned"),
-                         *linearized(shim.study)], title)]
-    figures = {} if not multipoles else {"shim_multipoles.png": (
+    aim, moves = aim_of(shim.model), _move_table(shim)
+    rows = values_table(shim.model, _compared(shim, *(shim.fields or (shim.before, shim.after))))
+    sections = [Section([_convention(shim), Table(rows, aim.table), *linearized(shim.study)],
+                        aim.title)]
+    figures = {} if shim.fields else {"shim_multipoles.png": (
         partial(multipole_figure, _compared(shim, shim.before, shim.after), shim.limit),
         f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
         "and skew (right); bars are two standard deviations")}
@@ -335,7 +357,7 @@ def page(shim: Shim) -> Page:
                 "move, including the uncertainty")}
     shimmed, note = shim.shimmed_study, f"shimmed: {len(shim.steps)} moves"
     return Page("shim", "how to shim it", shim.study, answer(shim), _summary(shim), sections,
-                {move_title: moves, title: rows}, rows, figures, new_study=(
+                {move_title: moves, aim.title: rows}, rows, figures, new_study=(
         None if shimmed is None else (STUDY_FILE, lambda: [(shimmed, note)])))
 
 
@@ -417,12 +439,10 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
 
 def _gain_figure(shim: Shim) -> Figure:
     """Draw the rms of the values against the number of moves."""
-    figure = figure_of(3.4)
-    axis = figure.subplots()
+    figure, axis = chart(3.4)
     sizes = [known.rms for known in (shim.before, *(step.after for step in shim.steps))]
     axis.plot(sizes, "-o", color=POSTERIOR)
     axis.set(xlabel="moves", ylim=(0, 1.08 * max(sizes)), ylabel="rms of |c$_n$| in units of 1e-4"
              if shim.fields is None else "rms deviation of |B| in ppm")
     axis.set_xticks(range(len(sizes)))
-    axis.grid(alpha=0.3)
     return figure

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import (
     MultipoleTable,
@@ -38,7 +37,15 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.words import ROUNDING, counted, decimals, flux_density, is_fourier, relative
+from halbach_fe.report.words import (
+    ROUNDING,
+    counted,
+    decimals,
+    flux_density,
+    is_fourier,
+    magnet_rows,
+    relative,
+)
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution, write_solution
 from halbach_fe.solver.formulation_choice import finer_in_words

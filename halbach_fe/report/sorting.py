@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -13,13 +13,12 @@ from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.sorting import SortedBlocks, types_in_words
 from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
+from halbach_fe.report.homogeneity import SIZES
 from halbach_fe.report.multipoles import (
     lacks_main,
     main_in_words,
     multipole_figure,
     of_no_main,
-    reference_summary,
     reference_text,
 )
 from halbach_fe.report.page import (
@@ -35,9 +34,9 @@ from halbach_fe.report.page import (
     legend_above,
     page_of,
 )
+from halbach_fe.report.shimming import aim_of, values_summary, values_table
 from halbach_fe.report.words import counted, in_a_row, ppm
 from halbach_fe.response.deviations import DeviationModel
-from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")
 
@@ -54,9 +53,10 @@ all ranges of the page do."""
 
 def _summary(found: SortedBlocks) -> dict[str, object]:
     """Return the content of sort.json; rms values are those of the mean."""
-    unit = "units" if found.fields is None else "ppm"
+    unit = aim_of(found.model).unit
     return {
-        "study": found.study.name, **_content(found),
+        "study": found.study.name, **values_summary(found.model, found.limit, dict(zip(
+            ("sorted", "unsorted"), found.fields or (found.best, found.numbered), strict=True))),
         "blocks": len(found.table), "left_over": found.left_over,
         "table_order": found.own_order, "turned": [
             {"serial": found.table.serial[row], "ring": int(found.table.ring[row]),
@@ -69,18 +69,6 @@ def _summary(found: SortedBlocks) -> dict[str, object]:
             found.random, QUANTILES).tolist(), strict=True)),
         f"best_random_{unit}": float(found.random.min()),
     }
-
-
-def _content(found: SortedBlocks) -> dict[str, object]:
-    """Return multipoles or homogeneity, and what they refer to, as entries of sort.json."""
-    if isinstance(found.model, DeviationModel) and found.fields is not None:
-        best, own = found.fields
-        return {"region": asdict(found.model.homogeneity.region), "limit_ppm": found.limit,
-                "sorted": plain_homogeneity(best), "unsorted": plain_homogeneity(own)}
-    assert isinstance(found.model, MultipoleModel)
-    unit = found.model.unit
-    return {"reference": reference_summary(found.model, found.limit),
-            "sorted": plain(found.best, unit), "unsorted": plain(found.numbered, unit)}
 
 
 def _turned_rows(found: SortedBlocks) -> list[int]:
@@ -117,9 +105,8 @@ def place_table(found: SortedBlocks) -> list[dict[str, str]]:
 
 def order_table(found: SortedBlocks) -> list[dict[str, str]]:
     """Return the rows of the table of multipoles or fields, as text."""
-    if found.fields is not None:
-        return homogeneity_rows(_compared(found, *found.fields))
-    return text_table(**_compared(found, found.best, found.numbered))
+    return values_table(found.model, _compared(
+        found, *(found.fields or (found.best, found.numbered))))
 
 
 def _compared(found: SortedBlocks, best: T, own: T) -> dict[str, T]:
@@ -147,14 +134,10 @@ def _answer(found: SortedBlocks) -> Answer:
     """Return the answer of a table that is of this magnet."""
     best, own = found.best.rms_of_mean, found.numbered.rms_of_mean
     low, high = np.quantile(found.random, QUANTILES[::2])
-    if isinstance(found.model, DeviationModel):
-        region = found.model.homogeneity.region.text
-        what, unit, text = f"the deviation of |B| in {region} is", "ppm rms", ppm
-        sizes = "" if found.fields is None else " ({} instead of {} peak to peak)".format(
-            *(ppm(each.peak_to_peak_ppm) for each in found.fields))
-    else:
-        what, unit, sizes = "the unwanted multipoles are", "units of 1e-4 rms", ""
-        text = "{:.3g}".format
+    aim = aim_of(found.model)
+    what, unit, text = aim.what, aim.rms_unit, aim.size
+    sizes = "" if found.fields is None else " ({} instead of {} peak to peak)".format(
+        *(ppm(each.peak_to_peak_ppm) for each in found.fields))
     question = "Which block goes into which slot?"
     left = ("" if not found.left_over else f" {counted(found.left_over, 'block')} "
             f"{'is' if found.left_over == 1 else 'are'} left over.")
@@ -231,11 +214,9 @@ def _uncertainty(found: SortedBlocks) -> float:
 @page_of.register
 def page(found: SortedBlocks) -> Page:
     """Return the page of blocks that were assigned to slots."""
-    in_a_region = isinstance(found.model, DeviationModel)
-    title = (f"Deviations of |B| in {found.model.homogeneity.region.text}"
-             if isinstance(found.model, DeviationModel) else "Multipoles in units of 1e-4")
+    aim = aim_of(found.model)
     rows, places = order_table(found), place_table(found)
-    figures = {} if in_a_region else {"sort_multipoles.png": (
+    figures = {} if found.fields else {"sort_multipoles.png": (
         partial(multipole_figure, _compared(found, found.best, found.numbered), found.limit),
         "Unwanted multipoles of the blocks" + (
             " in the order of the table and of the sorted blocks" if _chose(found) else "")
@@ -243,7 +224,7 @@ def page(found: SortedBlocks) -> Page:
     if found.matters:
         figures["sort_orders.png"] = (
             partial(_random_orders_figure, found), "Histogram of the root mean square of "
-            f"{_axis_text(found)} for {len(found.random)} random orders of the blocks; the lines "
+            f"{aim.axis} for {len(found.random)} random orders of the blocks; the lines "
             "are the order of the table and the sorted blocks")
     turned = _turned_rows(found)
     files = {"blocks.sorted.csv": partial(write_blocks, found.table)} | ({} if not turned else {
@@ -260,12 +241,12 @@ def page(found: SortedBlocks) -> Page:
         Section(["Blocks go only into slots of their own type."]),
         Section([by_serial, Table(places)], "Which block goes where",
                 folded=len(places) > 12),
-        Section([_convention(found), Table(rows, "turned" if in_a_region else "numbers")], title),
+        Section([_convention(found), Table(rows, aim.table)], aim.title),
         *([Section([
             "Each is put into its slot as it was measured, and then turned about its own axes. "
             "The moments in blocks.sorted.csv are those of the turned blocks.",
             Table(_turn_table(found))], "Blocks that are turned in their slots")]
-          if turned else [])], {title: rows}, figures=figures, files=files)
+          if turned else [])], {aim.title: rows}, figures=figures, files=files)
 
 
 def _convention(found: SortedBlocks) -> str:
@@ -279,12 +260,6 @@ def _convention(found: SortedBlocks) -> str:
             f"{main_in_words(found.model, found.best)}.")
 
 
-def _axis_text(found: SortedBlocks) -> str:
-    """Return what is sorted for."""
-    return ("the deviation of |B| in ppm" if isinstance(found.model, DeviationModel)
-            else "the unwanted multipoles in units of 1e-4")
-
-
 def _random_orders_figure(found: SortedBlocks) -> Figure:
     """Draw the histogram of the rms of random orders."""
     figure = figure_of(3.6)
@@ -292,7 +267,7 @@ def _random_orders_figure(found: SortedBlocks) -> Figure:
     axis.hist(found.random, 50, color=PUBLISHED, label="random orders")
     axis.axvline(found.numbered.rms_of_mean, color=PRIOR, lw=2, ls="--", label=found.own_order)
     axis.axvline(found.best.rms_of_mean, color=POSTERIOR, lw=2, label="sorted")
-    axis.set(xlabel=f"rms of {_axis_text(found)}", ylabel="random orders")
+    axis.set(xlabel=f"rms of {aim_of(found.model).axis}", ylabel="random orders")
     begin_at_zero(axis)
     legend_above(figure, axis, columns=3)
     return figure

@@ -30,6 +30,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     begin_at_zero,
+    chart,
     figure_of,
     legend_above,
     linearized,
@@ -213,8 +214,7 @@ def _drawn(study: Study, draws: str) -> str:
 
 def _size_quantiles_figure(found: Tolerance) -> Figure:
     """Draw median and quantiles of |c_n| by order."""
-    figure = figure_of(3.6)
-    axis = figure.subplots()
+    figure, axis = chart(3.6)
     place = np.arange(len(found.model.orders))
     low, middle, high = found.quantiles[:3]
     axis.errorbar(place, middle, [middle - low, high - middle], fmt="o", color=POSTERIOR, capsize=4)
@@ -223,14 +223,12 @@ def _size_quantiles_figure(found: Tolerance) -> Figure:
         legend_above(figure, axis)
     axis.set_xticks(place, [f"c$_{{{order}}}$" for order in found.model.orders])
     axis.set(ylabel="|c$_n$| in units", ylim=(0, None))
-    axis.grid(alpha=0.3)
     return figure
 
 
 def _largest_multipole_figure(found: Tolerance) -> Figure:
     """Draw the distribution function of the largest |c_n|."""
-    figure = figure_of(3.6)
-    axis = figure.subplots()
+    figure, axis = chart(3.6)
     largest = np.sort(found.sizes.max(axis=1))
     axis.plot(largest, np.arange(1, len(largest) + 1) / len(largest), color=POSTERIOR)
     if found.limit is not None:
@@ -240,7 +238,6 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     axis.set(xlabel="limit of all |c$_n$| in units", ylabel="share of magnets", ylim=(0, 1.02))
     begin_at_zero(axis)
     axis.ticklabel_format(axis="x", useOffset=False)
-    axis.grid(alpha=0.3)
     return figure
 
 

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.magnet_table import magnet_rows
 from halbach_fe.report.magnet_view_3d import ViewPoints, field_points, view_of_nominal_magnet
 from halbach_fe.report.page import (
     MEASURED,
@@ -39,6 +38,7 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     is_fourier,
+    magnet_rows,
     ppm,
     relative,
 )

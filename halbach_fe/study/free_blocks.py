@@ -17,7 +17,6 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.study.grades import Material, columns_with_grades
-from halbach_fe.study.polygons import crossing
 from halbach_fe.study.types import (
     MAX_LENGTH_M,
     MIN_LENGTH_M,
@@ -28,6 +27,7 @@ from halbach_fe.study.types import (
     RecoilPermeability,
     Remanence,
     StudyModel,
+    crossing,
 )
 
 Shape = Literal["cuboid", "sector", "trapezoid", "cylinder", "polygon", "prism"]

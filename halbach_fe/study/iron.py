@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from halbach_fe.study import materials
-from halbach_fe.study.polygons import crossing
 from halbach_fe.study.types import (
     MAX_LENGTH_M,
     Coordinate,
@@ -18,6 +17,7 @@ from halbach_fe.study.types import (
     Places,
     Rotation,
     StudyModel,
+    crossing,
 )
 
 

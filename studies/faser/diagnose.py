@@ -25,6 +25,7 @@ import numpy as np
 import xarray as xr
 from averages import READINGS, Fitted, fit
 from matplotlib.figure import Figure
+from published import PublishedErrors
 from run import HERE, Z_STEP_M, profile_to_map
 
 from halbach_fe.cli import common
@@ -54,7 +55,6 @@ from halbach_fe.report.page import (
     draw_cross_section,
     write_files,
 )
-from halbach_fe.report.prediction import PublishedErrors
 from halbach_fe.report.registration import place_table, pose_table
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import read_study

@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from published import PublishedErrors, median_table, page
 
 from halbach_fe.cli import common
 from halbach_fe.cli.options import positive_number
@@ -22,9 +23,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
-from halbach_fe.report.inference import page, score_table
 from halbach_fe.report.page import write_files
-from halbach_fe.report.prediction import PublishedErrors
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 
@@ -95,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         update = infer(build_magnet(study), read_map(measured), session)
     written = write_files(page(update, published, assumptions(update, arguments.z_step_m)),
                           arguments.output)
-    common.print_table(score_table(update, published),
+    common.print_table(median_table(update, published),
                        "Median relative error of B_x on the axis, before and after the update")
     common.say(f"Report: {written}")
     return 0

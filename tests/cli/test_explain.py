@@ -11,8 +11,7 @@ import tomlkit
 from halbach_fe.cli import main
 from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.report.answer import Answer
-from halbach_fe.report.page_record import PAGE_RECORD, PageRecord, write_record
+from halbach_fe.report.answer import PAGE_RECORD, Answer, PageRecord, write_record
 from tests.diagnosis.campaign import CIRCLES, NOISE_T, STUDY, drawn, field
 from tests.support.cuboids import DOCUMENT
 

@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.design import shimming
 from halbach_fe.design.remounting import mounts_of, remounted, rotation_deg, shape_turns
 from halbach_fe.design.shimming import gain, shim, taken_out
 from halbach_fe.geometry.blocks import rotation_matrix
@@ -274,25 +273,6 @@ def test_the_best_swap_is_found(one_magnet, generator):
                     best = min(best, float(values @ values)) if ok else best
     # the best by the mean need not be that of the largest expected gain: by the variances only
     assert float(found.after.mean @ found.after.mean) < best + np.sum(found.after.root**2)
-
-
-def moves(found):
-    """The kind of every move, and where it puts which block."""
-    return [(step.move.kind, {(one.to, one.block) for one in step.move.placements})
-            for step in found.steps]
-
-
-def test_cycles_in_small_parts_are_the_same(one_magnet, generator, monkeypatch):
-    """Moves are evaluated so many at a time; the control keeps the moves of the last part only."""
-    _, update, model, _ = one_magnet
-    found = shim(update, model, generator, {"cycle": 2, "swap": 1})
-    monkeypatch.setattr(shimming, "AT_ONCE", 7)
-    again = shim(update, model, generator, {"cycle": 2, "swap": 1})
-    assert moves(again) == moves(found)
-    cycles = shimming._cycles
-    monkeypatch.setattr(shimming, "_cycles", lambda *arguments: list(cycles(*arguments))[-1:])
-    control = shim(update, model, generator, {"cycle": 2, "swap": 1})
-    assert moves(control) != moves(found)
 
 
 def test_the_best_cycle_is_found(one_magnet, generator):

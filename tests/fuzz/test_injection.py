@@ -16,7 +16,7 @@ from halbach_fe.geometry.domain import Regions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
-from halbach_fe.report.page_record import Picture
+from halbach_fe.report.answer import Picture
 from halbach_fe.solver.magnetostatics import CROSS_SECTION, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.study.model import Study

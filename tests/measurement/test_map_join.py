@@ -18,7 +18,8 @@ from halbach_fe.measurement.harmonic_field import Charges
 from halbach_fe.measurement.joined_probe import JoinedModel, Pose
 from halbach_fe.measurement.map_check import InstrumentTerm, scan_of
 from halbach_fe.measurement.map_join import join_checked, join_maps
-from halbach_fe.report.map_join import answer, sentences
+from halbach_fe.report.map_check import joined_answer as answer
+from halbach_fe.report.map_check import joined_sentences as sentences
 from tests.support.joined_campaigns import (
     MAGNETS,
     NOISE_T,

@@ -19,10 +19,9 @@ from halbach_fe.cli import main
 from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import RECORD, result_folder
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import PAGE_RECORD, Answer, Picture
 from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
 from halbach_fe.report.campaign_report import _parts, read_campaign
-from halbach_fe.report.page_record import PAGE_RECORD, Picture
 from tests.conftest import changed, parse_study
 from tests.support.pages import write_any_page
 from tests.support.results import STUDY, TINY, results

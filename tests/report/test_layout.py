@@ -6,8 +6,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from halbach_fe.cli import main
+from halbach_fe.report.answer import WIDEST_IN
 from halbach_fe.report.page import SMALL, figure_of, label_logarithmic, save, units_kept
-from halbach_fe.report.page_record import WIDEST_IN
 from tests.report.conftest import PATIENCE_MS
 from tests.report.test_page import ANSWER, SEEN
 from tests.support.pages import write_any_page

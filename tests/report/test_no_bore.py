@@ -14,9 +14,9 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report import magnet_view_3d, page
 from halbach_fe.report import solution as solution_page
-from halbach_fe.report.magnet_table import in_one_line, magnet_rows
 from halbach_fe.report.magnet_view_3d import cut_trace
 from halbach_fe.report.page import write_files
+from halbach_fe.report.words import in_one_line, magnet_rows
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.response.solution import solve
 from halbach_fe.solver.formulation_choice import finer_in_words

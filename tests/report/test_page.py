@@ -20,9 +20,8 @@ from matplotlib.figure import Figure
 import halbach_fe as hf
 from halbach_fe.cli import common, main
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import DPI, LEGIBLE_PX, Answer
 from halbach_fe.report.page import SMALL, own_style, save, simulated_files
-from halbach_fe.report.page_record import DPI, LEGIBLE_PX
 from tests.conftest import DIPOLE, ROOT, parse_study
 from tests.support.pages import page, write_any_page
 

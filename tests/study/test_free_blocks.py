@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from halbach_fe.core.errors import StudyError
 from halbach_fe.study.free_blocks import COLUMNS, SIZES, FreeBlocks, RowError
 from halbach_fe.study.grades import grade
-from halbach_fe.study.polygons import crossing
 from halbach_fe.study.reader import parse_study
+from halbach_fe.study.types import crossing
 from tests.conftest import DIPOLE, changed
 
 SIZE = {"size_x_m": 0.02, "size_y_m": 0.03, "inner_radius_m": 0.05, "outer_radius_m": 0.08,
@@ -119,7 +119,7 @@ def test_many_polygons_are_compared_in_parts(monkeypatch, generator):
     polygons = generator.uniform(-1, 1, (300, 4, 2))
     whole = crossing(polygons)
     assert 0.1 < whole.mean() < 0.9
-    monkeypatch.setattr("halbach_fe.study.polygons.MAX_PAIRS", 100)
+    monkeypatch.setattr("halbach_fe.study.types.MAX_PAIRS", 100)
     assert np.array_equal(crossing(polygons), whole)
 
 

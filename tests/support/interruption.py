@@ -16,7 +16,7 @@ import psutil
 import xarray as xr
 
 from halbach_fe.core.result_folder import RECORD
-from halbach_fe.report.page_record import PAGE_RECORD
+from halbach_fe.report.answer import PAGE_RECORD
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 
 ENDS = {".json": b"\n", ".csv": b"\n", ".html": b"</html>"}

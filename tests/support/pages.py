@@ -8,9 +8,8 @@ import re
 from html.parser import HTMLParser
 
 from halbach_fe.core.versions import version
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import PAGE_RECORD, Answer
 from halbach_fe.report.page import Page, Section, Table, write_files, write_page
-from halbach_fe.report.page_record import PAGE_RECORD
 from halbach_fe.report.result_files import page_of
 
 
