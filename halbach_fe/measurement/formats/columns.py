@@ -1,5 +1,7 @@
 """Import of text tables with commas, semicolons, tabs or spaces, with or without a header.
 
+They come from gaussmeters, mappers, spreadsheets, and programs such as CST or JMAG.
+
 All lines before the first line of numbers, or mostly numbers, form the preface. The header is the
 last line of the preface, commented or not, that has a name for each column and of which at least
 two names are recognized. A line of units may follow the header.
