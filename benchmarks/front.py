@@ -40,5 +40,5 @@ def no_root(note: Note) -> None:
     said = subprocess.run([ROOT / "tools" / "check_wheel.sh"], check=True, capture_output=True,
                           text=True).stdout
     ran, of = map(int, re.findall(r"^(\d+) of (\d+) commands ran without root$", said, re.M)[-1])
-    note("front.no_root", ran, "commands", f"{of}: doctor, Python, explain, solve with iron, with "
-         "the wheel, the static GetDP and no user of the system")
+    note("front.no_root", ran, "commands", f"{of}: doctor, Python, explain, solve with iron, of "
+         "the wheel alone with the static GetDP")
