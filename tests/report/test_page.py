@@ -179,11 +179,13 @@ def test_a_question_is_one_module(dipole, tmp_path, capsys, monkeypatch):
     study = tmp_path / "study.toml"
     study.write_text(tomlkit.dumps(DIPOLE))
     for as_json in (False, True):
-        arguments = Namespace(study=study, output=tmp_path / "cli", json=as_json)
-        assert common.finish(arguments, toy.page(found)) == 0
+        arguments = Namespace(verb="count", study=study, output=tmp_path / "cli", json=as_json)
+        assert common.with_folder(
+            lambda given: common.finish(given, toy.page(found)), arguments) == 0
         printed = capsys.readouterr()
         assert (said in printed.err) != as_json
         assert ("Blocks by ring" in printed.out) != as_json
     assert json.loads(printed.out)["blocks"] == list(found.blocks)
+    assert json.loads((tmp_path / "cli" / "run.json").read_text())["command"] == "halbach-fe count"
     with pytest.raises(TypeError, match="has returned; instead received a str"):
         hf.write_report("text", tmp_path / "none")
