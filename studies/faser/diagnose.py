@@ -26,6 +26,7 @@ import xarray as xr
 from averages import READINGS, Fitted, fit
 from matplotlib.figure import Figure
 from published import PublishedErrors
+from published import page as page_beside_the_paper
 from run import HERE, Z_STEP_M, profile_to_map
 
 from halbach_fe.cli import common
@@ -39,7 +40,7 @@ from halbach_fe.inference.pose_result import OpenKey, PosePrior, Registration
 from halbach_fe.inference.registration import EQUAL_LOG_EVIDENCE, odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report import diagnosis, inference, registration
+from halbach_fe.report import diagnosis, registration
 from halbach_fe.report.answer import Answer as PageAnswer
 from halbach_fe.report.page import (
     MEASURED,
@@ -386,7 +387,7 @@ def run(arguments: argparse.Namespace) -> int:
                            "Median relative error of B_x at held-out readings")
         found = sentences(best, answers, fitted, published)
         for name, page in (("registration", registration.page(read_study(STUDY), data, poses)),
-                           ("inferred", inference.page(best.update, published))):
+                           ("inferred", page_beside_the_paper(best.update, published, ()))):
             write_files(page, folder / name, STUDY)
         left = [f"The best answer ({best.hypothesis.name}) leaves chi² of "
                 f"{best.registration.chi2:.2g} per reading that was fitted and "

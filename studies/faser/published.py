@@ -94,4 +94,5 @@ def page(
         sections=[*made.sections[:2], Section([
             "Medians of relative errors, as they are published.",
             Table(median_table(result, published)), Drawn(figure)], "Relative errors"),
-            Section([Items(assumptions)], "Assumptions"), *made.sections[2:]])
+            Section([Items(assumptions)] if assumptions else [], "Assumptions"),
+            *made.sections[2:]])
