@@ -240,7 +240,7 @@ def _if_simulated(path: Path) -> str:
 
 
 def reference(arguments: argparse.Namespace) -> MultipoleReference | None:
-    """Return the reference that options of `add_multipole_arguments` describe, if any is given."""
+    """Return the reference that options `MULTIPOLES` describe, if any is given."""
     from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
 
     given = (arguments.reference_radius_m, arguments.orders, arguments.at_z_m)

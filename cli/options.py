@@ -33,6 +33,7 @@ from halbach_fe.measurement.formats.units import (
 )
 
 AXES = ("x", "y", "z")
+"""As `halbach_fe.study.types.COMPONENTS`, whose module takes long to import."""
 
 Number = TypeVar("Number", int, float)
 Declared = TypeVar("Declared", bound=DeclaredFormat)

@@ -353,7 +353,7 @@ def _templates() -> jinja2.Environment:
 def _marked(text: str) -> Markup:
     """Return a text as HTML, see `Text`."""
     text = re.sub("`(.*?)`", r"<code>\1</code>", html.escape(text))
-    text = re.sub(r"\[([^]]+)\]\(([\w./-]+\.html)\)", r'<a href="\2">\1</a>', text)
+    text = re.sub(r"\[([^]]+)\]\((\w[\w-]*(?:/\w[\w-]*)*\.html)\)", r'<a href="\2">\1</a>', text)
     return Markup(re.sub(r"\*\*(.*?)\*\*", r"<strong>\1</strong>", text))
 
 

@@ -92,12 +92,12 @@ SHOWN_SHARE = 1e-3
 ALL = (STEP, LENGTH, RADIUS)
 ALL_HYPOTHESES = (
     Hypothesis("the axis; all as assumed", (), ON_THE_AXIS),
-    Hypothesis("the axis; length open", (LENGTH,), ON_THE_AXIS),
-    Hypothesis("the axis; step open", (STEP,), ON_THE_AXIS),
+    Hypothesis("the axis; length fitted", (LENGTH,), ON_THE_AXIS),
+    Hypothesis("the axis; step fitted", (STEP,), ON_THE_AXIS),
     Hypothesis("the axis; step, length, radius open", ALL, ON_THE_AXIS),
     Hypothesis("a line beside the axis; all as assumed", (), ANYWHERE),
-    Hypothesis("a line beside the axis; step open", (STEP,), ANYWHERE),
-    Hypothesis("a line beside the axis; length open", (LENGTH,), ANYWHERE),
+    Hypothesis("a line beside the axis; step fitted", (STEP,), ANYWHERE),
+    Hypothesis("a line beside the axis; length fitted", (LENGTH,), ANYWHERE),
     Hypothesis("a line beside the axis; step, length, radius open", ALL, ANYWHERE))
 QUICK_HYPOTHESES = tuple(each for each in ALL_HYPOTHESES if each.open_keys == (LENGTH,))
 
@@ -225,9 +225,7 @@ def sentences(best: Answer, answers: list[Answer], fitted: list[Fitted],
     """Return what was found, the answer first."""
     found = best.registration
     x, y = np.abs(1e3 * found.middle_m[:2])
-    sd = 1e3 * found.translation_sd_m
-    radius = float(np.hypot(x, y))
-    radius_sd = float(np.hypot(x * sd[0], y * sd[1]) / radius)
+    radius, radius_sd = distance_mm(found)
     angle = float(np.degrees(np.arctan2(y, x)))
     paper, here = medians(published.posterior, best.update), best.medians()
     axis = max((each for each in answers if each.hypothesis.pose is ON_THE_AXIS),
@@ -263,9 +261,10 @@ def sentences(best: Answer, answers: list[Answer], fitted: list[Fitted],
     return said
 
 
-def answer_page(best: Answer, found: list[str], published: PublishedErrors,
+def answer_page(answers: list[Answer], found: list[str], published: PublishedErrors,
                 quick: bool) -> PageAnswer:
-    """Return the answer of the page; ``found`` is what `sentences` says."""
+    """Return the answer of the page; ``found`` is what `sentences` says of the answers."""
+    best = answers[0]
     asked, said = "What does the published profile of the FASER dipole show?", found[0]
     step = ("For a map of your own: `halbach-fe new study.toml` writes a file in which to describe "
             "its magnet, then:" if quick else "Read what is left, and the further pages below.")
@@ -274,13 +273,15 @@ def answer_page(best: Answer, found: list[str], published: PublishedErrors,
         return PageAnswer(asked, said, " ".join(found[1:]), step)
     array = best.registration.study.array
     assert array.ring_length_m is not None
-    radius = float(np.hypot(*best.registration.middle_m[:2]))
+    radius, radius_sd = distance_mm(best.registration)
     paper, here = medians(published.posterior, best.update)[0], best.medians()[0]
+    axis = min(each.medians()[0] for each in answers if each.hypothesis.pose is ON_THE_AXIS)
     left = best.registration.held_out_chi2
     sound = best.registration.explains
     trust = [
-        f"{'Yes' if sound else 'No'}: chi² of held-out readings is {left:.2g} each, where 1 is "
-        "expected; but which of four equal lines it is, the profile cannot tell.",
+        f"{'Yes' if sound else 'No'}: with positions uncertain by 1 mm, chi² of held-out readings "
+        f"is {left:.2g} each, where 1 is expected; but which of four equal lines it is, the "
+        "profile cannot tell.",
         *found[1:]]
     if not best.registration.at_rest:
         trust.append("The search for the line ended before it came to rest, so that the line may "
@@ -289,10 +290,18 @@ def answer_page(best: Answer, found: list[str], published: PublishedErrors,
         asked, said, " ".join(trust), step, own if quick else "",
         sound=sound,
         gist="It is not that of the axis, as published: it is that of a line "
-        f"{1e3 * radius:.0f} mm beside the axis of a magnet "
-        f"{array.rings * array.ring_length_m:.3g} m long.",
-        numbers=(("median relative error in the fringe, in the paper and here",
+        f"{radius:.0f} ± {radius_sd:.0f} mm beside the axis of a magnet "
+        f"{array.rings * array.ring_length_m:.3g} m long. On the axis, {axis:.3f} would be left.",
+        numbers=(("median relative error in the fringe: the paper's updated magnet, and ours",
                   f"{paper:.2f} → {here:.3f}"),))
+
+
+def distance_mm(found: Registration) -> tuple[float, float]:
+    """Return the distance of a line along z from the axis in mm, and its error bar."""
+    x, y = np.abs(1e3 * found.middle_m[:2])
+    sd = 1e3 * found.translation_sd_m
+    radius = float(np.hypot(x, y))
+    return radius, float(np.hypot(x * sd[0], y * sd[1]) / radius)
 
 
 def _step_or_length(answers: list[Answer]) -> list[str]:
@@ -324,13 +333,13 @@ def profile_figure(answers: list[Answer], published: PublishedErrors) -> Figure:
         nominal = each.update.prediction_prior.mean
         scale = np.median(each.update.readings[60:100] / nominal[60:100])
         field.semilogy(index, 1e3 * scale * nominal, color=colour, label=(
-            f"nominal magnet: {each.hypothesis.name}"))
+            f"before the update: {each.hypothesis.name}"))
         error.semilogy(index, each.error, color=colour, lw=0.8)
         apart = each.update.held_out
         error.semilogy(index[apart], each.error[apart], ".", color=colour,
                        label=f"updated: {each.hypothesis.name}; points were held out")
     field.semilogy(index, 1e3 * best.update.readings, ".", ms=4, color=MEASURED, label="readings")
-    error.semilogy(index, published.posterior, color=PUBLISHED, label="the paper, updated")
+    error.semilogy(index, published.posterior, color=PUBLISHED, label="the paper's updated magnet")
     for axes in (field, error):
         axes.axvspan(1, FRINGE[0], color="0.93")
         axes.axvspan(FRINGE[1], len(index), color="0.93")
@@ -404,7 +413,7 @@ def run(arguments: argparse.Namespace) -> int:
     columns = column_table(fitted, best.update)
     write_files(Page(
         "register", "What its published profile shows", read_study(STUDY),
-        answer_page(best, found, published, arguments.quick), {}, [
+        answer_page(answers, found, published, arguments.quick), {}, [
             Section([Text(
                 "Every fifth reading (index 5, 10, ..., 155) was set aside before anything was "
                 "fitted. Errors are medians of |predicted / measured - 1| of B_x over these, as "
@@ -440,7 +449,8 @@ def diagnosed(
     study = best.registration.study
     found = diagnose(study, data, session, say=common.say)
     page = diagnosis.page(found, separations(found, data, session), study)
-    common.finish(argparse.Namespace(study=STUDY, output=folder, json=False), page)
+    write_files(page, folder, STUDY)
+    common.say(page.answer.said)
     return [page.answer.said, page.answer.trust]
 
 

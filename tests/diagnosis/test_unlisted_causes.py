@@ -126,7 +126,7 @@ def test_without_the_competition_false_names_appear(small, diagnosed, monkeypatc
     assert false_names(diagnosed(small, data))
 
 
-@pytest.mark.parametrize("names", [("arm_sag", "gain_z"), ()])
+@pytest.mark.parametrize("names", [("drift",), ("arm_sag", "gain_z"), ()])
 def test_effects_of_the_catalogue_keep_their_names(small, diagnosed, names):
     """Whole blocks keep theirs in `test_diagnose.py`."""
     campaign = simulate_campaign(small, 5, hide=[(EFFECTS[name], None) for name in names])
