@@ -627,7 +627,7 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
     _, first = np.unique(moments, axis=0, return_index=True)
     rare = 1e-3  # probability of as many equal moments by rounding alone
     if len(first) < len(moments) and poisson.sf(
-            len(moments) - len(first) - 1, _equal_by_rounding(moments, table.moment)) < rare:
+            len(moments) - len(first) - 1, _equal_by_rounding(moments)) < rare:
         again = int(np.setdiff1d(np.arange(len(moments)), first)[0])
         same = int(np.flatnonzero((moments == moments[again]).all(axis=1))[0])
         raise MeasurementError(must_be(
@@ -637,15 +637,15 @@ def _check_samples(table: BlockTable, label: str, deviations: Floats) -> None:
             "Leave the copies out."))
 
 
-def _equal_by_rounding(moments: Floats, every: Floats) -> float:
+def _equal_by_rounding(moments: Floats) -> float:
     """Return how many pairs of different samples (n, 3) are expected to have the same moment.
 
     Two normal samples that are rounded to steps q agree with a probability q / (2 sqrt(pi) sd). The
-    steps are the smallest differences between the moments (m, 3) of ``every`` type.
+    steps are taken for the smallest differences between samples.
     """
     probability = 1.0
-    for values, others in zip(moments.T, every.T, strict=True):
-        distinct = np.unique(others)
+    for values in moments.T:
+        distinct = np.unique(values)
         step = float(np.diff(distinct).min()) if len(distinct) > 1 else np.inf
         probability *= min(1.0, step / (2 * np.sqrt(np.pi) * max(values.std(), 1e-300)))
     return probability * len(moments) * (len(moments) - 1) / 2

@@ -208,7 +208,8 @@ class JoinedModel(ProbeModel):
         for number, own in self._each(rows):
             one, fit, gain = self._posed(at, number)
             part = slice(done, done := done + int(own.sum()))
-            by_term = gain * one.by_parameter(fit, own) / one.any_sd
+            by_term = gain * one.by_parameter(fit, own) / np.where(
+                one.any_sd > 0, one.any_sd, np.inf)
             found[part, :, :TERMS] = by_term
             found[part, :, self.own(number)] = by_term
             found[part, :, self.placed(number)] = (

@@ -546,6 +546,8 @@ def _order(data: xr.Dataset) -> str:
     if "time_s" in data:
         return "time_s"
     points = points_of(data)
+    if len(points) < 2:
+        return "rows"
     step = np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
     to_any_other = np.sqrt(2 * np.sum(np.var(points, axis=0)))
     on_lines = np.mean(motion(points).any(axis=1))

@@ -794,7 +794,8 @@ class _Joined:
             [Pose(np.eye(3), np.zeros(3))] * len(there))
         value = self.at.instrument * self.model.prior_sd
         value[TERMS:] = 0.0
-        common = replace(self.at, instrument=value / first.prior_sd)
+        common = replace(self.at, instrument=value / np.where(
+            first.prior_sd > 0, first.prior_sd, np.inf))
         left, read = self.model.field - self.model.readings(self.at), first.readings(common)
         for number in range(len(there)):
             part = self.model.rows_of(number)

@@ -38,9 +38,10 @@ def broken_rows(points: Floats, field: Floats) -> dict[str, list[int]]:
     moved = (points[1:] != points[:-1]).any(axis=1) & ~zero[1:]
     repeated, copied = np.zeros(len(field), bool), np.zeros(len(field), bool)
     repeated[1:] = _no_chance(alike, moved)
-    order = np.lexsort(np.hstack([field, points]).T)  # copies follow each other, in their order
-    there = (points[order[1:]] == points[order[:-1]]).all(axis=1) & ~zero[order[1:]]
-    copied[order[1:]] = _no_chance(field[order[1:]] == field[order[:-1]], there)
+    if field.shape[1] == 3:  # single components repeat where they are measured again
+        order = np.lexsort(np.hstack([field, points]).T)  # copies follow each other, in order
+        there = (points[order[1:]] == points[order[:-1]]).all(axis=1) & ~zero[order[1:]]
+        copied[order[1:]] = _no_chance(field[order[1:]] == field[order[:-1]], there)
     return {name: (1 + np.flatnonzero(rows)).tolist()
             for name, rows in (("zero", zero), ("repeated", repeated), ("copied", copied))
             if rows.any()}

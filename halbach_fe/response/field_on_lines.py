@@ -32,11 +32,13 @@ from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.separate_blocks import (
     SeparateReaction,
     applies,
+    external_acts,
     present_blocks,
     solve_separate,
 )
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.magnet import External
 
 if TYPE_CHECKING:
     from halbach_fe.geometry.iron import IronSolid
@@ -260,6 +262,11 @@ def _through_blocks(
             "irreversible losses, and of the method reaction", "another magnet",
             "End the line before the blocks."))
     outside, in_iron = number < 0, number >= len(blocks)
+    if in_iron.any() and magnet.external != External() and not external_acts(magnet):
+        raise StudyError(must_be(
+            "points inside iron", magnet.name, "of a study without `external`, to which this iron "
+            "does not answer here", f"{in_iron.sum()} such points",
+            "Leave `external` out, or end the line before the iron."))
     points = points.copy()
     points[outside] = check_points(magnet, points[outside], OF_LINES)
     solved = None if magnet.is_vacuum else solve_separate(magnet, session)

@@ -289,10 +289,10 @@ def answer_page(answers: list[Answer], found: list[str], published: PublishedErr
     return PageAnswer(
         asked, said, " ".join(trust), step, own if quick else "",
         sound=sound,
-        gist="It is not that of the axis, as published: it is that of a line "
-        f"{radius:.0f} ± {radius_sd:.0f} mm beside the axis of a magnet "
-        f"{array.rings * array.ring_length_m:.3g} m long. On the axis, {axis:.3f} would be left.",
-        numbers=(("median relative error in the fringe: the paper's updated magnet, and ours",
+        gist=f"It is no profile of the axis, but of a line {radius:.0f} ± {radius_sd:.0f} mm "
+        f"beside it, in a magnet {array.rings * array.ring_length_m:.3g} m long.",
+        numbers=(("median relative error in the fringe: the paper's, and ours (on the axis "
+                  f"{axis:.3f})",
                   f"{paper:.2f} → {here:.3f}"),))
 
 

@@ -628,7 +628,7 @@ def test_refusals(vacuum_dipole, generator, placed, change, said):
 
 def test_copies_of_a_sample_are_none(vacuum_dipole, generator):
     study = vacuum_dipole()
-    slots, _, truth = blocks_and_truth(study, generator, copies=2)
+    slots, _, truth = blocks_and_truth(study, generator, copies=8)
     table = table_of(study, slots, truth)
     prior_from_blocks(build_magnet(study), table)  # the control
     first, second = np.flatnonzero(np.array(table.type) == table.type[0])[:2]

@@ -463,6 +463,34 @@ def test_what_is_advised_for_another_unit_can_be_followed(tmp_path, unit, factor
     assert same(imported(tmp_path, "\n".join(rows)))
 
 
+def test_planes_that_comments_place(tmp_path):
+    """One plane comes again; the comment above the first of them is in the preface."""
+    planes = [(0, POINTS[:6]), (10, POINTS[6:12]), (0, POINTS[12:18])]
+    text = "".join(f"# z = {z} mm\n" + ("" if number else "# x[mm] y[mm] Bx[T] By[T] Bz[T]\n")
+                   + rows(" ", np.column_stack([1e3 * part[:, :2], FIELD[:6]]), np.zeros((6, 1)),
+                          range(5))
+                   for number, (z, part) in enumerate(planes))
+    found = points_of(imported(tmp_path, text).data)
+    assert found[:, 2].tolist() == [0.0] * 6 + [0.01] * 6 + [0.0] * 6
+    np.testing.assert_allclose(found[:, :2], POINTS[:18, :2])
+
+
+def test_a_first_row_that_runs_together(tmp_path):
+    """The most negative corner of a grid in columns of fixed width."""
+    table = np.abs(np.hstack([POINTS, FIELD]))
+    table[0] = -0.1, -0.2, -0.3, -0.4, -0.5, -0.6
+    text = "  X  Y  Z  Bx  By  Bz\n" + "".join(
+        "".join(f"{value:8.5f}" for value in row) + "\n" for row in table)
+    assert text.splitlines()[1].count(" ") == 0
+    found = imported(tmp_path, text, length_unit="m", field_unit="T")
+    np.testing.assert_allclose(points_of(found.data), table[:, :3], atol=1e-5)
+    table = -np.abs(table)
+    every = "".join("".join(f"{value:8.5f}" for value in row) + "\n" for row in table)
+    found = imported(tmp_path, every, columns=tuple(["x", "y", "z", "Bx", "By", "Bz"]),
+                     length_unit="m", field_unit="T")
+    np.testing.assert_allclose(points_of(found.data), table[:, :3], atol=1e-5)
+
+
 def test_commands_of_the_measured_studies_read_their_maps(tmp_path):
     """What the Makefile has `halbach-fe import-map` do with the measured maps works."""
     text = (ROOT / "Makefile").read_text().replace("\\\n", " ")

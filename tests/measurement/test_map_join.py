@@ -249,6 +249,15 @@ def test_a_fine_map_between_the_points_of_a_coarse_one(generator, order):
     json.dumps(joined.plain(), allow_nan=False)
 
 
+def test_rows_whose_order_tells_nothing(generator):
+    """No term of a scan is asked of them, and the joined map has all of their readings."""
+    maps, poses, _ = campaign(1, maps=2)
+    maps["part1"] = maps["part1"].isel(point=generator.permutation(maps["part1"].sizes["point"]))
+    joined = joined_of(maps)
+    assert np.abs(over_bars(joined, poses)).max() < 4  # of six numbers
+    assert np.isfinite(joined.data["B_T"].values).all()
+
+
 def test_too_few_points_in_common_are_said(generator):
     maps = pole_maps(generator, (lattice(2, 0.01, 0.0), 0.01, np.zeros(3)),
                      (lattice(2, 0.01, 0.0), 0.01, np.zeros(3)))

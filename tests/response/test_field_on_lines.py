@@ -210,6 +210,13 @@ def test_what_is_refused():
     with pytest.raises(StudyError, match="of a 3D magnet"):
         field_on_lines(flat, Lines(np.array([0.14, 0, 0]), np.array([0.15, 0, 0]), (
             np.zeros(1), np.zeros(1)), 3), known, Session.temporary(), inside=True)
+    shielded = magnet_of(size=0.04, external={"background_T": [0.0, 0.0, 1e-3]}, iron={
+        "bodies": [{"kind": "tube", "inner_radius_m": 0.05, "outer_radius_m": 0.06}],
+        "relative_permeability": 100.0})
+    with pytest.raises(StudyError, match="a study without `external`"):
+        field_on_lines(shielded, Lines(np.array([0, 0.052, 0]), np.array([0, 0.058, 0]), count=3),
+                       Gaussian(shielded.nominal_magnetization, np.zeros((3, 1))),
+                       Session.temporary(), inside=True)
     edge = Lines(np.array([0.01, 0.04, -0.02]), np.array([0.01, 0.04, 0.02]),
                  (np.zeros(1), np.zeros(1)), 5)
     with pytest.raises(StudyError, match=r"`--from-m and --to-m` of .* on an edge"):

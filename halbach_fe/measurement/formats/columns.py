@@ -83,15 +83,24 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
 
 def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> ForeignTable:
     """Read a table of columns from lines, as `read` does."""
-    start = _first_numbers(lines, declared, where)
-    if delimiter_of(lines[start][1], declared) is None and any(
-            RUN_TOGETHER.search(line) for _, line in lines[start:]):
-        lines = [*lines[:start], *((number, line if is_comment(line) else RUN_TOGETHER.sub(
-            r"\1 ", line)) for number, line in lines[start:])]
+    try:
+        start = _first_numbers(lines, declared, where)
+    except MeasurementError:  # unless the numbers of all rows run together
+        lines = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
+                 for number, line in lines]
+        start = _first_numbers(lines, declared, where)
+    if delimiter_of(lines[start][1], declared) is None:
+        apart = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
+                 for number, line in lines]
+        while start and _are_alike(apart[start - 1][1], apart[start][1]) and (
+                apart[start - 1] != lines[start - 1]):  # a first row of numbers run together
+            start -= 1
+        lines = [*lines[:start], *apart[start:]]
     first = _below_counts(lines, start, declared, where)
     counts, preface = lines[start:first], lines[:first]
     header = {line.strip() for _, line in preface}  # repeated above every part of some files
-    body = [line for line in lines[first:] if line[1].strip() not in header]
+    body = [line for line in lines[first:]
+            if is_comment(line[1]) or line[1].strip() not in header]
     delimiter = delimiter_of(body[0][1], declared)
     remarks: tuple[str, ...] = ()
     try:
@@ -115,7 +124,8 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
     own = {column.text for column in columns} <= OWN_COLUMNS
     stated = [names.parse(text, stated=True) for text in declared.columns] or columns
-    added, more = _in_comments(preface, body, {column.quantity for column in stated})
+    known = {column.quantity for column in stated}
+    added, more = _in_comments(preface, body, known) if declared.positions is None else ([], [])
     if added:
         columns, values = (*columns, *added), np.column_stack([values, *more])
         remarks += (f"{' and '.join(column.quantity for column in added)} of the rows "
@@ -125,6 +135,13 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
         comments="" if own else comments_of(preface),
         attributes=attributes_of(preface) if own else {},
         remarks=remarks if own else remarks + unused_lines(preface, columns))
+
+
+def _are_alike(line: str, other: str) -> bool:
+    """Tell whether two lines consist of equally many numbers, and of nothing else."""
+    cells = line.split()
+    return not is_comment(line) and len(cells) == len(other.split()) and all(
+        re.fullmatch(r"[-+]?[\d.]+(?:[eEdD][-+]?\d+)?", cell) for cell in cells)
 
 
 def _in_comments(
