@@ -486,7 +486,7 @@ def test_a_first_row_that_runs_together(tmp_path):
     np.testing.assert_allclose(points_of(found.data), table[:, :3], atol=1e-5)
     table = -np.abs(table)
     every = "".join("".join(f"{value:8.5f}" for value in row) + "\n" for row in table)
-    found = imported(tmp_path, every, columns=tuple(["x", "y", "z", "Bx", "By", "Bz"]),
+    found = imported(tmp_path, every, columns=("x", "y", "z", "Bx", "By", "Bz"),
                      length_unit="m", field_unit="T")
     np.testing.assert_allclose(points_of(found.data), table[:, :3], atol=1e-5)
 
