@@ -604,7 +604,7 @@ def test_calibration_of_the_coil_is_not_mistaken_for_a_discovery(dipole, generat
 
 @pytest.mark.parametrize(("placed", "change", "said"), [
     (True, lambda t: {"moment": 1e3 * t.moment, "sigma": t.sigma},
-     r"moment of block B0 .* 1.01e\+03 times .*in A m\^2 and m\^3"),
+     r"moment of block B0 .* 1.010 times .*in A m\^2 and m\^3"),
     (True, lambda t: {"moment": 1e-3 * t.moment, "sigma": 1e-3 * t.sigma}, r"in A m\^2 and m\^3"),
     (True, lambda t: {"moment": -t.moment}, "moment of block B0 .* own axes"),
     (True, lambda t: {"volume": 1e9 * t.volume}, "volume_m3 of block B0 .* near the study's"),
