@@ -46,10 +46,11 @@ from tests.support.short_dipole import (
     FRINGE,
     GRID,
     NOISE_T,
-    TEXT,
+    SECTORS,
     campaign_study,
     measured,
     reading,
+    sectors,
     truth,
 )
 
@@ -81,7 +82,7 @@ POSES = {"body": (4e-4, 5e-3, 0.0), "fringe": (4e-4, 5e-3, 0.05)}
 
 def registration(generator: Generator, session: Session) -> Outcome:
     """Find the pose of a map from nothing."""
-    magnet = build_magnet(parse_study(tomllib.loads(TEXT)))
+    magnet = build_magnet(parse_study(tomllib.loads(SECTORS)))
     while True:  # until the map is within the bore
         turn = (Rotation.from_rotvec(TURN_RAD * generator.uniform(-1, 1, 3) / np.sqrt(3))
                 * Rotation.from_matrix(right_angles()[generator.integers(24)]))
@@ -89,7 +90,8 @@ def registration(generator: Generator, session: Session) -> Outcome:
         shift = middle - turn.apply(GRID.mean(axis=0))
         if np.abs(turn.apply(GRID) + shift)[:, :2].max() < IN_BORE_M:
             break
-    data = measured(truth(generator, generator.uniform(0.005, 0.02)), generator, turn, shift)
+    data = measured(
+        sectors(truth(generator, generator.uniform(0.005, 0.02))), generator, turn, shift)
     stage = STAGE_M * generator.uniform(-1, 1, 3)
     found = register(magnet, field_map(GRID + stage, data["B_T"].values), session)
     angles = [(Rotation.from_rotvec(each.instrument.rotation_rad) * turn.inv()).magnitude()
@@ -109,7 +111,7 @@ def checked(
     offset: np.ndarray, columns: tuple[int, ...] = (0, 1, 2), signs: tuple[int, ...] = (1, 1, 1)
 ) -> MapCheck:
     """Check a map that a probe with errors makes through the bore and before it."""
-    points, source = FRINGE - FRINGE.mean(axis=0), truth(generator)
+    points, source = FRINGE - FRINGE.mean(axis=0), sectors(truth(generator))
     axes = Rotation.from_rotvec(roll).as_matrix().T
     field = np.column_stack([
         source.getB(points + FRINGE.mean(axis=0) + place) @ axis
@@ -148,7 +150,7 @@ def sensors_apart(generator: Generator, session: Session) -> Outcome:
 
 def two_maps(generator: Generator, session: Session) -> Outcome:
     """Find the poses of two overlapping maps by a probe of other gains."""
-    source = truth(generator, generator.uniform(0.005, 0.02))
+    source = sectors(truth(generator, generator.uniform(0.005, 0.02)))
     gain = 0.005 * generator.standard_normal(3)
     maps, right = {}, {}
     for name, points in (("body", BODY), ("fringe", FRINGE)):
@@ -162,7 +164,9 @@ def two_maps(generator: Generator, session: Session) -> Outcome:
         for number, axis in enumerate(COMPONENTS):
             right[f"{name}.translation_{axis}_m"] = moved[number]
             right[f"{name}.rotation_{axis}_rad"] = turn.as_rotvec()[number]
-    result = infer(build_magnet(campaign_study("hall", gain=0.01)), maps, session)
+    study = campaign_study("hall", gain=0.01).with_(
+        array=parse_study(tomllib.loads(SECTORS)).array)
+    result = infer(build_magnet(study), maps, session)
     assert result.terms is not None
     errors = {name: (value - right[name]) / sd for name, value, sd in zip(
         result.terms.names, result.terms.change, result.terms.sd, strict=True) if name in right}

@@ -15,7 +15,7 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.field_map import field_map
 from tests.support import cube_dipole
-from tests.support.short_dipole import truth
+from tests.support.short_dipole import sectors, truth
 
 ROLL_RAD, LAG_M, APART_M, GAIN, DRIFT = 0.02, 1e-3, 2e-3, 0.02, 0.02
 """Usual sizes of one error of a probe."""
@@ -47,8 +47,8 @@ def _within(radius: float) -> Callable[[Floats], Floats]:
 
 
 def dipole(generator: np.random.Generator) -> tuple[Callable[[Floats], Floats], Floats]:
-    """Two rings of cuboids of 20 mm, a bore of 40 mm, through their ends."""
-    magnets, step = truth(generator), generator.choice([0.005, 0.0055, 0.006])
+    """Two rings of sectors of 20 mm, a bore of 40 mm, through their ends."""
+    magnets, step = sectors(truth(generator)), generator.choice([0.005, 0.0055, 0.006])
     across = step * np.arange(-3, 4)
     points = serpentine(across, across, 0.008 * np.arange(-2, 6),
                         _within(generator.uniform(0.016, 0.018)))

@@ -49,6 +49,8 @@ common_mode_sd = 0.01
 [inference.held_out]
 scan_lines_every = 5
 """
+SECTORS = TEXT.replace('shape = "cuboid"\nwidth_m = 0.016', 'shape = "sector"')
+"""The same of the blocks of `sectors`."""
 GRID = np.stack(np.meshgrid(0.005 * np.arange(-2, 3), 0.005 * np.arange(-2, 3),
                             0.006 * np.arange(16), indexing="ij"), axis=-1).reshape(-1, 3)
 """Points of a stage, in scan lines along the bore."""

@@ -15,7 +15,7 @@ from halbach_fe.solver.formulation_choice import finite_element_part, solve_nomi
 from halbach_fe.synthetic import magpylib_field, optional_packages
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
-from halbach_fe.synthetic.ngsolve_reaction import moment_field, reaction_field
+from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
 from halbach_fe.synthetic.simulate import true_field as full_field
 from halbach_fe.synthetic.true_magnet import BodyPart, vector
 from tests.conftest import circle
@@ -225,7 +225,9 @@ def test_reaction_in_3d(short_dipole, session, iron):
     cap = 2e-5
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < cap
     assert np.abs(ours - theirs).max() < 3 * cap
-    # negative controls: the wrong sign, and each point's neighbour
+    # negative controls: coarse elements, the wrong sign, and each point's neighbour
+    rough = reaction_field(magnet_of(study), POINTS, Elements(0.06, 1))
+    assert np.abs(rough - theirs).max() > 3 * cap
     assert np.abs(ours + theirs).max() > 100 * cap
     assert np.abs(ours - np.roll(theirs, 1, axis=0)).max() > 30 * cap
 
