@@ -110,15 +110,18 @@ def test_a_library_that_does_not_return_is_ended(tmp_path, patience_s):
     """Gmsh meshes for minutes without looking at signals; with long patience, the control."""
     script = tmp_path / "stuck.py"
     script.write_text(STUCK)
-    process = subprocess.Popen([sys.executable, str(script), str(patience_s)], text=True,
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout.readline() == "locked\n"
-    process.send_signal(signal.SIGTERM)
-    if patience_s > 1:
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(timeout=0.6)
-        process.kill()
-    said = process.communicate(timeout=30)[1].strip()
+    with subprocess.Popen([sys.executable, str(script), str(patience_s)], text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == "locked\n"
+        while psutil.Process(process.pid).status() != psutil.STATUS_SLEEPING:
+            time.sleep(0.05)
+        time.sleep(0.2)  # it sleeps in the library by now, where Python sees no signal
+        process.send_signal(signal.SIGTERM)
+        if patience_s > 1:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(timeout=0.6)
+            process.kill()
+        said = process.communicate(timeout=30)[1].strip()
     assert (process.returncode, said) == ((130, "interrupted") if patience_s < 1 else (-9, ""))
 
 
