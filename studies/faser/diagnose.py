@@ -17,7 +17,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -397,7 +397,12 @@ def run(arguments: argparse.Namespace) -> int:
         found = sentences(best, answers, fitted, published)
         for name, page in (("registration", registration.page(read_study(STUDY), data, poses)),
                            ("inferred", page_beside_the_paper(best.update, published, ()))):
-            write_files(page, folder / name, STUDY)
+            command = page.answer.command.replace("DIR/", f"DIR/{name}/").replace(
+                " MAP", f" DIR/{measured.name}")
+            if name == "inferred":  # the posterior is that of the registered study
+                command = command.replace(" STUDY", " DIR/registration/study.registered.toml")
+            write_files(replace(page, answer=replace(page.answer, command=command)),
+                        folder / name, STUDY)
         left = [f"The best answer ({best.hypothesis.name}) leaves chi² of "
                 f"{best.registration.chi2:.2g} per reading that was fitted and "
                 f"{best.registration.held_out_chi2:.2g} per reading that was held out, if a "

@@ -83,15 +83,14 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
 
 def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> ForeignTable:
     """Read a table of columns from lines, as `read` does."""
+    apart = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
+             for number, line in lines]
     try:
         start = _first_numbers(lines, declared, where)
     except MeasurementError:  # unless the numbers of all rows run together
-        lines = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
-                 for number, line in lines]
-        start = _first_numbers(lines, declared, where)
+        start = _first_numbers(apart, declared, where)
+        lines = apart
     if delimiter_of(lines[start][1], declared) is None:
-        apart = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
-                 for number, line in lines]
         while start and _are_alike(apart[start - 1][1], apart[start][1]) and (
                 apart[start - 1] != lines[start - 1]):  # a first row of numbers run together
             start -= 1
