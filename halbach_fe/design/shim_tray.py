@@ -283,6 +283,18 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
             "What iron answers to the shims is not computed: leave it out and measure again with "
             "the tray filled."))
     study = f"study {magnet.name}"
+    outer = np.hypot(choices.places[:, 0], choices.places[:, 1])
+    if (outer > magnet.radius).any():
+        raise StudyError(must_be(
+            f"place {int(np.argmax(outer > magnet.radius)) + 1} of `shim_tray`", study,
+            f"within the magnet, whose radius is {1e3 * magnet.radius:.4g} mm",
+            f"{1e3 * outer.max():.4g} mm from the axis", "Is it in metres?"))
+    along, reach = np.abs(choices.places[:, 2]), magnet.field_reach
+    if (along > reach).any():
+        raise StudyError(must_be(
+            f"place {int(np.argmax(along > reach)) + 1} of `shim_tray`", study,
+            f"within {reach:.3g} m of the middle along z, where there is some field",
+            f"{along.max():.4g} m", "Is it in metres?"))
     sizes = np.array([each.size_m for each in choices.tray.magnets]).max(axis=0).tolist()
     largest = choices.tray.magnets[0].with_(size_m=tuple(sizes))
     blocks = [_block(largest, place, float(phi), number + 1) for number, (place, phi) in enumerate(
@@ -300,18 +312,6 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
         magnet.blocks, magnet.external.neighbours)
     if touched := block_in_others(blocks, others):
         refuse(touched[0], f"block {others[touched[1]].name}", "Is the tray within the bore?")
-    outer = np.hypot(choices.places[:, 0], choices.places[:, 1])
-    if (outer > magnet.radius).any():
-        raise StudyError(must_be(
-            f"place {int(np.argmax(outer)) + 1} of `shim_tray`", study, "within the magnet, whose "
-            f"radius is {1e3 * magnet.radius:.4g} mm", f"{1e3 * outer.max():.4g} mm from the axis",
-            "Is it in metres?"))
-    along, reach = np.abs(choices.places[:, 2]), magnet.field_reach
-    if (along > reach).any():
-        raise StudyError(must_be(
-            f"place {int(np.argmax(along)) + 1} of `shim_tray`", study, f"within {reach:.3g} m of "
-            "the middle along z, where there is some field", f"{along.max():.4g} m",
-            "Is it in metres?"))
     points, _ = region.points(12)
     # points along each side of a magnet that must be outside of the region
     along_side = np.linspace(-0.5, 0.5, 9)

@@ -135,11 +135,11 @@ def hint(key: str, error: ErrorDetails) -> str:
     value, kind = error.get("input"), error["type"]
     if key.endswith(".curve"):
         return CURVE
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return ""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if kind != "tuple_type":
-        return wrong_unit(key, value, error.get("ctx", {})) or "Correct the value."
-    deviation = wrong_unit(key, value, {"le": most_deviation})
+        return (wrong_unit(key, value, error.get("ctx", {})) or "Correct the value."
+                if number else "")
+    deviation = wrong_unit(key, value, {"le": most_deviation}) if number else ""
     return f"Write it in brackets, an element for each axis or part. {deviation}".strip()
 
 

@@ -174,7 +174,8 @@ class StudyModel(BaseModel):
     def with_(self, **changes: Any) -> Self:
         """Return a copy with other values of some keys, validated like a table from a file.
 
-        ``mesh__growth`` changes the key ``growth`` of the table ``mesh``.
+        ``mesh__growth`` changes the key ``growth`` of the table ``mesh``; ``mesh={...}`` is a new
+        table, of which keys that are not given have their defaults.
 
         Raises
         ------
@@ -188,7 +189,7 @@ class StudyModel(BaseModel):
             if name not in values:
                 near = difflib.get_close_matches(name, values, 1, 0.5)
                 raise StudyError(must_be(
-                    "name", where, "a key of it", f"`{name}`", f"Did you mean `{near[0]}`?"
+                    "name", where, "a key of it", f"`{name}`", sentences.did_you_mean(near[0], name)
                     if near else f"Known keys here: {', '.join(values)}."))
             if nested and not isinstance(values[name], StudyModel):
                 raise StudyError(must_be(
@@ -199,15 +200,13 @@ class StudyModel(BaseModel):
         try:
             return type(self).model_validate(values)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}"
-                          for part in first["loc"]).lstrip(".") or "the whole"
-            if (ours := sentences.contradiction(first)) is not None:
-                raise StudyError(
-                    f"Input `{key}` of {where} must be consistent: {ours}.") from None
-            raise StudyError(must_be(f"`{key}`", where, sentences.expected(first),
-                                     sentences.received(first["input"]),
-                                     sentences.hint(key, first))) from None
+            said = sentences.sentence(error, where, type(self))
+            whole = [name for name, value in changes.items() if isinstance(value, dict)
+                     and isinstance(getattr(self, name, None), StudyModel)]
+            if whole and error.errors()[0]["type"] == "missing":
+                said += (f" `{whole[0]}={{...}}` is a whole new table; `{whole[0]}__KEY=...` "
+                         "changes one of its keys.")
+            raise StudyError(said) from None
 
 
 MAX_PAIRS = 2_000_000

@@ -102,7 +102,9 @@ def test_every_kind_of_error_has_a_sentence():
     ({"noise": {"regions": [{"name": "a", "sigma_T": 1e300}]}}, "less than or equal to 1"),
     ({"maps": {"name": "a", "file": "a.csv"}}, "`maps` of study must be a list; instead received a "
      "table. Write [[maps]] for [maps], and once more for each further one."),
-    ({"instrument": {"gain": {"x": 0.1}}}, "must be a list; instead received a table."),
+    ({"instrument": {"gain": {"x": 0.1}}}, "must be a list; instead received a table. "
+     "Write it in brackets, an element for each axis or part."),
+    ({"instrument": {"field_axes": "y,x,z"}}, "instead received 'y,x,z'. Write it in brackets"),
     ({"iron_ring__curve": [[0, 0], [100, 1]]}, "a list of 2. Name a steel, { kind = \"steel\""),
     ({"iron_ring__curve": "aisi_1010"}, "'aisi_1010'. Name a steel, { kind = \"steel\""),
     ({"instrument": {"gain": 1.02}}, "a list; instead received 1.02. Write it in brackets, an "
@@ -123,6 +125,20 @@ def test_sentences_are_ours(changes, said):
         with pytest.raises(StudyError) as caught:
             study.with_(**changes)
         assert sentence.partition("must be ")[2][:20] in str(caught.value)
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"array": {"remanence_T": 1.2}}, "instead received nothing. Add the keys. `array={...}` is "
+     "a whole new table; `array__KEY=...` changes one of its keys."),
+    ({"array__inner_radius_mm": 100}, "Did you mean `inner_radius_m`? Then convert its values to m."),
+    ({"observation__positions": {"radius_m": 0.1}}, "Add the key, as one of 'line', 'circles', "),
+])
+def test_changes_have_the_sentences_of_a_file(changes, said):
+    study = parse_study(DIPOLE)
+    assert study.with_(array__remanence_T=1.2).array.remanence_T == 1.2  # the control
+    with pytest.raises(StudyError) as caught:
+        study.with_(**changes)
+    assert said in str(caught.value)
 
 
 def test_a_byte_order_mark(tmp_path):
