@@ -130,7 +130,8 @@ def test_sentences_are_ours(changes, said):
 @pytest.mark.parametrize(("changes", "said"), [
     ({"array": {"remanence_T": 1.2}}, "instead received nothing. Add the keys. `array={...}` is "
      "a whole new table; `array__KEY=...` changes one of its keys."),
-    ({"array__inner_radius_mm": 100}, "Did you mean `inner_radius_m`? Then convert its values to m."),
+    ({"array__inner_radius_mm": 100},
+     "Did you mean `inner_radius_m`? Then convert its values to m."),
     ({"observation__positions": {"radius_m": 0.1}}, "Add the key, as one of 'line', 'circles', "),
 ])
 def test_changes_have_the_sentences_of_a_file(changes, said):
