@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.cli import main
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
 from halbach_fe.study.free_blocks_file import read_free_blocks
@@ -113,6 +113,33 @@ def test_free_blocks(tmp_path, header, values, declared):
     else:
         np.testing.assert_allclose([table.remanence_x_T, table.remanence_y_T, table.remanence_z_T],
                                    [[0], [1.3], [0]], atol=1e-9)
+
+
+@pytest.mark.parametrize(("text", "declared", "said"), [
+    ("id;type;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;12;0;0\n", {"length_unit": "mm"},
+     "--length-unit"),
+    ("id;type;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;12;0;0\n", {"along_block": True},
+     "--along-block"),
+    (FREE + "Br [mT]\nb;cuboid;0;0;0;0;0;0;1;2;3;1300\n", {"axes": ("z", "x", "y")},
+     "--axes and --along-block"),
+    (FREE + "Br [mT]\nb;cuboid;0;0;0;0;0;0;1;2;3;1300\n", {"length_unit": "cm"},
+     "--length-unit"),
+    (FREE + "Br\nb;cuboid;0;0;0;0;0;0;1;2;3;1300\n", {"field_unit": "mT"}, "")])  # the control
+def test_an_option_that_would_have_no_effect_is_refused(tmp_path, text, declared, said):
+    declared = {"fixed": {"sigma": "0.1 %"} if "type" in text else {}} | declared
+    if not said:
+        assert len(imported(tmp_path, text, **declared)) == 1
+        return
+    with pytest.raises(MeasurementError, match=f"Input {said} of table of blocks"):
+        imported(tmp_path, text, **declared)
+
+
+def test_columns_that_are_not_read_are_named(tmp_path):
+    row = "Br [mT];{}\nb;cuboid;0;0;0;0;0;0;10;20;30;1300;{}\n"
+    with pytest.warns(HalbachWarning, match="are not read: colour, temperature, volume. Free"):
+        imported(tmp_path, FREE + row.format("colour;temp;volume [cm^3]", "red;80;3"))
+    measured = "id;type;mx [A m^2];my [A m^2];mz [A m^2];temp\nA;1;12;0;0;20\n"
+    imported(tmp_path, measured, fixed={"sigma": "0.1 %"})  # warnings are errors
 
 
 def test_workbooks_and_the_command(tmp_path, capsys):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, StudyError, must_be, printable
+from halbach_fe.core.errors import (
+    HalbachWarning,
+    MeasurementError,
+    StudyError,
+    must_be,
+    printable,
+)
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MU_0
 from halbach_fe.measurement.block_table import BlockTable
@@ -105,6 +112,7 @@ class _Table:
     lines: tuple[int, ...]
     where: str
     decimal_comma: bool
+    unknown: tuple[str, ...]
 
     def __contains__(self, name: object) -> bool:
         return name in self.cells
@@ -141,6 +149,14 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
             "content", where, "complete", f"a table that does not say {'; '.join(missing)}",
             "A column can be named by --columns, and what all blocks share be given by one --fixed "
             "NAME=VALUE,NAME=VALUE; nothing is guessed."))
+    if declared.along_block and not free:
+        raise MeasurementError(must_be(
+            "--along-block", where, "beside positions, which free blocks have", "alone",
+            "Leave it out: measured moments lie along the block's own axes."))
+    if unread := _unread(table, free):
+        warnings.warn(f"Of {where} these are not read: {', '.join(unread)}. "
+                      f"{'Free' if free else 'Measured'} blocks have no such quantity, or it "
+                      "follows from the others.", HalbachWarning, stacklevel=2)
     if free:
         return _free_blocks(table, declared)
     digest = hashlib.sha256(raw).hexdigest()
@@ -189,10 +205,19 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         unit[name] = said
     kinds = {"length": declared.length_unit, "field": declared.field_unit,
              "angle": declared.angle_unit}
+    for kind, said in kinds.items():
+        own = {one for name, one in unit.items() if KIND.get(name) == kind}
+        if said and "" not in own and own != {said}:
+            raise MeasurementError(must_be(
+                f"--{kind}-unit", where, "of a column that does not state its unit itself",
+                f"'{said}', which no column needs", "Leave it out."))
     for name in unit:
         unit[name] = units.unit_symbol(unit[name]) or (
             unit[name] if unit[name] else kinds.get(KIND.get(name, ""), ""))
-    return _Table(cells, unit, tuple(one[0] for one in body), where, declared.decimal_comma)
+    unknown = [text.strip() for text, (name, _) in zip(rows[start][1], header, strict=False)
+               if not name and text.strip()] if start >= 0 and not declared.columns else []
+    return _Table(cells, unit, tuple(one[0] for one in body), where, declared.decimal_comma,
+                  tuple(unknown))
 
 
 def _names(cells: Sequence[str]) -> bool:
@@ -262,6 +287,21 @@ def _missing(table: _Table, free: bool) -> list[str]:
             missing.append(f"the unit of {name} (one of {', '.join(units.KINDS[kind])}"
                            + (f", not '{unit[:20]}')" if unit else ")"))
     return missing
+
+
+def _unread(table: _Table, free: bool) -> list[str]:
+    """Return the columns, and the values that all blocks share, that make no difference."""
+    strength = _strength(table)
+    read = {strength, *(f"{strength}_{axis}" for axis in COMPONENTS if strength not in table),
+            "serial", "type", "ring", "slot"}
+    sizes = {f"size_{axis}" for axis in COMPONENTS}
+    if free:
+        read |= {"shape", "material", "sides"} | {
+            name for name, kind in KIND.items() if kind in ("length", "angle")}
+        read |= {"volume"} if strength == "moment" else set()
+    else:
+        read |= {"sigma", "temperature", "volume"} | (set() if "volume" in table else sizes)
+    return [*table.unknown, *(name for name in table.cells if name not in read)]
 
 
 def _volume(table: _Table) -> Floats:
@@ -343,6 +383,11 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
         if strength == "moment":
             vectors = vectors * (MU_0 / _volume(table))[:, None]
         if strength in table:
+            if declared.along_block or declared.axes != COMPONENTS:
+                raise MeasurementError(must_be(
+                    "--axes and --along-block", table.where, "of a strength of three components",
+                    f"beside a single column of it, {strength}, which is along the block's own x",
+                    "Leave them out."))
             columns["remanence_T"] = vectors[:, 0].tolist()
         else:
             vectors = _turned(vectors, declared.axes)
