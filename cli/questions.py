@@ -117,7 +117,8 @@ def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
              help=f"where the line goes {end}") for end in ("from", "to")),
     option("--count", type=partial(at_least, 3), default=201, metavar="N",
            help="number of points of a line (default: 201)"),
-    option("--across-m", type=finite_number, nargs=2, default=(0.0, 0.0), metavar=("U", "V"),
+    option("--across-m", type=within(finite_number, 0.0, 10.0), nargs=2, default=(0.0, 0.0),
+           metavar=("U", "V"),
            help="half widths of a grid of parallel lines: of a line along z those along x and y"),
     option("--lines", type=positive, metavar="N",
            help="number of lines along each half width (default: 5)"),
@@ -143,10 +144,12 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.types import COMPONENTS
 
-    if arguments.lines and not any(arguments.across_m):
-        raise StudyError(must_be("--lines", "the command line", "beside --across-m, the half "
-                                 "widths of the grid of lines", "given alone", "Add --across-m "
-                                 "U V, or leave it out."))
+    fewest = 2  # along a half width
+    if arguments.lines and (arguments.lines < fewest or not any(arguments.across_m)):
+        raise StudyError(must_be("--lines", "the command line", "at least 2, beside --across-m, "
+                                 "the half widths of the grid of lines", f"{arguments.lines}"
+                                 + ("" if any(arguments.across_m) else " alone"),
+                                 "Correct it, add --across-m U V, or leave it out."))
     offsets = tuple(np.linspace(-half, half, arguments.lines or 5) if half else np.zeros(1)
                     for half in arguments.across_m)
     lines = Lines(np.array(arguments.from_m), np.array(arguments.to_m), (offsets[0], offsets[1]),
@@ -186,7 +189,10 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
                                                    columns[f"sd_I{order}{axis}_{key}"][middle])
             for order, name, unit, key in ((1, "first", "T m", "T_m"), (2, "second", "T m²",
                                                                          "T_m2"))}}
-        for axis in COMPONENTS], "Integrals of B along the middle line")
+        for axis in COMPONENTS], "Integrals of B along the "
+        + ("middle line" if not columns["u_m"][middle] and not columns["v_m"][middle] else
+           f"line at u = {1e3 * columns['u_m'][middle]:.4g} mm, "
+           f"v = {1e3 * columns['v_m'][middle]:.4g} mm"))
     if doubt:
         say(doubt)
     several = "1 line" if len(lines.points) == 1 else f"{len(lines.points)} lines"

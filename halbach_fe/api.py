@@ -8,6 +8,7 @@ The package `halbach_fe` exports them: a user writes ``import halbach_fe as hf``
 from __future__ import annotations
 
 import difflib
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from dataclasses import field as value_of
@@ -17,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arguments import refuse_unknown, typed
-from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
@@ -456,7 +457,14 @@ def field(
     """
     known = (assembled_prior(magnet, magnet.nominal_magnetization) if posterior is None
              else distributions_of(magnet, posterior)["posterior"])
-    return field_on_lines(magnet, lines, known, session, inside)
+    found = field_on_lines(magnet, lines, known, session, inside)
+    most = 0.01
+    if (spacing := found.relative_spacing) > most:
+        warnings.warn(f"The {lines.count} points of a line are too far apart for its integrals: "
+                      f"that makes {100 * spacing:.2g} % of the integral of |B|, which is in "
+                      "their error bars. Take more points (--count), or shorter lines.",
+                      HalbachWarning, stacklevel=2)
+    return found
 
 
 @alone

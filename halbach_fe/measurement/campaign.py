@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -16,7 +17,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
     TOTAL_SIGMA_COLUMN,
@@ -60,8 +61,8 @@ COARSE = 0.25
 that readings at a place repeat: then repetitions prove nothing."""
 
 FEWEST_COPIES, BY_CHANCE = 8, 1e-6
-"""Smallest count of rows that are copies of others, and the probability below which so many
-repetitions are no chance."""
+"""Smallest count of rows that are copies of others from which a map is refused, and the probability
+below which so many repetitions are no chance."""
 
 
 @dataclass(frozen=True)
@@ -254,11 +255,18 @@ def _refuse_copies(name: str, data: xr.Dataset, study: Study) -> None:
     count = int(copied.sum())
     if count and _no_chance(count, int(again.sum()), field, noise):
         row = int(max(order[np.flatnonzero(copied)[0]:][:2])) + 1
-        raise MeasurementError(must_be(
+        _refuse(count, must_be(
             f"rows of `{name}`", f"study {study.name}", "readings of their own, as the same "
             "readings must not count twice", f"{count} of {len(points)} rows that are another row "
             f"again, digit for digit, such as row {row}", "Remove the copies; repeated "
             "measurements differ by their noise."))
+
+
+def _refuse(copies: int, sentence: str) -> None:
+    """Raise a MeasurementError of copies of readings, or warn if so few hardly change a result."""
+    if copies >= FEWEST_COPIES:
+        raise MeasurementError(sentence)
+    warnings.warn(f"{sentence} Until then these count twice.", HalbachWarning, stacklevel=2)
 
 
 def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
@@ -267,7 +275,7 @@ def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
     Two readings that are rounded to steps q have the same digits with the probability
     ``q / (2 sqrt(pi) sigma)``, for q below the noise sigma.
     """
-    if copies < FEWEST_COPIES or noise <= 0:
+    if not copies or noise <= 0:
         return False
     alike = 1.0
     for column in field.T:
@@ -299,13 +307,13 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
         copies = int(repeated(fewer, more, exact).sum())
         there = int(repeated(fewer[:, :3], more[:, :3], exact[:3]).sum())
         of_fewer = field if fewer is sides[0] else values
-        if shared > SHARED * len(fewer) or _no_chance(
-                copies, there, of_fewer[:, both], min(noise, sigma)):
-            shared = max(shared, copies)
-            raise MeasurementError(must_be(
+        rounded = shared > SHARED * len(fewer)
+        if rounded or _no_chance(copies, there, of_fewer[:, both], min(noise, sigma)):
+            count = max(shared, FEWEST_COPIES) if rounded else copies
+            _refuse(count, must_be(
                 f"`maps` '{one.name}' and '{other.name}'", "the campaign",
                 "different maps, as the same readings must not count twice",
-                f"the same readings in {shared} of {len(fewer)} rows",
+                f"the same readings in {shared if rounded else copies} of {len(fewer)} rows",
                 "Remove one of them, or these rows of one."))
 
 

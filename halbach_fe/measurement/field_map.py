@@ -525,11 +525,13 @@ def _check_header(header: list[str], where: str) -> None:
 
 
 def _number(cell: str, name: str, number: int, where: str) -> float:
-    if not cell and name in (*FIELD_COLUMNS, *SIGMA_COLUMNS, *TOTAL_COLUMNS):
+    may_be_empty = name in (*FIELD_COLUMNS, *SIGMA_COLUMNS, *TOTAL_COLUMNS)
+    if not cell and may_be_empty:
         return np.nan
     return finite(cell, f"{name} in line {number}", where,
                   "Write seconds, or call the column time and convert the file by halbach-fe "
-                  "import-map." if name == "time_s" else "Leave a missing component empty.")
+                  "import-map." if name == "time_s" else "Leave a missing component empty."
+                  if may_be_empty else "Correct it, or remove the row.")
 
 
 def check_readings(data: xr.Dataset, path: Path | str) -> None:

@@ -59,6 +59,10 @@ def test_rows_that_come_again_with_other_times(generator):
     some[:200] = first[:200]
     with pytest.raises(MeasurementError, match="200 of 1280"):
         maps_of(study(), twice(first, some))
+    few = read(generator)
+    few[:3] = first[:3]
+    with pytest.warns(HalbachWarning, match="3 of 1280 rows .* Until then these count twice"):
+        maps_of(study(), twice(first, few))
     single = np.where([True, False, False], first, np.nan)
     with pytest.raises(MeasurementError, match="digit for digit"):
         maps_of(study(), twice(single, single))
@@ -85,7 +89,8 @@ def test_a_part_of_a_map_in_another_one(generator):
         maps_of(study("one", "two"), copied)
     second[8:200] += 1e-6
     second[7] += 1e-6
-    maps_of(study("one", "two"), {**data, "two": field_map(GRID, second)})
+    with pytest.warns(HalbachWarning, match="7 of 640 rows.* Until then these count twice"):
+        maps_of(study("one", "two"), {**data, "two": field_map(GRID, second)})
 
 
 def test_a_field_along_z_in_two_dimensions_is_told(generator):

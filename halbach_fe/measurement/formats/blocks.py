@@ -19,13 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import (
-    HalbachWarning,
-    MeasurementError,
-    StudyError,
-    must_be,
-    printable,
-)
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be, printable
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MU_0
 from halbach_fe.measurement.block_table import BlockTable
