@@ -681,6 +681,8 @@ def simulate_measurement(arguments: argparse.Namespace) -> int:
     # before the simulation, which may take long; a refused study leaves no folder all the same
     common.own_folder(arguments, study.name)
     elements = Elements(arguments.element_size, arguments.order)
+    alone = "." if elements == Elements() or arguments.hide or arguments.hide_random else (
+        " alone: --element-size and --order of NGSolve make no difference.")
     placed = common.blocks_of(arguments.placed)
     said = arguments.json
 
@@ -689,7 +691,7 @@ def simulate_measurement(arguments: argparse.Namespace) -> int:
         nonlocal said
         if not said:
             common.say("Computing the field with magpylib" + (
-                "." if magnet.is_vacuum else " and NGSolve, which may take minutes."))
+                alone if magnet.is_vacuum else " and NGSolve, which may take minutes."))
         said = True
         show(done, total)
 

@@ -24,6 +24,7 @@ from halbach_fe.cli.options import (
     at_least,
     count,
     dry_run,
+    describes_a_format,
     finite_number,
     input_file,
     map_format,
@@ -35,7 +36,7 @@ from halbach_fe.cli.options import (
     whole,
     within,
 )
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import CommandLineError, StudyError, must_be
 from halbach_fe.core.numbers import ACROSS, DENSITY, DRAWS, HIGHEST_DEGREE
 
 if TYPE_CHECKING:
@@ -267,6 +268,14 @@ def homogeneity(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     from halbach_fe.response.homogeneity import SHOWN_DEGREES
 
     within_it, posterior = common.region_of(arguments), common.posterior_of(arguments, magnet)
+    if not arguments.measurements and describes_a_format(arguments):
+        raise CommandLineError(must_be(
+            "options of the format", "the command line", "beside --measurements, whose map they "
+            "describe", "given alone", "Add --measurements MAP, or leave them out."))
+    if arguments.degrees and within_it is not None and within_it.shape != "sphere":
+        raise CommandLineError(must_be(
+            "--degrees", "the command line", "of a sphere, which alone has spherical harmonics",
+            "beside another region", "Leave it out, or give --sphere-m."))
     data = (common.read_one(arguments, arguments.measurements) if arguments.measurements
             else None)
     with common.session(arguments, magnet.study) as session:

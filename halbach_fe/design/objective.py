@@ -116,7 +116,7 @@ def check_objective(
         if there is not None:
             raise StudyError(must_be(
                 name, f"study {magnet.name}", "left out, as its table [homogeneity] asks for a "
-                "homogeneous field", "given", "Leave out the options of multipoles, or the table."))
+                "homogeneous field", "one", "Leave out the options of multipoles, or the table."))
     region_points(magnet, default_region(magnet))
 
 

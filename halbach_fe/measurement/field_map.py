@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
@@ -33,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, OutputError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError, must_be
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
@@ -689,9 +690,17 @@ def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
         keys.append(np.unique(data["scan"].values, return_inverse=True)[1][:, None].astype(float))
     _, first = np.unique(np.hstack(keys), axis=0, return_index=True)
     copies = np.setdiff1d(np.arange(len(points)), first)
+    if not len(copies):
+        return
+    x, y, z = points[copies[0]]
+    said = must_be(
+        f"reading {copies[0] + 1}", where, "no copy of another row", f"({x:g}, {y:g}, {z:g}) m "
+        f"with the same readings again, as {len(copies)} of {len(points)} rows are",
+        "Remove them, or distinguish repeated readings by time_s or scan.")
     if len(copies) > COPIES * len(points):
-        x, y, z = points[copies[0]]
-        raise MeasurementError(must_be(
-            f"reading {copies[0] + 1}", where, "no copy of another row", f"({x:g}, {y:g}, {z:g}) m "
-            f"with the same readings again, as {len(copies)} rows are",
-            "Remove them, or distinguish repeated readings by time_s or scan."))
+        raise MeasurementError(said)
+    # without times, few digits make some readings of a place alike
+    finest_T = 1e-8  # no probe of magnets reads finer steps twice
+    read = np.nan_to_num(data["B_T"].values[copies])
+    if "time_s" in data or (np.abs(read / finest_T - np.rint(read / finest_T)) > 1e-3).any():
+        warnings.warn(f"{said} Until then these count twice.", HalbachWarning, stacklevel=2)

@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from halbach_fe.core.errors import printable
 from halbach_fe.core.files import write_text
-from halbach_fe.inference.result import Reservation
+from halbach_fe.inference.result import OWN_NOISE, Reservation
 from halbach_fe.report.words import in_a_row
 from halbach_fe.study.model import Study
 
@@ -202,6 +202,11 @@ def agreement(disagreement: str | None) -> str:
             if disagreement is None else "Yes: the update agrees with its map.")
 
 
+STATE_NOISE = ("State the noise that the map has (sigma_T, position_sd_m) and update again. This "
+               "command finds it.", "halbach-fe check MAP -o DIR")
+"""The next step, and its command, if readings scatter less than their noise."""
+
+
 def of_a_conflict(question: str, said: str, disagreement: str) -> Answer:
     """Return an answer from an update that disagrees with its map, which is not to be trusted.
 
@@ -212,6 +217,11 @@ def of_a_conflict(question: str, said: str, disagreement: str) -> Answer:
             question, said, f"{disagreement} These numbers are of that update.",
             "Find out what it is, and update again, before you rely on these numbers.",
             "halbach-fe infer STUDY --measurements MAP -o DIR", sound=False)
+    if disagreement.endswith(OWN_NOISE):  # the readings are nearer than their noise, and no more
+        return Answer(
+            question, "Not known, as model and measurement agree better than the stated noise "
+            f"allows. If the noise were right: {said}", f"No. {disagreement}", *STATE_NOISE,
+            sound=False)
     return Answer(
         question, f"Not known, as model and measurement disagree. If the model were right: {said}",
         f"No. {disagreement}",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
-from halbach_fe.report.answer import Answer
+from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
     decimals,
@@ -125,8 +125,7 @@ def _of_the_solver(result: InferenceResult) -> str:
 def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
     """Return the next step, and its command, if model and measurement disagree."""
     if result.disagreement == result.too_near:
-        return ("State the noise that the map has (sigma_T, position_sd_m) and update again. This "
-                "command finds it.", "halbach-fe check MAP -o DIR")
+        return STATE_NOISE
     if result.solver_over_noise >= 1:
         return ("First lower the solver's error, as is said above, and update again: as it is, it "
                 "hides what the study may lack. This command shows how it falls.",

@@ -151,8 +151,7 @@ def _answer(found: SortedBlocks) -> Answer:
             question, f"It does not matter: {what} {text(best)} {unit} in every order that is "
             f"allowed.{left}", f"Yes: {len(found.random)} random orders are alike. Only blocks "
             "that are at the same angle may change places, in rings whose fields add up along z.",
-            "Let more slots take the same blocks by prior.types of the study"
-            f"{types_in_words(found.alike)}, and sort again.",
+            f"To have a choice, {_more(found)}. Then sort again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
     if not _chose(found):
         return Answer(
@@ -189,9 +188,17 @@ def _answer(found: SortedBlocks) -> Answer:
         f"them upside down.{_ordered(found)}",
         "Assemble the magnet in this order, measure it, and update the blocks." if not hardly else
         "Assemble the magnet in this order, or in another one that you write into "
-        "blocks.sorted.csv, measure it, and update the blocks. To gain more, let more slots take "
-        f"the same blocks by prior.types of the study{types_in_words(found.alike)}.",
+        f"blocks.sorted.csv, measure it, and update the blocks. To gain more, {_more(found)}.",
         "halbach-fe infer STUDY --measurements MAP --blocks DIR/blocks.sorted.csv -o DIR")
+
+
+def _more(found: SortedBlocks) -> str:
+    """Say what gives the search more choice."""
+    stated = {frozenset(slots) for slots in found.study.prior.types.values()}
+    if stated == {frozenset(slots) for slots in found.alike.values()}:
+        return "measure spare blocks: all slots whose blocks are alike take the same ones already"
+    return ("let more slots take the same blocks by prior.types of the study"
+            f"{types_in_words(found.alike)}")
 
 
 def _ordered(found: SortedBlocks) -> str:

@@ -189,6 +189,9 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
     It ends with the number of the others. ``root`` is the model of the whole file.
     """
     errors = error.errors(include_url=False)
+    # A list of which an element is wrong is too short besides, as pydantic counts the others.
+    errors = [one for one in errors if one["type"] != "too_short" or not any(
+        other is not one and other["loc"][:len(one["loc"])] == one["loc"] for other in errors)]
     # An unknown key is the likeliest cause of the others: a misspelt key is also a missing key.
     errors.sort(key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]

@@ -168,7 +168,7 @@ def simulate_campaign(
     sigma = point_noise(study, np.vstack([points, others]), magnitude)
     blocks, coil, noise, effects, faults = _streams(seed)
     nominal = magnet_of(study)
-    site = site_of(study, nominal)
+    site = replace(site_of(study, nominal), is_of_length=magnitude)
     hidden = choose_effects(site, hide, hide_random, effects)
     drawn = draw_magnet(study, nominal, blocks)
     table, calibration = coil_table(study, nominal, with_effects(

@@ -120,7 +120,14 @@ def test_command_lines(campaign, tmp_path, capsys, arguments, said):
     (["simulate-measurement", "{study}", "--hide", "iron_ring=0.01,0.02,9,2"], 3, "outer radius"),
     (["simulate-measurement", "{study}", "--hide", "iron_ring=0.3,0.2,9,2"], 3, "above inner"),
     (["simulate-measurement", "{study}", "--hide", "ferromagnetic_object=0,0,0,1"], 3, "away"),
-    (["simulate-measurement", "{study}", "--hide", "neighbour_magnet=0"], 3, "either side")])
+    (["simulate-measurement", "{study}", "--hide", "neighbour_magnet=0"], 3, "either side"),
+    (["simulate-measurement", "{study}", "--component", "abs", "--hide", "offset_y=0.1"], 3,
+     "also needs: y. Choose another effect, or change the study. A map of |B| has a single"),
+    (["simulate-measurement", "{study}", "--component", "abs", "--hide", "swapped_axes=1,2"], 3,
+     "also needs: axes"),
+    (["homogeneity", "{study}", "--length-unit", "mm"], 2, "beside --measurements, whose map"),
+    (["homogeneity", "{study}", "--cylinder-m", "0.01", "0.01", "--degrees", "4"], 2,
+     "--degrees of the command line must be of a sphere")])
 def test_values_that_no_magnet_has(campaign, tmp_path, capsys, arguments, code, said):
     study, measured, blocks = campaign
     found, sentence = refused(

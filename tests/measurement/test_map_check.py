@@ -11,7 +11,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.cli.measured import floor_of
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.measurement import harmonic_field, map_check
 from halbach_fe.measurement.field_map import (
     checked_map,
@@ -787,3 +787,10 @@ def test_a_place_may_be_read_twice(generator):
     assert len(checked_map(field_map(again, field), "map")["B_T"]) == len(GRID) + 1
     with pytest.raises(MeasurementError, match="no copy of another row"):
         checked_map(field_map(np.vstack([GRID, GRID]), np.vstack([field[:-1], field[:-1]])), "map")
+    few = field_map(np.vstack([GRID, GRID[:3]]), np.vstack([field[:-1], field[:3]]))
+    with pytest.warns(HalbachWarning, match="as 3 of .* rows are.* Until then these count twice"):
+        checked_map(few, "map")
+    checked_map(few.assign(B_T=few["B_T"].round(4)), "map")  # may be alike by chance
+    with pytest.warns(HalbachWarning, match="as 1 of"):  # not at the same time
+        checked_map(few.isel(point=[0, 1, 2, *range(20, 60), len(GRID)]).round(4).assign(
+            time_s=("point", np.zeros(44))), "map")

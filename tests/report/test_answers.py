@@ -25,6 +25,7 @@ from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.summary import amounts
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.inference.result import OWN_NOISE
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.report import (
     campaign,
@@ -42,7 +43,7 @@ from halbach_fe.report import (
     tolerance,
     verification,
 )
-from halbach_fe.report.answer import LISTED_MAPS, MOST_WORDS, Answer, known_paths
+from halbach_fe.report.answer import LISTED_MAPS, MOST_WORDS, Answer, known_paths, of_a_conflict
 from halbach_fe.report.page import write_files
 from halbach_fe.report.words import (
     bayes_factor,
@@ -620,6 +621,11 @@ def test_an_update_that_conflicts_with_its_map_is_not_to_be_trusted(given, tmp_p
             assert one.sound == sound
             assert one.trust.startswith("Yes: " if sound else "No. ")
             assert ("diagnose" in one.command) != sound
+    near = of_a_conflict("?", "It is so.", f"It is nearer. {OWN_NOISE}")  # than the noise
+    assert not near.sound
+    assert near.command == "halbach-fe check MAP -o DIR"
+    assert "agree better than the stated noise allows" in near.said
+    assert "diagnose" in of_a_conflict("?", "It is so.", "It is far.").command  # the control
     unknown = hf.multipoles(given.magnet, given.session, posterior=dict(stored))
     assert "which its own page says" in multipoles.answer(unknown.tables, None,
                                                           unknown.disagreement).trust
@@ -835,6 +841,9 @@ def test_an_order_that_hardly_matters(given):
     assert said.said.startswith("The order hardly matters: the sorted one is 1\u00a0% better")
     assert "in all random orders about" in said.said
     assert "or in another one that you write into blocks.sorted.csv" in said.step
+    assert "To gain more, measure spare blocks" in said.step  # all that are alike are of one type
+    apart = replace(alike, study=alike.study.with_(prior__types={}))
+    assert "To gain more, let more slots take the same blocks" in sorting.answer(apart).step
 
 
 def test_an_order_is_compared_with_the_table_and_with_random_ones(given):

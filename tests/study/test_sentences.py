@@ -142,6 +142,16 @@ def test_changes_have_the_sentences_of_a_file(changes, said):
     assert said in str(caught.value)
 
 
+def test_an_element_that_is_wrong_is_counted_once():
+    """pydantic finds a list of tables too short besides, if its only one is wrong."""
+    layer = {"radii_m": [0.1, 0.11], "blocks_per_ring": [8], "sizes_m": [0.01]}
+    design = {"rings": 3, "spacing_m": 0.02, "least_field_T": 0.01, "layer": [layer]}
+    with pytest.raises(StudyError, match=r"or none\.$"):
+        parse_study(changed(DIPOLE, design=design))
+    with pytest.raises(StudyError, match=r"\(1 more in this file\.\)$"):  # the control
+        parse_study(changed(DIPOLE, design={**design, "spacing_m": 20.0}))
+
+
 def test_a_byte_order_mark(tmp_path):
     """Which some editors put at the beginning of a text."""
     text = (ROOT / "studies" / "quadrupole" / "study.toml").read_bytes()

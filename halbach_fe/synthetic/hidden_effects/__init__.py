@@ -77,7 +77,9 @@ def choose_effects(
             raise StudyError(must_be(f"--hide {effect.name}", "the study",
                                      "an effect whose needs the study meets",
                                      f"one that also needs: {', '.join(lacking)}",
-                                     "Choose another effect, or change the study."))
+                                     "Choose another effect, or change the study."
+                                     + (" A map of |B| has a single sensor, called x, without axes."
+                                        if site.is_of_length else "")))
     others = [effect for effect in EFFECTS.values()
               if effect.group != "gross" and effect not in [requested for requested, _ in effects]
               and all(site.has(need) for need in effect.needs)]

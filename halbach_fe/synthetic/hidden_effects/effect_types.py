@@ -20,12 +20,13 @@ from halbach_fe.synthetic.shapes import Vector
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
 Need = Literal["3d", "rings", "equal rings", "four edges", "no iron", "vacuum", "few blocks",
-               "x", "y", "z", "circles"]
+               "x", "y", "z", "circles", "axes"]
 """A requirement of an effect on the study.
 
 These are three dimensions, several rings, nothing but equal rings, only blocks of four edges, no
 iron in the study, blocks in vacuum besides, at most `FEW_BLOCKS` of them, an observed component x,
-y or z, and points off the axis (``circles``).
+y or z, points off the axis (``circles``), and readings of components, of which maps of |B| have
+none (``axes``).
 """
 
 FEW_BLOCKS = 64
@@ -62,6 +63,8 @@ class Site:
         Whether the array consists of equal rings only.
     has_four_edges : bool
         Whether all blocks have four edges.
+    is_of_length : bool
+        Whether the map is of |B|: its probe is a single sensor, that of x, and has no axes.
     """
 
     dimension: int
@@ -80,6 +83,7 @@ class Site:
     places: tuple[tuple[int, int], ...]
     is_uniform: bool
     has_four_edges: bool
+    is_of_length: bool = False
 
     @property
     def scale(self) -> float:
@@ -89,12 +93,12 @@ class Site:
     def has(self, need: Need) -> bool:
         """Tell whether the study meets a requirement."""
         if need in ("x", "y", "z"):
-            return need in self.components
+            return need in (("x",) if self.is_of_length else self.components)
         return {"3d": self.dimension == 3, "rings": self.rings > 1, "no iron": not self.has_iron,
                 "few blocks": len(self.places) <= FEW_BLOCKS,
                 "vacuum": not self.has_iron and self.permeability == self.most_permeable == 1.0,
                 "equal rings": self.is_uniform, "four edges": self.has_four_edges,
-                "circles": self.radius > 0}[need]
+                "circles": self.radius > 0, "axes": not self.is_of_length}[need]
 
     def slots_of(self, ring: float) -> list[int]:
         """Return the slots of a ring that have a block, in their order."""

@@ -71,7 +71,7 @@ def _misalignment(sensor: int, other: int) -> HiddenEffect:
     name, of = COMPONENTS[sensor], COMPONENTS[other]
     return HiddenEffect(f"misalignment_{name}{of}", "instrument", (HiddenParameter("fraction"),),
                         draw_number(1e-3, 1e-2), instrument=apply,
-                        needs=(name, "3d") if of == "z" else (name,))
+                        needs=(name, "axes", "3d") if of == "z" else (name, "axes"))
 
 
 def _sensor_position(sensor: int, name: Component) -> HiddenEffect:
@@ -194,7 +194,7 @@ def _effects() -> Iterator[HiddenEffect]:
     angle = (HiddenParameter("angle", "rad"),)
     stretch = (HiddenParameter("fraction", least=-0.5, most=1.0),)
     yield HiddenEffect("planar_hall", "instrument", (HiddenParameter("value", "1/T"),),
-                       draw_number(1e-3, 1e-2), instrument=planar_hall, needs=("3d",))
+                       draw_number(1e-3, 1e-2), instrument=planar_hall, needs=("3d", "axes"))
     yield HiddenEffect("quadratic_nonlinearity", "instrument", (HiddenParameter("value", "1/T"),),
                        draw_number(1e-3, 1e-2), instrument=quadratic_nonlinearity)
     yield HiddenEffect("cubic_nonlinearity", "instrument", (HiddenParameter("value", "1/T^2"),),
@@ -327,9 +327,9 @@ GROSS_ERRORS = (
                  lambda site, generator: (signed_log_uniform(generator, 0.05, 0.2) * (
                      site.radius if site.radius > 0 else site.inner),), instrument=wrong_radius),
     HiddenEffect("swapped_axes", "gross", (HiddenParameter("first"), HiddenParameter("second")),
-                 _draw_swap, instrument=swapped_axes),
+                 _draw_swap, instrument=swapped_axes, needs=("axes",)),
     HiddenEffect("sign_flipped_axis", "gross", (HiddenParameter("axis"),), _draw_axis,
-                 instrument=sign_flipped_axis),
+                 instrument=sign_flipped_axis, needs=("axes",)),
     HiddenEffect("millimetres", "gross", (), lambda site, generator: NOTHING,
                  instrument=millimetres),
     HiddenEffect("millitesla", "gross", (), lambda site, generator: NOTHING, instrument=millitesla),
