@@ -161,6 +161,9 @@ def import_blocks(path: str | Path, **declared: object) -> BlockTable | FreeBloc
     0.5
     """
     refuse_unknown(declared, [one.name for one in fields(DeclaredBlocks)], "hf.import_blocks")
+    if not isinstance(declared.get("fixed", {}), Mapping):
+        raise StudyError(must_be("fixed", "hf.import_blocks", "a dict such as {'volume': '12 "
+                                 "cm^3'}", repr(declared["fixed"])))
     if "columns" in declared:
         declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
     return read_foreign_blocks(as_path(path), DeclaredBlocks(**declared))  # type: ignore[arg-type]
@@ -197,6 +200,10 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     """
     path = as_path(path)
     if isinstance(content, Magnet):
+        if format not in ("csv", "blocks"):
+            raise MeasurementError(must_be(
+                "format", "hf.export", "left out for a magnet, of which the table of its blocks is "
+                "written", f"'{format}'", "Its field is a map: hf.solve(magnet).field_map."))
         write_free_blocks(blocks_table(content), path)
     elif format not in WRITERS:
         raise MeasurementError(must_be("format", "hf.export", f"one of {', '.join(WRITERS)}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from dataclasses import dataclass
 
 import numpy as np
@@ -184,10 +185,17 @@ class OpenKey:
         """
         found: object = study
         for name in self.key.split("."):
-            found = getattr(found, name, None)
+            known = getattr(type(found), "model_fields", {})
+            if name not in known:
+                near = difflib.get_close_matches(name, known, 1, 0.5)
+                raise StudyError(must_be(
+                    f"`{self.key}`", f"study {study.name}", "the key of a number", f"`{name}`, "
+                    "which is none", f"Did you mean `{near[0]}`?" if near else ""))
+            found = getattr(found, name)
         if isinstance(found, bool) or not isinstance(found, int | float):
             raise StudyError(must_be(f"`{self.key}`", f"study {study.name}",
-                                     "a number that is given, to be fitted", f"'{found}'"))
+                                     "a number that is given, to be fitted",
+                                     "nothing" if found is None else f"'{found}'"))
         return float(found)
 
     @property

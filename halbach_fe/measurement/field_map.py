@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, plain
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError, must_be
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
@@ -107,7 +107,7 @@ def field_map(
     array([0.4 , 0.39])
     """
     try:
-        points, given = np.array(points_m, float), np.array(B_T, float)
+        points, given = plain(points_m), plain(B_T)
     except (TypeError, ValueError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
@@ -133,7 +133,7 @@ def field_map(
         attrs=dict(attributes or {}))
     data["B_T"].attrs["units"] = "T"
     if sigma_T is not None:
-        sigma = np.array(sigma_T, float)
+        sigma = plain(sigma_T)
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
@@ -209,7 +209,7 @@ def with_total_field(
 ) -> xr.Dataset:
     """Return a map with |B| (n,) in T, and its noise sigma (n,) in T, beside what it has."""
     columns = {TOTAL_COLUMN: magnitude} | ({} if sigma is None else {TOTAL_SIGMA_COLUMN: sigma})
-    return data.assign({name: ("point", np.array(values, float), {"units": "T"})
+    return data.assign({name: ("point", plain(values), {"units": "T"})
                         for name, values in columns.items()})
 
 

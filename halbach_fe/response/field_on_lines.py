@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson, simpson
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.core.numbers import MU_0
+from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.matrix import response_matrix
@@ -67,9 +67,21 @@ class Lines:
     count: int = 201
 
     def __post_init__(self) -> None:
-        for name in ("start", "end"):
-            object.__setattr__(self, name, np.array(getattr(self, name), float))
+        try:
+            for name in ("start", "end"):
+                object.__setattr__(self, name, plain(getattr(self, name)))
+            first, second = self.across
+            object.__setattr__(self, "across", tuple(map(np.atleast_1d, (
+                plain(first), plain(second)))))
+        except (TypeError, ValueError) as error:
+            raise StudyError(must_be("start, end and across", "lines", "numbers in m, and two "
+                                     "arrays of offsets", f"what is none: {error}")) from None
+        values = np.concatenate([self.start.ravel(), self.end.ravel(), *self.across])
+        if self.start.shape != (3,) or self.end.shape != (3,) or not np.isfinite(values).all():
+            raise StudyError(must_be("start and end", "lines", "finite x, y, z in m, and across "
+                                     "finite", f"{self.start.tolist()} and {self.end.tolist()}"))
         fewest = 3  # Simpson's rule needs them
+        check_number("count", "lines", self.count, whole=True)
         if self.count < fewest or np.array_equal(self.start, self.end):
             raise StudyError(must_be(
                 "lines", "the field", f"of at least {fewest} points, and end elsewhere than they "

@@ -17,7 +17,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, plain
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
@@ -186,7 +186,7 @@ def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
 def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
     try:
-        points: Floats = np.ma.filled(np.ma.asarray(points_m, float), np.nan)
+        points = plain(points_m)
     except (TypeError, ValueError):  # text, or rows of different lengths
         raise StudyError(must_be("points_m", magnet.name, "x, y, z in m: an array (..., 3)",
                                  f"a {type(points_m).__name__} that is none")) from None

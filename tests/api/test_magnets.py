@@ -186,10 +186,28 @@ def test_a_study_of_keys_names_all_that_are_missing():
                                   "radius_m": [0.01], "remanence_T": [1.3]}), "received 'sphere'"),
     (lambda: hf.field_map(np.zeros((9, 3)), np.zeros((9, 3)), np.full(8, 1e-5)), "sigma_T"),
     (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]]), "of shapes"),
+    (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0j, 3.0]]), "complex numbers"),
+    (lambda: hf.Lines((0, 0), (0, 0, 1)), "finite x, y, z in m"),
+    (lambda: hf.Lines((0, 0, 0), (0, 0, np.nan)), "finite x, y, z in m"),
+    (lambda: hf.Lines((0, 0, 0), (0, 0, 1), across=(np.nan, 0)), "across finite"),
+    (lambda: hf.Lines((0, 0, 0), (0, 0, 1), across=0.01), "two arrays of offsets"),
+    (lambda: hf.Lines((0, 0, 0), (0, 0, 1), count=3.5), "count of lines must be a whole number"),
+    (lambda: hf.export(hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04), "a.vtu", "vtu"),
+     "format of hf.export must be left out for a magnet"),
+    (lambda: hf.import_blocks("a.csv", fixed="sigma=1 %"), "fixed of hf.import_blocks"),
     (lambda: hf.field_map([[0, 0, 0]], [[1.0, 2.0]], components=["x", "Bz"]), "out of x, y, z")])
 def test_mistakes_get_a_sentence(call, said):
     with pytest.raises(hf.HalbachError, match=said):
         call()
+
+
+def test_a_masked_reading_is_none():
+    """It was read as if it were not masked."""
+    field = np.ma.masked_greater([[0.1, 5.0, 0.2], [0.1, 0.2, 0.3]], 1.0)
+    data = hf.field_map(np.zeros((2, 3)), field, np.ma.masked_less([1e-5, 2e-5, 3e-5], 0))
+    assert np.isnan(data["B_T"].values).tolist() == [[False, True, False], [False] * 3]
+    assert data["sigma_T"].values[0, 0] == 1e-5
+    assert hf.Lines((0, 0, 0), (0, 0, 1), across=(0.01, [0.0, 0.02])).points.shape == (2, 201, 3)
 
 
 def test_noise_of_each_reading_is_that_of_its_components():

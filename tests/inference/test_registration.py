@@ -229,6 +229,9 @@ def test_open_keys_and_probe(magnet, generator, tmp_path):
     ([OpenKey("mesh.block_size_m", 1e-3)], "on which the readings depend.*without effect"),
     ([OpenKey("prior.magnitude_sd", 1e-3)], "on which the readings depend.*without effect"),
     ([OpenKey("array.ring_length_m", 1e-4)] * 2, "open once"),
+    ([OpenKey("array.remanence", 0.02)],
+     r"the key of a number; instead received `remanence`, which is none. Did you mean `remanence_T`"
+     ),
     ([OpenKey("array.rings", 1.0)], r"array\.rings=1 of --fit .*A whole number cannot be fitted"),
     ([OpenKey("array.remanence_T", 100.0)], r"array\.remanence_T=100 of --fit .* smaller"),
 ])

@@ -139,7 +139,12 @@ def test_columns_that_are_not_read_are_named(tmp_path):
     with pytest.warns(HalbachWarning, match="are not read: colour, temperature, volume. Free"):
         imported(tmp_path, FREE + row.format("colour;temp;volume [cm^3]", "red;80;3"))
     measured = "id;type;mx [A m^2];my [A m^2];mz [A m^2];temp\nA;1;12;0;0;20\n"
-    imported(tmp_path, measured, fixed={"sigma": "0.1 %"})  # warnings are errors
+    for name in ("temp", "temperature_C", "temperature_degC"):  # warnings are errors
+        found = imported(tmp_path, measured.replace("temp", name), fixed={"sigma": "0.1 %"})
+        assert found.temperature.tolist() == [20.0]
+    found = imported(tmp_path, measured.replace("temp", "temperature_K").replace("20", "293.15"),
+                     fixed={"sigma": "0.1 %"})
+    np.testing.assert_allclose(found.temperature, 20.0)
 
 
 def test_workbooks_and_the_command(tmp_path, capsys):

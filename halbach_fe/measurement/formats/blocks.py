@@ -226,7 +226,7 @@ def quantity_of(text: str) -> tuple[str, str]:
     if not unit and "_" in text:  # moment_A_m2
         parts = text.split("_")
         for n in range(1, len(parts)):
-            if units.unit_symbol(" ".join(parts[n:])):
+            if units.unit_symbol(" ".join(parts[n:])) or parts[n:] in (["C"], ["K"], ["degC"]):
                 base, unit = "_".join(parts[:n]), " ".join(parts[n:])
                 break
     key = re.sub(r"[\s_.|-]", "", base.lower())
