@@ -78,10 +78,16 @@ def answer(found: HomogeneityResult) -> Answer:
         text += " if all blocks are as ordered"
     text += _of_map(found)
     if _cancels(best):
+        region = found.model.region
+        x, y, z = region.centre_m
+        reach = region.half_axes_m[2]
+        step = ("See its multipoles.", "halbach-fe multipoles STUDY -o DIR")
+        if found.magnet.study.array.multipole_order == 1:  # a dipole whose main multipole is none
+            step = ("See the field on a line through the region.", "halbach-fe field STUDY "
+                    f"--from-m {x:g} {y:g} {z - reach:g} --to-m {x:g} {y:g} {z + reach:g} -o DIR")
         return Answer(
             question, f"{text}.", "Only as a property of |B|: the mean of the vector B over this "
-            "region is 0 but for errors of the blocks, as in a multipole.", "See its multipoles.",
-            "halbach-fe multipoles STUDY -o DIR", sound=False)
+            "region is 0 but for errors of the blocks, as in a multipole.", *step, sound=False)
     trust, small = solver_error_text(found.model, best.rms_ppm)
     numbers = (("mean field", flux_density(best.mean_T, 4)),
                ("rms deviation", f"{ppm(best.rms_ppm)}\u00a0ppm"))

@@ -124,6 +124,8 @@ def test_free_blocks(tmp_path, header, values, declared):
      "--axes and --along-block"),
     (FREE + "Br [mT]\nb;cuboid;0;0;0;0;0;0;1;2;3;1300\n", {"length_unit": "cm"},
      "--length-unit"),
+    (FREE + "Br [mT]\nb;cuboid;0;0;0;0;0;0;1;2;3;1300\n", {"fixed": {"shape": "cylinder"}},
+     "--fixed shape"),
     (FREE + "Br\nb;cuboid;0;0;0;0;0;0;1;2;3;1300\n", {"field_unit": "mT"}, "")])  # the control
 def test_an_option_that_would_have_no_effect_is_refused(tmp_path, text, declared, said):
     declared = {"fixed": {"sigma": "0.1 %"} if "type" in text else {}} | declared

@@ -186,6 +186,9 @@ def test_a_field_that_cancels_has_no_direction(given):
         said = homogeneity.answer(found)
         assert said.trust.startswith("Only" if cancels else "Yes")
         assert ("multipoles" in said.command) == cancels
+        if cancels:  # of a study of a dipole, whose multipoles would be refused
+            other = homogeneity.answer(replace(found, magnet=given.magnet))
+            assert other.command.startswith("halbach-fe field STUDY --from-m 0 0 -")
         assert bool(homogeneity.harmonic_rows(found)) != cancels
 
 

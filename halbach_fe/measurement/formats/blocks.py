@@ -193,6 +193,10 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         if name:
             cells[name], unit[name] = [one[1][column] for one in body], said
     for name, text in declared.fixed.items():
+        if name in cells:
+            raise MeasurementError(must_be(
+                f"--fixed {name}", where, "what the table does not say", "a value beside a column "
+                "of it", "Leave it out, or ignore the column by - in --columns."))
         value, _, said = text.partition(" ")
         value = value.replace(".", ",") if declared.decimal_comma else value
         cells[name] = [value if name in KIND or name == "temperature" else text] * len(body)
