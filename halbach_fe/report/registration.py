@@ -547,8 +547,9 @@ def page(
             Section([*said, Text(
                 "The search tried every rotation by right angles and every place along the axis, "
                 "for a map on a line beside the axis too. Pose, probe and open "
-                "numbers were then fitted together with the magnetizations of all blocks, whose prior is that of the study"
-                f"{updated}; error bars include what the blocks leave open.", "small")]),
+                "numbers were then fitted together with the magnetizations of all blocks, whose "
+                f"prior is that of the study{updated}; error bars include what the blocks leave "
+                "open.", "small")]),
             Section([Table(rows), Text(
                 "chi² per reading is that of the updated blocks; about 1 is expected. Odds compare "
                 "poses that explain the map; there are none if none does, or if poses were left "
