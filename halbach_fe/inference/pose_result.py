@@ -261,6 +261,8 @@ class Registration:
         Which component the readings were taken for, where the map does not say it; else empty.
     total : bool
         Whether the map is of |B|, which then stands in place of x in the residuals.
+    left_out : int
+        Number of poses that the search found too, and that were not fitted.
     """
 
     study: Study
@@ -285,6 +287,7 @@ class Registration:
     likeness: float = 1.0
     component: str = ""
     total: bool = False
+    left_out: int = 0
 
     @property
     def undetermined(self) -> tuple[str, ...]:

@@ -147,6 +147,7 @@ def _registered(
     starts = coarse_poses(magnet, fit.points, fit.readings, fit.training, prior.sd(magnet)[0],
                           pace, fit.total)
     starts = [each for each in starts if fit.is_possible(np.zeros(len(fit.prior_sd())), each)]
+    left_out = len(starts) - len(starts[:most])
     starts = starts[:most]
     if prior.stage is not None and starts:
         starts = _on_stage(starts, prior.stage)
@@ -171,7 +172,7 @@ def _registered(
         if not any(each is best for each in own):
             own.append(fit.refined(np.append(best.middle_m, best.instrument.rotation_rad)))
         own.sort(key=lambda each: -each.log_evidence)
-        found += [each for number, each in enumerate(own)
+        found += [replace(each, left_out=left_out) for number, each in enumerate(own)
                   if not any(_same(each, other) for other in own[:number])]
     return found
 

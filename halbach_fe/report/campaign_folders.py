@@ -429,6 +429,8 @@ def _plain(study: Study) -> dict[str, Any]:
     """Return a study as plain data, without paths, which start from the folder of its file."""
     found = study.model_dump(mode="json", exclude={"description"})
     found["maps"] = [one | {"file": None} for one in found["maps"]]
+    # those by 0 only hold what `uncertain` changes
+    found["array"]["exceptions"] = [one for one in found["array"]["exceptions"] if _own(one)]
     return found
 
 
@@ -453,11 +455,17 @@ def _difference(key: str, old: Any, new: Any) -> str:
 
 def _exception(entry: dict[str, Any]) -> str:
     """Return an entry of `array.exceptions` in words: the block, and what it deviates by."""
-    usual = BlockException().model_dump(mode="json")
-    own = ", ".join(_key_in_words(key, value) for key, value in entry.items()
-                    if value != usual[key] and key not in ("ring", "slot"))
+    own = ", ".join(_key_in_words(key, value) for key, value in _own(entry).items())
     place = block_in_words(entry["ring"] or 0, entry["slot"] or 0) or "all blocks"
     return f"{place} ({own})"
+
+
+def _own(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of an entry of `array.exceptions` by which blocks deviate."""
+    usual = BlockException().model_dump(mode="json")
+    return {key: value for key, value in entry.items() if key not in ("ring", "slot")
+            and value != usual[key]
+            and (value or key not in ("inner_corner_loss", "magnetization_gradient"))}
 
 
 def _key_in_words(key: str, value: Any) -> str:

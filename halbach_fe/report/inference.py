@@ -54,6 +54,7 @@ from halbach_fe.report.words import (
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.multipoles import circle_models
+from halbach_fe.stats.gaussian import by_readings_alone
 
 STUDY_FILE = "study.updated.toml"
 
@@ -176,6 +177,19 @@ def definition(axis: MagneticAxis) -> str:
 
 
 NOTHING = "–"
+
+ALONE = "by the readings alone"
+"""Head of a column of deviations along easy axes."""
+
+SHRUNK = (
+    "± along the easy axis counts on what was known of the block before: one that is farther off "
+    f"than that is shown too near to the nominal one. “{ALONE[0].upper()}{ALONE[1:]}” leaves out "
+    "what was known before of that block.")
+"""What the columns of the table of blocks mean."""
+
+MOST_PARAMETERS = 3000
+"""Number of magnetizations up to which that column is computed, in seconds."""
+
 NUMBERED_SLOTS, NUMBERED_RINGS = 32, 48
 """Largest numbers of slots and rings for which the contraction figure prints its values."""
 
@@ -251,9 +265,20 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
         rows.append({
             "block": place_of(result.magnet.blocks[there[one]]),
             "along the easy axis": f"{with_error(of * along[one], of * sd)}\u00a0%",
+            **_by_readings(result, row[0], of),
             "turned by": f"{decimals(float(turn), 2)}°",
             "standard deviations of its prior": decimals(float(distance[one]), 2)})
     return rows
+
+
+def _by_readings(result: InferenceResult, axis: Floats, of: float) -> dict[str, str]:
+    """Return the cell of what readings alone say along a unit vector, in per cent by ``of``."""
+    if len(axis) > MOST_PARAMETERS or not result.prior.sd_of(axis[None])[0]:
+        return {}
+    mean, sd = by_readings_alone(result.prior, result.posterior, axis)
+    mean += float(axis @ (result.prior.mean - result.response.nominal))
+    told = of * sd < 100  # not even a whole block otherwise
+    return {ALONE: f"{with_error(of * mean, of * sd)}\u00a0%" if told else NOTHING}
 
 
 @page_of.register
@@ -276,7 +301,8 @@ def page(result: InferenceResult) -> Page:
     return Page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [
-            Section([*doubtful, Table(block_table(result))], "The blocks that deviate most"),
+            Section([*doubtful, Table(block_table(result)), Text(SHRUNK, "small")],
+                    "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),
             Section([View(lambda: view_of_inference(result), colours_in_words(result))]),
             Section([] if result.magnetic_axis is None else [

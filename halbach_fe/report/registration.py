@@ -246,6 +246,11 @@ def stated_odds(found: Sequence[Registration]) -> Floats:
     return probability
 
 
+def has_odds(found: Sequence[Registration]) -> bool:
+    """Tell whether poses have odds: one of them explains the map, and none was left out."""
+    return found[0].explains and not found[0].left_out
+
+
 def _is_near(best: Registration, assumed: Instrument) -> bool:
     """Tell whether the map lies within `NEAR_M` and `NEAR_RAD` of where the study states it."""
     (shift, turn), (old_shift, old_turn) = (
@@ -310,6 +315,9 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
     """Say which other poses are possible, and whether it matters which of them is used."""
     probability, said = stated_odds(found), []
     alike, unlike = [], []
+    if left := found[0].left_out:
+        said.append(f"Of the {len(found) + left} poses that the search found, {len(found)} "
+                    f"{'was' if len(found) == 1 else 'were'} fitted; the others may be as likely.")
     if not found[0].explains:
         alike = rivals(found)
     for each, value in zip(found[1:], probability[1:], strict=True):
@@ -431,7 +439,7 @@ def pose_table(
     for number, (each, probability) in enumerate(zip(found, stated_odds(found), strict=True), 1):
         rows.append({
             "pose": str(number),
-            "odds": f"{100 * probability:.3g} %" if found[0].explains else EMPTY_CELL,
+            "odds": f"{100 * probability:.3g} %" if has_odds(found) else EMPTY_CELL,
             **({"component": f"B{each.component}"} if each.component else {}),
             **({"open": hypothesis(each)} if len(by_hypothesis(found)) > 1 else {}),
             "axes x, y, z of the map": ", ".join(axes_of_map(each.instrument).values()),
@@ -495,7 +503,7 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         return [None if np.isnan(value) else float(value) for value in values]
 
     return {"poses": [{
-        "odds": float(probability) if found[0].explains else None,
+        "odds": float(probability) if has_odds(found) else None,
         "at_rest": each.at_rest, "explains": each.explains, "sound": is_sound(each),
         "doubts": [one.plain() for one in each.doubts], "factor": each.factor,
         **({"component": each.component} if each.component else {}),
@@ -537,13 +545,15 @@ def page(
         "register", f"where {'map ' + name if name else 'the map'} lies in the magnet", study,
         answer(found, before, name, assumed=study.instrument), registration_summary(found), [
             Section([*said, Text(
-                "Every rotation by right angles and every place along the axis was tried, for a "
-                "map on a line beside the axis too. Pose, probe and open numbers were then fitted "
-                "together with the magnetizations of all blocks, whose prior is that of the study"
-                f"{updated}; error bars include what the blocks leave open.", "small")]),
+                "The search tried every rotation by right angles and every place along the axis, "
+                "for a map on a line beside the axis too. Pose, probe and open "
+                "numbers were then fitted together with the magnetizations of all blocks, whose "
+                f"prior is that of the study{updated}; error bars include what the blocks leave "
+                "open.", "small")]),
             Section([Table(rows), Text(
                 "chi² per reading is that of the updated blocks; about 1 is expected. Odds compare "
-                "poses that explain the map; there are none if none does.", "small")], "Poses"),
+                "poses that explain the map; there are none if none does, or if poses were left "
+                "out.", "small")], "Poses"),
             Section([Table(doubts)] if doubts else [], "Far from what was known before"),
             Section(["The pose is where the middle of the map lies in the magnet, and how the map "
                      "is turned about the axes of the magnet, once its own axes were put along "

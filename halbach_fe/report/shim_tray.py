@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
@@ -45,6 +45,19 @@ def answer(found: FilledTray) -> Answer:
 
 def _answer(found: FilledTray) -> Answer:
     """Return the answer of an update that agrees with its map."""
+    if not found.filled:
+        return _told(found)
+    (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
+    numbers = (("rms deviation without and with the tray",
+                f"{ppm(before)} → {ppm(after)}\u00a0ppm"),)
+    useless = f"Do not fill this tray: {len(found.filled)} of its magnets hardly help."
+    return replace(_told(found), numbers=numbers, gist=useless if before < FEW * after else
+                   f"Fill the tray with {len(found.filled)} magnets in {len(found.places_m)} "
+                   "places.")
+
+
+def _told(found: FilledTray) -> Answer:
+    """Return the same without its numbers in large type."""
     region, tray = found.model.region.text, found.magnet.study.shim_tray
     question = f"Which magnets in the tray make the field in {region} homogeneous?"
     measured = "halbach-fe infer STUDY --measurements NEW_MAP -o DIR"
@@ -158,8 +171,7 @@ def _tray_figure(found: FilledTray) -> Figure:
         colour = COLOURS[number % len(COLOURS)]
         axis.quiver(angle, z, np.sin(turn), np.cos(turn), pivot="mid", color=colour,
                     scale=max(26, 1.1 * columns), width=0.005, label=name)
-    axis.set(xlabel="angle about z in degrees\narrows: north ↑ away from the axis, "
-             "→ counter-clockwise", ylabel="z in mm", xlim=(-10, 360))
+    axis.set(xlabel="angle about z in degrees", ylabel="z in mm", xlim=(-10, 360))
     axis.margins(y=0.2)
     axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(names) + 1, frameon=False)
     return figure
@@ -180,8 +192,9 @@ def page(found: FilledTray) -> Page:
               f"The first {LISTED} of {len(rows)} magnets of shim_tray.csv")
     figures = {
         "shim_tray.png": (
-            partial(_tray_figure, found), "The tray unrolled, seen from outside. Arrows are "
-            "polarizations: up is away from the axis, right is counter-clockwise"),
+            partial(_tray_figure, found), "The tray unrolled, seen from outside. Arrows point to "
+            "the north poles of its magnets: up is away from the axis, right is "
+            "counter-clockwise"),
         "before.png": (partial(slices_figure, before, found.before.mean_T, largest),
                        text.format("an empty tray")),
         "after.png": (partial(slices_figure, after, found.after.mean_T, largest),

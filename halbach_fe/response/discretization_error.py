@@ -49,9 +49,11 @@ of the iron. The potential is of order (distance)^(2/3) there, and the error els
 the Finite Element Method, chapter 8). Without iron the materials differ by some per cent, so that
 the order is above 2 and the change itself is larger than the error."""
 
-BOUNDARY_SERIES = 1 / (1 - REFINEMENT**-3)
-"""Error of a 3D outer boundary over the change by the farther boundary: 1.4. The field that the
-boundary reflects is that of a dipole at most, and falls with the cube of its distance."""
+BOUNDARY_SERIES = {dimension: 1 / (1 - REFINEMENT**-dimension) for dimension in (2, 3)}
+"""Error of an outer boundary over the change by the farther boundary: 1.8 in 2D and 1.4 in 3D. The
+field that the boundary reflects is that of a dipole at most, and falls with the square of its
+distance in 2D, with the cube in 3D."""
+
 
 def refined(magnet: Magnet, factor: float) -> Magnet:
     """Return the magnet with all elements smaller by a factor (larger if it is below 1).
@@ -100,9 +102,9 @@ def reading_errors(
     On a 3D mesh the other discretization is the dual formulation on the same mesh: the energies of
     the two formulations bracket the exact energy, and the two err in opposite directions at the
     boundary. For the other routes a second mesh is cheap. Their error bar is the sum of the changes
-    made by a coarser mesh and by a farther boundary. For azimuthal modes the coarser mesh also has
-    more modes, so that its change contains the modes that were left out, and both changes are
-    extrapolated (`IRON_SERIES`, `BOUNDARY_SERIES`).
+    made by a coarser mesh and by a farther boundary, which is extrapolated (`BOUNDARY_SERIES`). For
+    azimuthal modes the coarser mesh also has more modes, so that its change contains the modes that
+    were left out, and is extrapolated too (`IRON_SERIES`).
 
     Parameters
     ----------
@@ -134,13 +136,14 @@ def reading_errors(
 
     def change(variant: Magnet, purpose: str) -> Floats:
         other = finite_element_part(
-            variant, observation.points, _error_bars(session, purpose), columns=False).nominal
+            variant, observation.points, _error_bars(session, purpose), columns=False,
+            anywhere=parts.anywhere).nominal
         return observation.magnitude(other - nominal)
 
     if route.dual is not None:
         return change(magnet.with_(solver__route=route.dual.value), "dual route")
     coarser = change(refined(magnet, 1 / REFINEMENT), "coarser mesh")
-    return coarser if route.mesh is None else coarser + change(
+    return coarser if route.mesh is None else coarser + BOUNDARY_SERIES[magnet.dimension] * change(
         farther(magnet, route.mesh, REFINEMENT), "farther boundary")
 
 
@@ -162,7 +165,7 @@ def _changes_of_modes(
     distant, = solve_modes(farther(magnet, "meridian", REFINEMENT), points, (), _error_bars(
         session, "farther boundary"), modes)
     series = IRON_SERIES if magnet.iron else 1.0
-    return series * (coarser - nominal), BOUNDARY_SERIES * (distant - nominal)
+    return series * (coarser - nominal), BOUNDARY_SERIES[3] * (distant - nominal)
 
 
 EXACT = "exact field"

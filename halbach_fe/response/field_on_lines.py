@@ -9,7 +9,8 @@ is in their bars: lines through faces of blocks, where B jumps, need more points
 
 Inside a block B is mu_0 H, that of all charges, plus the polarization of the block, ``B_r + chi
 mu_0 H``. With permeability 1 all of it is a closed form. Inside iron mu_0 H is the gradient of the
-potential in its elements, and B is ``mu_r`` times that.
+potential in its elements, and B is ``mu_r`` times that. In a cross-section with permeable blocks or
+iron, B is the curl of the vector potential everywhere, and H follows from it.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
+from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
-from halbach_fe.solver.formulation_choice import check_points
+from halbach_fe.solver.formulation_choice import check_plane, check_points, finite_element_part
 from halbach_fe.solver.separate_blocks import (
     SeparateReaction,
     applies,
@@ -120,8 +122,8 @@ class FieldOnLines:
         B along x, y and z.
     root : ndarray, shape (lines, count, 3, q), in T
         Root of its covariance.
-    error : ndarray, shape (lines, count, 3), in T
-        Error bar of the finite elements.
+    error, strength_error : ndarray, shape (lines, count, 3), in T
+        Error bars of the finite elements, of B and of mu_0 H.
     polarization : ndarray, shape (lines, count, 3, 1 + q), in T
         Mean and root of J of the block or iron in which a point is; 0 in air.
     in_block : ndarray of str, shape (lines, count)
@@ -134,6 +136,7 @@ class FieldOnLines:
     mean: Floats
     root: Floats
     error: Floats
+    strength_error: Floats
     polarization: Floats
     in_block: NDArray[np.str_]
     spacing: float
@@ -147,7 +150,8 @@ class FieldOnLines:
     def strength(self) -> tuple[Floats, Floats]:
         """H (lines, count, 3) in A/m and its standard deviation."""
         return ((self.mean - self.polarization[..., 0]) / MU_0, np.hypot(
-            np.linalg.norm(self.root - self.polarization[..., 1:], axis=-1), self.error) / MU_0)
+            np.linalg.norm(self.root - self.polarization[..., 1:], axis=-1),
+            self.strength_error) / MU_0)
 
     def integrals(self, order: int) -> tuple[Floats, Floats]:
         """Return the first or second integral (lines, 3) in T m or T m^2, and its bar.
@@ -236,20 +240,22 @@ def field_on_lines(
             "points", magnet.name, "in air", f"{int((number >= 0).sum())} of {len(points)} inside "
             "blocks or iron", "If B and H inside them are wanted, add --inside."))
     if (number >= 0).any():
-        mean, root, error, polarization = _through_blocks(
+        flux, polarization, (error, weak) = _through_blocks(
             magnet, points, number, magnetizations, session)
+        mean, root = flux[..., 0], flux[..., 1:]
     else:
         check_points(magnet, points, OF_LINES)
         model = response_matrix(magnet, flux_density_at(points), session)
         mean = model.offset + model.whole @ magnetizations.mean
         root, error = model.whole @ magnetizations.root, model.error
+        weak = error
         polarization = np.zeros((len(points), 3, 1 + root.shape[1]))
     shape = lines.points.shape
     names = np.array([*(block.name for block in magnet.blocks),
                       *(f"iron {body}" for body in range(1, len(magnet.iron) + 1)), ""])
     return FieldOnLines(lines, mean.reshape(shape), root.reshape(*shape, -1), error.reshape(shape),
-                        polarization.reshape(*shape, -1), names[number].reshape(shape[:2]),
-                        _spacing_error(magnet, lines))
+                        weak.reshape(shape), polarization.reshape(*shape, -1),
+                        names[number].reshape(shape[:2]), _spacing_error(magnet, lines))
 
 
 def _spacing_error(magnet: Magnet, lines: Lines) -> float:
@@ -287,24 +293,26 @@ def _blocks_of(magnet: Magnet, points: Floats) -> NDArray[np.intp]:
 def _through_blocks(
     magnet: Magnet, points: Floats, number: NDArray[np.intp], magnetizations: Gaussian,
     session: Session,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return mean (n, 3), root (n, 3, q) and bar (n, 3) of B in T, and J (n, 3, 1 + q) in T.
+) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+    """Return B and J, mean and root (n, 3, 1 + q), and the bars (n, 3) of B and mu_0 H, in T.
 
-    ``number`` (n,) is the block or iron that a point is in, see `_blocks_of`. Iron answers to the
-    deviations of the blocks too; what their permeability adds is an error bar, chi times that
+    ``number`` (n,) is the block or iron that a point is in, see `_blocks_of`. In 3D iron answers to
+    the deviations of the blocks too; what their permeability adds is an error bar, chi times that
     field.
 
     Raises
     ------
     StudyError
-        If blocks are not uniformly magnetized, or the magnet is not solved by moments.
+        If blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
     """
     blocks, count = magnet.blocks, len(magnetizations.mean)
-    uniform = count == 3 * len(blocks) and all(len(block.parts) == 1 for block in blocks)
-    if not uniform or magnet.has_losses or not applies(magnet):
+    flat = magnet.dimension == 2
+    uniform = (count == magnet.dimension * len(blocks)
+               and all(len(block.parts) == 1 for block in blocks))
+    if not uniform or magnet.has_losses or not (flat or applies(magnet)):
         raise StudyError(must_be(
-            "points inside blocks", magnet.name, "of a 3D magnet of uniform blocks without "
-            "irreversible losses, and of the method reaction", "another magnet",
+            "points inside blocks", magnet.name, "of a magnet of uniform blocks without "
+            "irreversible losses, and in 3D of the method reaction", "another magnet",
             "End the line before the blocks."))
     outside, in_iron = number < 0, number >= len(blocks)
     if in_iron.any() and magnet.external != External() and not external_acts(magnet):
@@ -312,8 +320,11 @@ def _through_blocks(
             "points inside iron", magnet.name, "of a study without `external`, to which this iron "
             "does not answer here", f"{in_iron.sum()} such points",
             "Leave `external` out, or end the line before the iron."))
+    check_plane(magnet, points, OF_LINES)
     points = points.copy()
     points[outside] = check_points(magnet, points[outside], OF_LINES)
+    if flat:
+        return _through_cross_section(magnet, points, number, magnetizations, session)
     solved = None if magnet.is_vacuum else solve_separate(magnet, session)
     free = np.flatnonzero(~in_iron)
     strength, error = np.zeros_like(points), np.zeros_like(points)
@@ -337,6 +348,7 @@ def _through_blocks(
     polarization = np.zeros_like(of_change)
     nominal = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
     remanence[..., 0] += nominal
+    weak = error.copy()
     for body in set(number[in_iron]):
         here = number == body
         polarization[here], times = _induced(magnet.iron[body - len(blocks)], of_change[here])
@@ -346,8 +358,56 @@ def _through_blocks(
         chi = tensors[block] - np.eye(3)
         polarization[here] = remanence[block] + chi @ of_change[here]
         error[here] = error[here] @ np.abs(tensors[block])
-    flux = of_change + polarization
-    return flux[..., 0], flux[..., 1:], error, polarization
+    return of_change + polarization, polarization, (error, weak)
+
+
+def _through_cross_section(
+    magnet: Magnet, points: Floats, number: NDArray[np.intp], magnetizations: Gaussian,
+    session: Session,
+) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+    """Return the same of a cross-section: B by the vector potential, from which H follows."""
+    magnet = magnet.with_(solver__method="reaction")
+    blocks = magnet.blocks
+    parts = finite_element_part(magnet, points, session, anywhere=True)
+    error = reading_errors(magnet, flux_density_at(points), parts,
+                           error_bar_session(session)).reshape(-1, 3)
+    tensors = np.array([block.recoil_tensor for block in blocks])
+    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
+                              magnetizations.root]).reshape(len(blocks), 2, -1)
+    remanence = MU_0 * tensors[:, :, :2] @ change
+    flux = np.zeros((*points.shape, change.shape[2]))
+    for block, unit in enumerate(unit_fields(blocks, points)):
+        flux += (unit[..., :2] + parts.block(block, slice(None))) @ remanence[block, :2]
+    flux[..., 0] += external_field(magnet, points) + field_of(blocks, points) + parts.nominal
+    remanence[..., 0] += [block.remanence * np.array(block.easy_axis) for block in blocks]
+    polarization, weak = np.zeros_like(flux), error.copy()
+    for body in set(number[number >= 0]):
+        here = number == body
+        if body < len(blocks):
+            flux[here] += remanence[body]
+            inverse = np.linalg.inv(tensors[body])
+            polarization[here] = flux[here] - inverse @ (flux[here] - remanence[body])
+            weak[here] = error[here] @ np.abs(inverse)
+        else:
+            polarization[here], share = _magnetized(magnet.iron[body - len(blocks)], flux[here])
+            weak[here] *= share
+    return flux, polarization, (error, weak)
+
+
+def _magnetized(body: IronSolid, flux: Floats) -> tuple[Floats, Floats]:
+    """Return J (n, 3, 1 + q) of iron in T for B, and d mu_0 H / dB (n, 1) at most.
+
+    Of the roots it is that of a small change.
+    """
+    if isinstance(body.law, float | int):
+        return (1 - 1 / body.law) * flux, np.full((len(flux), 1), 1 / body.law)
+    mean, curve = flux[..., 0], body.law.reluctivity
+    square = np.sum(mean**2, axis=1)
+    share, slope = MU_0 * curve.coefficient(square), 2 * MU_0 * curve.slope(square)
+    along = np.einsum("ni,niq->nq", mean, flux)
+    along[:, 0] = 0.0
+    strength = share[:, None, None] * flux + (slope[:, None] * mean)[..., None] * along[:, None]
+    return flux - strength, np.maximum(share, share + slope * square)[:, None]
 
 
 def _add_answer(

@@ -122,14 +122,15 @@ class Route(StrEnum):
         return 1e-7 if self is Route.SCALAR_POTENTIAL else SUPERPOSITION_TOLERANCE
 
     def solve(
-        self, magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session
+        self, magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
+        anywhere: bool = False
     ) -> Floats:
         """Solve a linear problem; the result is that of `solve_sources`."""
         if self is Route.AZIMUTHAL_MODES:
             reciprocal = saves_solves(magnet, points, blocks)
             return solve_modes(magnet, points, blocks, session,
                                single_blocks=reciprocal_gradients if reciprocal else None)
-        return solve_sources(magnet, points, blocks, session, self.formulation(magnet))
+        return solve_sources(magnet, points, blocks, session, self.formulation(magnet), anywhere)
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,8 @@ class ElementFields:
     for_deviations : bool
         Whether the blocks' parts only serve for deviations from ``nominal``, which is more exact
         than their sum. Derivatives at the nominal array do so too.
+    anywhere : bool
+        Whether points may lie in magnet and iron, of a cross-section.
     """
 
     superposition_tolerance: float
@@ -170,6 +173,7 @@ class ElementFields:
     block: Callable[[int, Ints | slice], Floats]
     error: Floats | None = None
     for_deviations: bool = False
+    anywhere: bool = False
 
     @property
     def linearized(self) -> bool:
@@ -249,7 +253,8 @@ def vacuum_part(magnet: Magnet, points: Floats) -> Floats:
 
 
 def finite_element_part(
-    magnet: Magnet, points: Floats, session: Session, columns: bool = True, estimate: bool = True
+    magnet: Magnet, points: Floats, session: Session, columns: bool = True, estimate: bool = True,
+    anywhere: bool = False
 ) -> ElementFields:
     """Compute the finite-element part of B by the route that `choose_route` returns.
 
@@ -257,7 +262,7 @@ def finite_element_part(
     ----------
     magnet : Magnet
     points : ndarray, shape (n, 3), in m
-        In air.
+        In air, or ``anywhere`` in a cross-section.
     session : Session
     columns : bool
         Whether to solve for single blocks too, the columns of the response matrix.
@@ -273,16 +278,16 @@ def finite_element_part(
     if route is Route.MOMENTS:
         return _moments_part(magnet, points, session, columns, estimate)
     if not columns:
-        nominal = _solve_nominal(magnet, points, session, route)
+        nominal = _solve_nominal(magnet, points, session, route, anywhere)
         return ElementFields(np.nan, nominal, nominal, magnet.blocks, _refuse_column)
     placed = uses_symmetry(magnet)
     symmetry = symmetry_of(magnet) if placed else no_symmetry(magnet)
     places, index = symmetry.source_points(points)
     if magnet.is_nonlinear:
         nominal, fields = solve_tangent(magnet, places, symmetry.sources, session,
-                                        route.formulation(magnet))
+                                        route.formulation(magnet), anywhere)
     else:
-        fields = route.solve(magnet, places, symmetry.sources, session)
+        fields = route.solve(magnet, places, symmetry.sources, session, anywhere)
         nominal = fields[0]
     # The first source is placed by the identity, so its source points are the points themselves.
     here = index[symmetry.sources[0]]
@@ -296,7 +301,7 @@ def finite_element_part(
     tangent = fields[0, here]
     return ElementFields(route.superposition_tolerance(magnet, placed),
                          nominal[here] if magnet.is_nonlinear else tangent, tangent,
-                         magnet.blocks, block)
+                         magnet.blocks, block, anywhere=anywhere)
 
 
 def _moments_part(
@@ -390,12 +395,16 @@ def _refuse_column(number: int, some: Ints | slice) -> Floats:
     raise AssertionError(f"block {number} was not solved for")
 
 
-def _solve_nominal(magnet: Magnet, points: Floats, session: Session, route: Route) -> Floats:
+def _solve_nominal(
+    magnet: Magnet, points: Floats, session: Session, route: Route, anywhere: bool = False
+) -> Floats:
     """Return the finite-element part of B (n, 3) in T of the nominal array."""
+    if magnet.is_nonlinear and anywhere:
+        return solve_tangent(magnet, points, (), session, route.formulation(magnet), True)[0]
     if magnet.is_nonlinear:
         return solve_samples(magnet, points, nominal_samples(magnet), session,
                              route.formulation(magnet))[0]
-    return route.solve(magnet, points, (), session)[0]
+    return route.solve(magnet, points, (), session, anywhere)[0]
 
 
 def finer_in_words(magnet: Magnet, points: Floats) -> str:
@@ -469,6 +478,20 @@ def choose_route(magnet: Magnet, points: Floats) -> Route:
     return Route(asked)
 
 
+def check_plane(magnet: Magnet, points: Floats, key: str) -> None:
+    """Refuse points (n, 3) in m of a 2D study that do not lie in one plane.
+
+    Raises
+    ------
+    StudyError
+    """
+    if magnet.dimension == 2 and len(points) and not is_in_plane(points):
+        raise StudyError(
+            f"Input `{key}` of study {magnet.name} must lie in one plane, since it "
+            f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
+            "one circle, or a 3D study.")
+
+
 def check_points(
     magnet: Magnet, points: Floats, key: str = "observation.positions"
 ) -> Floats:
@@ -496,11 +519,7 @@ def check_points(
         If points are on a face, so far away that they may be in mm, or so near to the outer
         boundary that its condition affects their field; if iron does not answer to external fields.
     """
-    if magnet.dimension == 2 and not is_in_plane(points):
-        raise StudyError(
-            f"Input `{key}` of study {magnet.name} must lie in one plane, since it "
-            f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
-            "one circle, or a 3D study.")
+    check_plane(magnet, points, key)
     places = magnet.surroundings(points)
     refused = places.refusal()
     if refused is not None:

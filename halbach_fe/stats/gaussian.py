@@ -257,3 +257,22 @@ def rotation_roots(vectors: Floats, sd: float) -> Floats:
     axes = np.eye(3)[2:] if vectors.shape[1] == 2 else np.eye(3)
     changes = np.cross(axes, vectors_3d[:, None])  # (n, axes, 3)
     return np.asarray(sd * changes[:, :, :vectors.shape[1]].swapaxes(1, 2))
+
+
+def by_readings_alone(prior: Gaussian, posterior: Gaussian, direction: Floats) -> tuple[
+        float, float]:
+    """Return the change from the prior mean along a unit vector (m,), and its standard deviation,
+    that an update would find if nothing had been known before along it.
+
+    A wide prior along ``u`` takes ``q q^T / (u.q)`` from the inverse covariance of the posterior,
+    with ``q`` the product of the inverse covariance of the prior and ``u`` (Sherman and Morrison).
+    The standard deviation is huge where the readings say nothing.
+    """
+    known = np.linalg.solve(prior.covariance, direction)
+    spread = posterior.covariance @ known
+    # below rounding the readings leave the prior as it was
+    told = max(float(direction @ known - known @ spread), 1e-12 * float(direction @ known))
+    pull = float(direction @ spread) / told
+    change = posterior.mean - prior.mean
+    return (float(direction @ change + pull * (known @ change)),
+            float(np.sqrt(posterior.sd_of(direction[None])[0] ** 2 + pull * (direction @ spread))))

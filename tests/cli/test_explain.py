@@ -13,6 +13,7 @@ from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.report.answer import PAGE_RECORD, Answer, PageRecord, write_record
 from tests.diagnosis.campaign import CIRCLES, NOISE_T, STUDY, drawn, field
+from tests.support.brought_maps import Brought, bring, judged
 from tests.support.cuboids import DOCUMENT
 
 
@@ -43,6 +44,25 @@ def test_a_map_that_the_update_explains_needs_nothing_else(study, generator, tmp
     printed = capsys.readouterr()
     assert "halbach-fe infer" in printed.err
     assert "halbach-fe register" not in printed.err
+
+
+def test_a_displaced_map_of_a_magnet_with_a_weak_block(tmp_path):
+    """README's recipe, as of the six maps of benchmarks/recipe.py, for a small one.
+
+    Negative control: a place 1 mm from where the map was.
+    """
+    case = Brought("", "--blocks-per-ring 8 --cube-m 0.012 --radius-m 0.04 --dsv-m 0.03",
+                   (0.015, 0.015), (1e3, 1e3), shift_m=(0.0, 0.0, 0.001), seed=7, steps=5)
+    bring(case, tmp_path)
+    found = {name: value for name, (value, _) in judged(case, tmp_path).items()}
+    assert said(tmp_path / "out" / "updated").sound
+    assert abs(found["weak_block"]) < 1.96
+    assert found["place"] < 2.39  # the largest of three numbers, in 95 % of cases
+    assert found["coverage"] > 0.85
+    assert not found["named"]
+    assert "by the readings alone" in (tmp_path / "out/updated/report.html").read_text()
+    elsewhere = replace(case, shift_m=(0.0, 0.0, 0.0))
+    assert judged(elsewhere, tmp_path)["place"][0] > 10
 
 
 def test_a_map_that_is_not_there_is_said_once(study, tmp_path, capsys):

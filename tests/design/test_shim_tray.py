@@ -222,5 +222,6 @@ def test_command(measured, tmp_path, capsys):
     page = (out / "shim_tray.html").read_text()
     assert ", without them by" in page
     assert "(None" not in page
+    assert "rms deviation without and with the tray" in page
     assert main([*arguments[:-1], str(tmp_path / "json"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == summary

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.campaign_registration import _of_known_probe
 from halbach_fe.inference.infer import infer
@@ -36,6 +37,7 @@ from halbach_fe.report.registration import (
     is_symmetric_to,
     magnet_on_stage,
     place_table,
+    pose_table,
     probe_table,
     stated_odds,
 )
@@ -133,6 +135,12 @@ def test_equal_poses_are_reported_together(magnet, generator, tmp_path):
         assert ("turned least" in trust) == (evidence > 0)
     worse = replace(twin, log_evidence=best.log_evidence - 1.1 * UNDECIDED_LOG_EVIDENCE)
     assert answer([uneven, worse]).trust.startswith(AT_REST)
+    # of poses that were not fitted nobody knows whether they are as likely
+    assert [row["odds"] for row in pose_table([best, twin])] == ["50 %", "50 %"]
+    lone = [replace(best, left_out=3)]
+    assert [row["odds"] for row in pose_table(lone)] == [EMPTY_CELL]
+    assert "Of the 4 poses that the search found, 1 was fitted" in answer(lone).trust
+    assert "that the search found" not in answer([best, twin]).trust
     # and a fit that has not come to rest is not to be used, nor has it odds
     restless = answer([replace(uneven, at_rest=False), nearly])
     assert "so that the odds of poses mean little" in restless.trust

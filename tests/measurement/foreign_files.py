@@ -53,6 +53,21 @@ def mm_T(length=1e3, tesla=1.0):
     return [*(length * POINTS.T), *(tesla * FIELD.T)]
 
 
+def spherical():
+    """Return the columns r in mm, theta and phi in degrees, and B along these in T.
+
+    The middle of the grid has no angles; 0 stands for them.
+    """
+    x, y, z = POINTS.T
+    radius, phi = np.linalg.norm(POINTS, axis=1), np.arctan2(y, x)
+    theta = np.arctan2(np.hypot(x, y), z)
+    along = (np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]),
+             np.array([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]),
+             np.array([-np.sin(phi), np.cos(phi), 0 * phi]))
+    return [1e3 * radius, np.degrees(theta), np.degrees(phi),
+            *(np.sum(FIELD.T * axis, axis=0) for axis in along)]
+
+
 def comma(text):
     """Return a table with decimal commas."""
     return text.replace(".", ",")
@@ -350,6 +365,15 @@ FILES = [
         " ", FIELD[:, [2, 0]].T), {"skip_lines": 3, "columns": ("Bz[T]", "Bx[T]"),
                                   "positions": True}, ("with it, --skip-lines 3",),
             field=FIELD * [1, np.nan, 1]),
+    Foreign("OPAL", "3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + table(" ", FIELD.T), {
+        "skip_lines": 4, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
+            ("--skip-lines 4",)),
+    Foreign("spherical coordinates", "r [mm],theta [deg],phi [deg],Br [T],Btheta [T],Bphi [T]\n"
+            + table(",", spherical())),
+    Foreign("spherical coordinates of mathematicians", "r [mm],theta [deg],phi [deg],Bx [T],By [T],"
+            "Bz [T]\n" + table(",", [spherical()[one] for one in (0, 2, 1)] + [*FIELD.T]), {
+                "columns": ("r[mm]", "phi[deg]", "theta[deg]", "Bx[T]", "By[T]", "Bz[T]")},
+            ("exchange theta and phi",)),
     Foreign("the middle twice", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
             + "0,0,0,0.1,1e-6,0.05\n", points=np.vstack([POINTS, [[0, 0, 0]]]),
             field=np.vstack([FIELD, [[0.1, 1e-6, 0.05]]])),

@@ -136,7 +136,7 @@ def test_bars_near_the_axis_of_iron(short_dipole, session, monkeypatch, series):
     """
     if not series:
         monkeypatch.setattr(discretization_error, "IRON_SERIES", 1.0)
-        monkeypatch.setattr(discretization_error, "BOUNDARY_SERIES", 1.0)
+        monkeypatch.setattr(discretization_error, "BOUNDARY_SERIES", {2: 1.0, 3: 1.0})
     study = short_dipole(iron_ring=IRON, mesh__meridian_size_m=0.02)
     magnet, points = build_magnet(study), near_axis()
     observation = observe(study, points, np.ones_like(points, bool))

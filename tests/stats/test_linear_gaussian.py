@@ -8,7 +8,7 @@ from scipy import stats
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, nominal_prior
+from halbach_fe.stats.gaussian import Gaussian, by_readings_alone, nominal_prior
 from halbach_fe.stats.linear_gaussian import contraction, posterior, predict, update, whitened
 from halbach_fe.stats.noise import independent_noise
 
@@ -53,6 +53,32 @@ def test_against_the_textbook_formula(generator, n, m):
     found = posterior(*case)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize(("n", "m"), [(12, 5), (3, 8)])
+def test_what_readings_alone_say_of_a_direction(generator, n, m):
+    """As with a prior that is wide along it. Negative controls: the posterior itself, and a wide
+    prior along another direction.
+    """
+    matrix, readings, noise, prior = problem(generator, n, m)
+    direction, other = np.linalg.qr(generator.standard_normal((m, 2)))[0].T
+    mean, sd = by_readings_alone(prior, posterior(matrix, readings, noise, prior), direction)
+
+    def wide(along):
+        found = posterior(matrix, readings, noise, Gaussian(
+            prior.mean, np.column_stack([prior.root, 1e4 * along])))
+        return direction @ (found.mean - prior.mean), found.sd_of(direction[None])[0]
+
+    assert (mean, sd) == pytest.approx(wide(direction), rel=1e-5, abs=1e-6)
+    for control in (0 * other, other):
+        assert abs(wide(control)[1] / sd - 1) > 1e-3
+
+
+def test_readings_that_say_nothing_leave_a_direction_open():
+    prior = Gaussian(np.zeros(2), np.eye(2))
+    found = posterior(np.array([[1.0, 0.0]]), np.ones(1), independent_noise(np.ones(1)), prior)
+    assert by_readings_alone(prior, found, np.array([1.0, 0.0])) == pytest.approx((1.0, 1.0))
+    assert by_readings_alone(prior, found, np.array([0.0, 1.0]))[1] > 1e5
 
 
 def test_against_brute_force_sampling(generator):

@@ -78,6 +78,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If there are no numbers, or lines of different length.
     """
     lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
+    _refuse_grid_above(lines[:3], where)
     return read_lines([one for one in lines if one[1]], declared, where)
 
 
@@ -134,6 +135,24 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
         comments="" if own else comments_of(preface),
         attributes=attributes_of(preface) if own else {},
         remarks=remarks if own else remarks + unused_lines(preface, columns))
+
+
+def _refuse_grid_above(first: Sequence[Line], where: str) -> None:
+    """Raise MeasurementError for maps of OPAL and ASTRA whose first lines are the axes of a grid.
+
+    Those of ASTRA are a number of coordinates and the coordinates.
+    """
+    axes = [line[:MAX_HEADER].split() for _, line in first]
+    if axes and axes[0] and axes[0][0].startswith("3DMagnetoStatic"):
+        raise MeasurementError(must_be(
+            "content", where, "rows with positions", "a map of OPAL, whose grid stands above them",
+            "Add --skip-lines 4, --columns Bx[T],By[T],Bz[T] with its unit, and --positions TABLE: "
+            "x, y and z of every row, in the order that its first line states."))
+    if len(axes) == 3 and all(len(axis) > 2 and axis[0] == str(len(axis) - 1) for axis in axes):
+        raise MeasurementError(must_be(
+            "content", where, "rows with positions", "a map of ASTRA, of one component on the grid "
+            "of its first three lines", "Write a table with a row x, y, z, Bx, By, Bz for every "
+            "point from its three files; each of their lines runs along x."))
 
 
 def _are_alike(line: str, other: str) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from halbach_fe.measurement.formats.units import (
@@ -21,6 +22,8 @@ TOTAL = "Babs"
 """The magnitude |B|, as a quantity of its own."""
 KNOWN = (*POSITIONS, *FIELDS, "B", TOTAL)
 """Quantities of columns; B is a single component, or the magnitude beside its components."""
+POLAR = {"theta": "theta", "btheta": "Btheta"}
+"""Quantities of these names in spherical coordinates r, theta, phi."""
 MOVES = ("dx", "dy", "dz")
 NOISE = ("sigma", *(f"sigma_{name}" for name in (*FIELDS, TOTAL)))
 """Standard deviations: of all components of a reading, or of one."""
@@ -148,6 +151,18 @@ def noise_of(base: str, key: str) -> str | None:
     if len(rest) == len(words):
         return None
     return ALIASES.get(_key(split_unit("_".join(rest))[0])) if rest else "B"
+
+
+def with_polar(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
+    """Return the columns, of which theta beside phi is the angle from the z axis, and Btheta the
+    component along it. Without phi theta is the angle about z.
+    """
+    keys = [_key(split_unit(column.text)[0]) for column in columns]
+    if not {"r", "theta", "phi"} <= {"r" if column.quantity == "r" else key
+                                     for key, column in zip(keys, columns, strict=True)}:
+        return tuple(columns)
+    return tuple(replace(column, quantity=POLAR[key]) if key in POLAR else column
+                 for key, column in zip(keys, columns, strict=True))
 
 
 def is_clock(column: ColumnName) -> bool:

@@ -213,6 +213,11 @@ def _noise(
                 "Choose with --columns; - ignores a column."))
         return np.repeat(of["sigma"][:, None], 3, axis=1)
     empty = np.full(len(table.values), np.nan)
+    if "Btheta" in used:
+        raise MeasurementError(must_be(
+            "standard deviations", table.where, "one for all components, where these are Br, "
+            "Btheta and Bphi", ", ".join(f"'{columns[used[name]].text}'" for name in of),
+            "Name one column sigma in --columns, and ignore the others by -."))
     if {"sigma_Br", "sigma_Bphi"} & set(of):
         radial, around = of.get("sigma_Br", empty), of.get("sigma_Bphi", empty)
         angle = si["phi"] if "phi" in si else np.arctan2(si["y"], si["x"])
@@ -312,6 +317,9 @@ def _remarks(
     if {"sigma_Br", "sigma_Bphi"} & set(noise):
         said.append("The standard deviations of Br and Bphi were turned into those of Bx and By, "
                     "as if errors of Bx and By were independent.")
+    if "theta" in used:
+        said.append("theta was read as the angle from the z axis, and phi as that about it; if it "
+                    "is the other way round, exchange them in --columns.")
     for index, column in enumerate(columns):
         if index in used.values() or not column.text or (
                 declared.columns and declared.columns[index].strip() == "-"):
@@ -345,7 +353,7 @@ def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[Col
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
     """Return the file's columns with the names and units that the user states instead."""
     if not declared.columns:
-        return _of_h(table.columns)
+        return _of_h(names.with_polar(table.columns))
     count = len(table.columns) - table.added
     more = declared.columns[count:]  # delimiters at the ends of lines have no column in the table
     if len(declared.columns) < count or any(text != "-" for text in more):
@@ -353,8 +361,9 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
             "--columns", table.where, f"of {count} columns, as the file has",
             f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
-    for text, column in zip(declared.columns, table.columns[:count], strict=False):
-        stated = ColumnName("") if text == "-" else names.parse(text, stated=True)
+    own = names.with_polar([ColumnName("") if text == "-" else names.parse(text, stated=True)
+                            for text in declared.columns])
+    for text, stated, column in zip(declared.columns, own, table.columns[:count], strict=False):
         if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
             raise MeasurementError(must_be(
                 "--columns", table.where,
@@ -399,10 +408,9 @@ def _used(
             continue
         if column.quantity in used and column.quantity == "phi":
             raise MeasurementError(must_be(
-                "positions", table.where, "x, y, z or r, phi, z", "r with two angles, "
-                f"'{columns[used['phi']].text}' and '{column.text}'",
-                "Compute x, y and z, give them by --positions TABLE, and state - for r and the "
-                "angles in --columns."))
+                "positions", table.where, "x, y, z or r, phi, z or r, theta, phi", "r with two "
+                f"angles, '{columns[used['phi']].text}' and '{column.text}'",
+                "Name the angle from the z axis theta, and that about it phi, in --columns."))
         if column.quantity in used:
             missing.append(f"its one column {column.quantity}: '"
                            f"{columns[used[column.quantity]].text}' or '{column.text}' (--columns, "
@@ -450,7 +458,9 @@ def _missing(
     missing: list[str] = []
     if (hint := _of_field(used, columns)) is not None:
         return [hint]
-    wanted = ("r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
+    spherical = "theta" in used
+    wanted = ("r", "theta", "phi") if spherical else (
+        "r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
     absent = [name for name in wanted if name not in used and name not in declared.at
               and f"d{name}" not in used]
     if absent == ["phi"]:
@@ -469,9 +479,11 @@ def _missing(
                        + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
                           if others else "")
                        + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "") + ")")
-    half = {"Br", "Bphi"} - set(used)
-    if len(half) == 1:
-        missing.append(f"{half.pop()}, without which the other is no Bx or By (--columns)")
+    whole = ["Br", *(["Btheta"] if spherical else []), "Bphi"]
+    half = [name for name in whole if name not in used]
+    if half and half != whole:
+        others = " and ".join(name for name in whole if name in used)
+        missing.append(f"{' and '.join(half)}, without which {others} is no Bx or By (--columns)")
     if table.anchor and declared.origin_m is None:
         missing.append(f"where {table.anchor} is along the magnet's axes (--origin-m=X,Y,Z)")
     return missing
@@ -560,13 +572,14 @@ def _units(
 
 def _kind(name: str) -> str:
     """Return the kind of unit of a quantity, one of `units.KINDS`."""
-    if name in ("phi", "t", "scan"):
-        return {"phi": "angle", "t": "time", "scan": ""}[name]
+    if name in ("theta", "phi", "t", "scan"):
+        return {"t": "time", "scan": ""}.get(name, "angle")
     return "length" if name in (*names.POSITIONS, *names.MOVES) else "field"
 
 
 def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     """Return points (n, 3) in m and B (n, 3) in T from columns in m, rad and T."""
+    si = _cylindrical(si, where) if "theta" in si else si
     if "r" in si:
         if {"x", "y"} & set(si):
             raise MeasurementError(must_be("positions", where, "either x, y, z or r, phi, z",
@@ -597,6 +610,31 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     cos, sin = np.cos(angle), np.sin(angle)
     return points, np.column_stack([si["Br"] * cos - si["Bphi"] * sin,
                                     si["Br"] * sin + si["Bphi"] * cos, si.get("Bz", empty)])
+
+
+def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
+    """Return columns of spherical coordinates as those of cylindrical ones."""
+    angle = si["theta"]
+    if {"x", "y", "z"} & set(si):
+        raise MeasurementError(must_be("positions", where, "either x, y, z or r, theta, phi",
+                                       "both", "Leave some out with --columns and -."))
+    if not (np.nanmin(angle) >= 0 and np.nanmax(angle) <= np.pi * (1 + 1e-6)):
+        raise MeasurementError(must_be(
+            "theta", where, "from 0 to 180 degrees, the angle from the z axis",
+            f"{np.degrees(np.nanmin(angle)):.4g} to {np.degrees(np.nanmax(angle)):.4g} degrees",
+            "If it is the angle about z, exchange theta and phi, and Btheta and Bphi, in "
+            "--columns; the unit of both is that of their names, or --angle-unit."))
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = {name: si[name] for name in si if name != "theta"} | {
+        "r": si["r"] * sin, "z": si["r"] * cos}
+    if "Btheta" in si:
+        if {"Bx", "By", "Bz"} & set(si):
+            raise MeasurementError(must_be(
+                "components", where, "either Bx, By, Bz or Br, Btheta, Bphi", "both",
+                "Leave some out with --columns and -."))
+        turned |= {"Br": si["Br"] * sin + si["Btheta"] * cos,
+                   "Bz": si["Br"] * cos - si["Btheta"] * sin}
+    return turned
 
 
 def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) -> xr.Dataset:
