@@ -22,9 +22,6 @@ import scipy.linalg as linalg
 
 from halbach_fe.core.arrays import Floats, Ints
 
-ROWS_AT_ONCE = 8192
-"""Number of rows that products over all readings take at a time, to bound their memory."""
-
 
 @dataclass(frozen=True)
 class Fit:
@@ -252,5 +249,7 @@ def with_fewer_columns(root: Floats) -> Floats:
 
 
 def _rows(count: int) -> list[slice]:
-    """Return slices of at most `ROWS_AT_ONCE` rows."""
-    return [slice(first, first + ROWS_AT_ONCE) for first in range(0, count, ROWS_AT_ONCE)]
+    """Return slices of rows, so few that the memory of a product over them is bounded."""
+    # Number of rows that products over all readings take at a time, to bound their memory.
+    rows_at_once = 8192
+    return [slice(first, first + rows_at_once) for first in range(0, count, rows_at_once)]

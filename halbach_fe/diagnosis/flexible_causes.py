@@ -42,9 +42,6 @@ at the largest size, for which it is left out: a residual of a thousand standard
 would change the log evidence by less than 1e-6."""
 
 SMOOTH_WAVES = (2.0, 5.0)
-ROUGH_WAVES = (3.0, 15.0)
-"""Numbers of half waves over the range of a coordinate at which the spectrum of a smooth function
-(squared-exponential covariance) and of a rough one (exponential covariance) falls off."""
 
 MOST_WAVES = 48
 """Largest number of half waves; finer structure is noise to this comparison."""
@@ -225,6 +222,10 @@ def instrument_families(
     noise_T : float
         Noise of a reading.
     """
+    # Numbers of half waves over the range of a coordinate at which the spectrum of a smooth
+    # function (squared-exponential covariance) and of a rough one (exponential covariance) falls
+    # off.
+    rough_waves = (3.0, 15.0)
     angle, radius = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     found = [_of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
                               np.ptp(points[:, 2]))]
@@ -242,7 +243,7 @@ def instrument_families(
             continue
         spectra = np.array([
             *(np.exp(-(waves / size)**2 / 4) for size in SMOOTH_WAVES),
-            *(1 / np.sqrt(1 + (waves / size)**2) for size in ROUGH_WAVES)])
+            *(1 / np.sqrt(1 + (waves / size)**2) for size in rough_waves)])
         spectra /= np.linalg.norm(spectra, axis=1)[:, None]
         for acts_on, shape in shapes.items():
             size = float(np.sqrt(np.mean(shape**2) * 3))

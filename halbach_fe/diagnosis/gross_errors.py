@@ -63,9 +63,6 @@ MIN_USED = 0.9
 """Smallest share of the observed values that a convention must use. One that puts a component of a
 cross-section along z, which is not observed there, has less to explain than the others."""
 
-WRONG_BLOCK_FACTORS = (1.0, 2.0)
-"""Multiple of a block's field that is lacking if it is missing, and if it is upside down."""
-
 INDISTINGUISHABLE_MISFIT_RATIO = 1.2
 """Ratio of misfits below which the map does not distinguish two errors."""
 
@@ -485,6 +482,8 @@ class _Search:
 
     def with_a_wrong_block(self, convention: MapConvention) -> _Misfit:
         """Return the smallest misfit with one block missing or upside down."""
+        # Multiple of a block's field that is lacking if it is missing, and if it is upside down.
+        wrong_block_factors = (1.0, 2.0)
         turned, nominal = self.nominal_of(convention)
         if nominal is None:
             return INFINITE_MISFIT
@@ -496,7 +495,7 @@ class _Search:
         blocks = self.blocks[None if turned else convention.magnet]
         for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             own = unit @ (rotation_about_z(turn) @ block.easy_axis) * block.remanence @ sensors
-            for factor in WRONG_BLOCK_FACTORS if block.remanence else ():
+            for factor in wrong_block_factors if block.remanence else ():
                 found = self.compared(convention, whole - factor * own, nominal.variance)
                 if found is not None:
                     misfit = _Misfit(float(np.sqrt(np.mean(found[0]**2))), found[1])

@@ -59,9 +59,6 @@ ROOM_C, OTHER_TEMPERATURE_K = 20.0, 10.0
 """Temperature in degrees Celsius at which data sheets state remanences, and the distance in K from
 it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
 
-NDFEB_PER_K = -0.0012
-"""Temperature coefficient of the remanence of NdFeB, for the size of the error that is told."""
-
 NAMED = 3
 """Number of blocks far from the others that a sentence names."""
 
@@ -277,6 +274,8 @@ def _temperature_doubts(magnet: Magnet, table: BlockTable) -> list[str]:
 
     Tables whose temperatures differ from each other are refused elsewhere.
     """
+    # Temperature coefficient of the remanence of NdFeB, for the size of the error that is told.
+    ndfeb_per_k = -0.0012
     known = table.temperature[~np.isnan(table.temperature)]
     if magnet.study.prior.temperature_coefficient_per_K is not None or not len(known):
         return []
@@ -287,7 +286,7 @@ def _temperature_doubts(magnet: Magnet, table: BlockTable) -> list[str]:
         return []
     return [f"The blocks were measured at {np.median(known):g} °C, {abs(away):g} K from "
             f"{reference:g} °C, and the study has no temperature coefficient: their moments count "
-            f"as they were read there, for NdFeB some {abs(100 * NDFEB_PER_K * away):.2g} % off. "
+            f"as they were read there, for NdFeB some {abs(100 * ndfeb_per_k * away):.2g} % off. "
             "Add temperature_coefficient_per_K and reference_temperature_C to [prior]."]
 
 

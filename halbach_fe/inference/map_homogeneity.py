@@ -67,12 +67,6 @@ OPEN = 0.2
 """Deviation of |B| that readings leave open, relative to the one that they show, above which they
 do not carry it: how much of it is left then depends on the prior of the amplitudes."""
 
-WIDE = 0.05
-"""Width of the 95 % range of the rms deviation, relative to it, from which a held-out part does not
-carry it if the whole map does. Of maps of cuboids a 20th of the scan lines had 1 %; a 30th or 40th
-had 8 to 10 %, with estimates up to 5 % too low, and a 60th 38 to 42 %: that is the prior of the
-amplitudes rather than the readings."""
-
 SEEN = 0.1
 """Part of the readings' sensitivity from which the field along a direction is measured: above the
 crosstalk of a probe, below a component of its own."""
@@ -137,15 +131,20 @@ def map_homogeneity(
 def not_carried(part: Homogeneity, whole: Homogeneity) -> str:
     """Say why the fit of a held-out part does not count beside that of the whole map, or nothing.
 
-    Its range either excludes what the whole map shows, or is `WIDE` where the whole map's is not.
+    Its range either excludes what the whole map shows, or is wide where the whole map's is not.
     """
+    # Width of the 95 % range of the rms deviation, relative to it, from which a held-out part does
+    # not carry it if the whole map does. Of maps of cuboids a 20th of the scan lines had 1 %; a
+    # 30th or 40th had 8 to 10 %, with estimates up to 5 % too low, and a 60th 38 to 42 %: that is
+    # the prior of the amplitudes rather than the readings.
+    wide = 0.05
     (low, _, high), (least, _, most) = part.rms_range_ppm, whole.rms_range_ppm
     has = (f"Its held-out part by itself has {part.rms_ppm:.0f} ppm rms (95 %: {low:.0f} to "
            f"{high:.0f})")
     if not low <= whole.rms_ppm <= high:
         return (f"{has}, which contradicts the {whole.rms_ppm:.0f} ppm of the whole map: its "
                 "readings are too few to tell it, or differ from the others. It is left out.")
-    if high - low > WIDE * part.rms_ppm and most - least <= WIDE * whole.rms_ppm:
+    if high - low > wide * part.rms_ppm and most - least <= wide * whole.rms_ppm:
         return (f"{has}, which its readings are too few to tell, unlike the whole map. It is left "
                 "out.")
     return ""

@@ -52,9 +52,6 @@ LITTLE = 0.05
 MOST = 0.9
 """Part of the gain of all moves that the first of them make, which the answer names."""
 
-LIKELY = 0.5
-"""Probability below which the answer says that moves do not reach the limit."""
-
 STUDY_FILE = "study.shimmed.toml"
 
 DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change places in a cycle",
@@ -214,6 +211,7 @@ def _place_text(shim: Shim, number: int) -> str:
 
 def answer(shim: Shim) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
+    likely = 0.5  # probability below which the answer says that moves do not reach the limit
     question = "Which blocks should be exchanged, turned or replaced?"
     aim = aim_of(shim.model)
     before, after = (aim.size(known.rms) for known in (shim.before, shim.after))
@@ -242,7 +240,7 @@ def answer(shim: Shim) -> Answer:
         limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
         said += f" {within.format(limit)} with a probability of {first}"
         said += f" before and {last} after." if shim.steps else "."
-        if shim.steps and shim.within[1] < LIKELY:
+        if shim.steps and shim.within[1] < likely:
             said += " These moves do not reach that limit."
     ended = f"The search ended because {STOPS[shim.stop]}."
     if shim.result.disagreement:

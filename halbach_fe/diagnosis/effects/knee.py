@@ -36,11 +36,6 @@ MOST_BLOCKS = 100
 """Largest number of blocks for which losses are searched unless the study describes the material:
 each place takes a solution of the whole magnet, of a few seconds for 64 blocks."""
 
-LIKELY_SCALES = (0.2, 5.0)
-"""Range of the factor between the losses that the readings want and the cheap estimate of them,
-within which a coercivity is tried. The estimate leaves out that lost polarization changes the field
-of the others, which changes the losses by less than a factor of two."""
-
 NODES = 3
 """Gauss nodes per direction and block at which the field is computed for the cheap estimate."""
 
@@ -97,6 +92,10 @@ class KneeEffect(Effect):
         A signature takes seconds. Here the losses are those in the field of the intact blocks in
         vacuum, and act by their mean over each block.
         """
+        # Range of the factor between the losses that the readings want and the cheap estimate of
+        # them, within which a coercivity is tried. The estimate leaves out that lost polarization
+        # changes the field of the others, which changes the losses by less than a factor of two.
+        likely_scales = (0.2, 5.0)
         # Gain in log likelihood, by the cheap estimate of the losses, from which a coercivity is
         # tried. To be named, a knee needs more than 11: log odds of 5 against prior odds of 1 to 50
         # for 12 places.
@@ -109,8 +108,8 @@ class KneeEffect(Effect):
         sizes = np.einsum("pi,ij,pj->p", losses, information, losses)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(sizes > 0, gains / sizes, 0.0)
-        likely = (scale * gains > 2 * least_gain) & (scale > LIKELY_SCALES[0]) & (
-            scale < LIKELY_SCALES[1])
+        likely = (scale * gains > 2 * least_gain) & (scale > likely_scales[0]) & (
+            scale < likely_scales[1])
         return [place for place, tried in zip(places, likely.tolist(), strict=True) if tried]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

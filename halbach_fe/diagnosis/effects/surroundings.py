@@ -36,9 +36,6 @@ class BackgroundEffect(Effect):
         return study.with_(external__background_T=total)
 
 
-GAPS_M = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
-"""Distances between the facing ends of the two magnets, one candidate place each."""
-
 STEP_M = 1e-4
 """Step of the finite difference with respect to the distance."""
 
@@ -59,10 +56,12 @@ class NeighbourMagnetEffect(Effect):
     applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
+        # Distances between the facing ends of the two magnets, one candidate place each.
+        gaps_m = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
         if study.dimension == 2:
             return []
         length = 2 * build_magnet(study).array_half_length
-        return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
+        return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in gaps_m]
 
     def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
         """See `Effect.representatives`.
@@ -97,10 +96,6 @@ def _centre(place: Place, farther: float) -> float:
 STEP_M = 1e-4
 """Step of the finite differences with respect to the position."""
 
-BEYOND_M = (0.03, 0.08, 0.15, 0.25)
-"""Distances of the candidate places from the magnet's ends."""
-
-
 NEAREST_M = 1e-3
 """Distance in m from the object below which a reading shows nothing of it: a place of the grid may
 be one where the probe was, and the field of a point dipole is infinite there."""
@@ -122,12 +117,14 @@ class FerromagneticObjectEffect(Effect):
     refinements = tuple(Parameter(f"at {axis}", "m", 0.05, longest_step=0.02) for axis in "xyz")
 
     def places(self, study: Study) -> Sequence[Place]:
+        # Distances of the candidate places from the magnet's ends.
+        beyond_m = (0.03, 0.08, 0.15, 0.25)
         if study.dimension == 2:
             return []
         magnet = build_magnet(study)
         half, outer = magnet.array_half_length, magnet.array_outer_radius
         radii = [magnet.bore_radius, outer, 1.4 * outer]
-        heights = [side * (half + beyond) for side in (-1, 1) for beyond in BEYOND_M]
+        heights = [side * (half + beyond) for side in (-1, 1) for beyond in beyond_m]
         ends = [(r, z) for r in radii for z in heights]
         outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
         angles = 2 * np.pi * np.arange(12) / 12
