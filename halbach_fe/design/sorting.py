@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.design.objective import Objective
+from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
@@ -48,7 +48,6 @@ from halbach_fe.inference.block_prior import (
 )
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.block_variation import with_variations
-from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.response.multipoles import MultipoleModel
 from halbach_fe.stats.gaussian import Gaussian

@@ -41,9 +41,8 @@ from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.evidence import Marginal, ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.flexible_causes import Family
-from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
     blocks_of,

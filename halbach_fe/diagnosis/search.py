@@ -17,6 +17,7 @@ from halbach_fe.core.errors import HalbachError, HalbachWarning
 from halbach_fe.core.pace import Progress
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
+from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     PINNED_SD,
@@ -36,7 +37,6 @@ from halbach_fe.diagnosis.screening import (
     near_the_likeliest,
     renumbered,
 )
-from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult

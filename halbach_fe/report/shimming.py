@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
@@ -41,7 +42,6 @@ from halbach_fe.report.page import (
     page_of,
 )
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
-from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")

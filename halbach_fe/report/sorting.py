@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.sorting import SortedBlocks, types_in_words
 from halbach_fe.measurement.block_table import write_blocks
@@ -36,7 +37,6 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.shimming import aim_of, values_summary, values_table
 from halbach_fe.report.words import counted, in_a_row, ppm
-from halbach_fe.response.deviations import DeviationModel
 
 T = TypeVar("T")
 

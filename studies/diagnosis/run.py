@@ -1,6 +1,6 @@
 """Sealed cases of hidden effects, and how often the diagnosis names them.
 
-Each case draws a magnet, a map and sizes of the effects (`halbach_fe.synthetic.drawn_studies`).
+Each case draws a magnet, a map and sizes of the effects (`drawn_studies.py`).
 Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted run goes on. Cases are
 independent, and --jobs of them run at a time::
 
@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from drawn_studies import MAGNETS, drawn_fault, drawn_magnet, drawn_study
 from sealed_cases_page import page
 
 from halbach_fe.cli import common
@@ -57,7 +58,6 @@ from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_studies import MAGNETS, drawn_fault, drawn_magnet, drawn_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field

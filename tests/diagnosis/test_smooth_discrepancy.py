@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.flexible_causes import field_family, fit_family, instrument_families
-from halbach_fe.diagnosis.smooth_discrepancy import harmonic_fields
+from halbach_fe.diagnosis.flexible_causes import (
+    field_family,
+    fit_family,
+    harmonic_fields,
+    instrument_families,
+)
 from tests.conftest import circle
 
 STEP = 1e-5
