@@ -210,8 +210,7 @@ class Linearization:
     @cached_property
     def in_model(self) -> dict[tuple[str, Place], IdentifiedEffect]:
         """The identified effects by name and place."""
-        return {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
-                for effect in self.identified}
+        return {effect.hypothesis.key: effect for effect in self.identified}
 
     def places(self, effects: Sequence[Effect]) -> dict[str, list[Place]]:
         """Return the places of every effect, by its name, which are worth a signature."""
@@ -234,18 +233,16 @@ class Linearization:
 
     def stored(self, hypothesis: Hypothesis) -> Floats | None:
         """Return the whitened signature (rows, k) of a hypothesis outside the model, if known."""
-        key = hypothesis.effect.name, hypothesis.place
-        signature = self.signatures.get(key, self.known.get(key))
+        signature = self.signatures.get(hypothesis.key, self.known.get(hypothesis.key))
         if signature is not None:
-            self.signatures[key] = signature
+            self.signatures[hypothesis.key] = signature
         return signature
 
     def exact(self, hypothesis: Hypothesis) -> Floats:
         """Compute the whitened signature (rows, k) of a hypothesis outside the model."""
-        key = hypothesis.effect.name, hypothesis.place
-        self.known[key] = self.signatures[key] = self._by_response(
-            hypothesis, self.scene_at_start)
-        return self.signatures[key]
+        signature = self._by_response(hypothesis, self.scene_at_start)
+        self.known[hypothesis.key] = self.signatures[hypothesis.key] = signature
+        return signature
 
     def rough(self, hypothesis: Hypothesis, is_over: bool) -> Floats | None:
         """Return the whitened rough signature (rows, k) of a hypothesis outside the model.
@@ -280,7 +277,7 @@ class Linearization:
     def refined(self, hypothesis: Hypothesis) -> Floats:
         """Compute the whitened signature (rows, k) at a place that `_improved_place` has found."""
         signature = self.training.shown(self.scene_at_start.signature(hypothesis))
-        self.signatures[hypothesis.effect.name, hypothesis.place] = signature
+        self.signatures[hypothesis.key] = signature
         return signature
 
     def _scene_of(self, study: Study, field: FieldAt) -> Scene:
@@ -343,7 +340,7 @@ class _Comparison:
         first |= {*self.point.in_model, *self.point.signatures}
         later = []
         for hypothesis in self.hypotheses:
-            if (hypothesis.effect.name, hypothesis.place) in first:
+            if hypothesis.key in first:
                 self._compare(hypothesis)
             else:
                 later.append(hypothesis)
@@ -394,7 +391,7 @@ class _Comparison:
         """
         self.progress(self._done, len(self.hypotheses))
         self._done += 1
-        present = self.point.in_model.get((hypothesis.effect.name, hypothesis.place))
+        present = self.point.in_model.get(hypothesis.key)
         if present is not None:
             signature, amounts = self.point.of_identified(present)
             self.residual = self.residual + signature @ amounts
@@ -415,8 +412,7 @@ class _Comparison:
         self, hypothesis: Hypothesis, signature: Floats, is_rough: bool = False
     ) -> _Competitor:
         """Return the competitor that has a whitened signature (rows, k)."""
-        effect, place = hypothesis.effect, hypothesis.place
-        in_model = (effect.name, place) in self.point.in_model
+        effect, in_model = hypothesis.effect, hypothesis.key in self.point.in_model
         columns = signature * amplitude_scale(effect)[:signature.shape[1]]
         # What all blocks share is known this well only, as the calibration of the coil. A block
         # that is reversed or elsewhere has it with another sign or direction, which the prior does
@@ -427,7 +423,7 @@ class _Comparison:
         count = columns.shape[1]
         is_binary = effect.is_binary or (effect.applied_in_full and count > len(effect.parameters))
         return _Competitor(hypothesis, Candidate(
-            effect.name, place.name, tuple(range(count)), is_binary and not is_rough,
+            effect.name, hypothesis.place.name, tuple(range(count)), is_binary and not is_rough,
             effect.unique, len(self.places[effect.name]), _parts(effect, count), effect.shared,
             effect.relative_odds), columns, in_model, is_rough)
 

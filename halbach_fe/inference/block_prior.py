@@ -59,9 +59,6 @@ ROOM_C, OTHER_TEMPERATURE_K = 20.0, 10.0
 """Temperature in degrees Celsius at which data sheets state remanences, and the distance in K from
 it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
 
-NAMED = 3
-"""Number of blocks far from the others that a sentence names."""
-
 MANY_SD = 5.0
 """Number of the study's standard deviations by which no mean of its own blocks is off by chance."""
 
@@ -244,6 +241,7 @@ def _far_blocks(magnet: Magnet, table: BlockTable, deviations: Floats) -> str:
 
     ``deviations`` (rows, d) are along the nominal magnetization, and angles across it.
     """
+    most_named = 3  # number of blocks far from the others that a sentence names
     if len(deviations) < MIN_SAMPLES:
         return ""
     settings = magnet.study.prior
@@ -263,8 +261,8 @@ def _far_blocks(magnet: Magnet, table: BlockTable, deviations: Floats) -> str:
         side = "stronger" if along > 0 else "weaker"
         return f"{table.serial[row]} is {100 * abs(along):.2g} % {side}"
 
-    named = ", block ".join(map(words, far[:NAMED].tolist()))
-    more = f" and {len(far) - NAMED} more are so far off" if len(far) > NAMED else ""
+    named = ", block ".join(map(words, far[:most_named].tolist()))
+    more = f" and {len(far) - most_named} more are so far off" if len(far) > most_named else ""
     return (f"Relative to the median of all, block {named}{more}: up to {times.max():.0f} times "
             "what is usual here. Are these rows of the table right?")
 

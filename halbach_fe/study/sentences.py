@@ -60,7 +60,6 @@ EXPECTED = {
 }
 """What is expected, by the kind of error; the models raise no others."""
 
-
 UNITS = ("m", "T", "deg", "rad", "C", "K")
 """Units at the end of names."""
 
@@ -70,6 +69,7 @@ def did_you_mean(near: str, given: str) -> str:
     stem, _, unit = near.rpartition("_")
     other = unit in UNITS and stem == given.rpartition("_")[0]
     return f"Did you mean `{near}`?" + (f" Then convert its values to {unit}." if other else "")
+
 
 KILOOERSTED, MOST_KILOOERSTED = 1e6 / (4 * math.pi), 45.0
 """In A/m, and the largest intrinsic coercivity of magnets: a larger number is in kA/m."""
@@ -90,7 +90,7 @@ WRONG_UNITS = (
 DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius_scale")
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
-ZERO_C_IN_K = 273.15
+ABSOLUTE_ZERO_C = -273.15
 
 
 def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
@@ -113,7 +113,7 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
             continue
         if factor == KILOOERSTED and value > MOST_KILOOERSTED:
             continue
-        given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
+        given = value * factor + (ABSOLUTE_ZERO_C if unit == "kelvin" else 0.0)
         if factor < 0 and value < 0:  # no sign was lost
             continue
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (

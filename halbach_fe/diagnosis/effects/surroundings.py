@@ -258,10 +258,6 @@ class IronRingEffect(Effect):
             relative_permeability=PERMEABILITY))
 
 
-SOFTER = 0.5
-"""Permeability of linear iron, relative to the study's, that stands for iron that saturates: it
-conducts less flux too."""
-
 STEEL = "aisi_1010"
 """Steel whose H(B) curve stands for that of structural steels."""
 
@@ -294,6 +290,9 @@ class IronSaturationEffect(Effect):
         return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
 
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
+        # Permeability of linear iron, relative to the study's, that stands for iron that saturates:
+        # it conducts less flux too.
+        softer_by = 0.5
         ring = nominal.study.iron_ring
         if ring is None or ring.relative_permeability is None:
             return None
@@ -301,7 +300,7 @@ class IronSaturationEffect(Effect):
         if permeability == 1.0 or choose_route(nominal.magnet, nominal.points) in BOTH:
             return None  # nothing is softer than what conducts no flux
         softer = nominal.study.with_(iron_ring=ring.with_(
-            relative_permeability=1 + SOFTER * (permeability - 1)))
+            relative_permeability=1 + softer_by * (permeability - 1)))
         return (nominal.solve(softer) - nominal.finite_element_field)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
