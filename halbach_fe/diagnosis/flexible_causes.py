@@ -156,8 +156,6 @@ NEGLIGIBLE = 1e-12
 at the largest size, for which it is left out: a residual of a thousand standard deviations along it
 would change the log evidence by less than 1e-6."""
 
-SMOOTH_WAVES = (2.0, 5.0)
-
 MOST_WAVES = 48
 """Largest number of half waves; finer structure is noise to this comparison."""
 
@@ -340,7 +338,7 @@ def instrument_families(
     # Numbers of half waves over the range of a coordinate at which the spectrum of a smooth
     # function (squared-exponential covariance) and of a rough one (exponential covariance) falls
     # off.
-    rough_waves = (3.0, 15.0)
+    smooth_waves, rough_waves = (2.0, 5.0), (3.0, 15.0)
     angle, radius = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     found = [_of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
                               np.ptp(points[:, 2]))]
@@ -357,7 +355,7 @@ def instrument_families(
         if len(waves) < 2:
             continue
         spectra = np.array([
-            *(np.exp(-(waves / size)**2 / 4) for size in SMOOTH_WAVES),
+            *(np.exp(-(waves / size)**2 / 4) for size in smooth_waves),
             *(1 / np.sqrt(1 + (waves / size)**2) for size in rough_waves)])
         spectra /= np.linalg.norm(spectra, axis=1)[:, None]
         for acts_on, shape in shapes.items():
@@ -367,7 +365,7 @@ def instrument_families(
             found.append(Family(
                 acts_on, name, partial(_products, functions, shape * noise_T / size),
                 np.repeat(np.arange(3), len(waves)), np.tile(spectra, 3),
-                tuple(number < len(SMOOTH_WAVES) for number in range(len(spectra))),
+                tuple(number < len(smooth_waves) for number in range(len(spectra))),
                 np.tile(waves, 3), 360.0 if name == "angle" else float(np.ptp(coordinate)),
                 noise_T / size))
     return found

@@ -59,10 +59,6 @@ MIN_READINGS = 12
 """Smallest number of readings for the search. With fewer readings some gross error would fit any
 map."""
 
-MIN_USED = 0.9
-"""Smallest share of the observed values that a convention must use. One that puts a component of a
-cross-section along z, which is not observed there, has less to explain than the others."""
-
 INDISTINGUISHABLE_MISFIT_RATIO = 1.2
 """Ratio of misfits below which the map does not distinguish two errors."""
 
@@ -508,7 +504,7 @@ class _Search:
         """Return standardized residuals (values,), their rms relative to that of the map, and the
         common factor of the readings.
 
-        None if points are inside material, or less than `MIN_USED` of the observed values remain.
+        None if points are inside material, or too few of the observed values remain.
         """
         turned, nominal = self.nominal_of(convention)
         if nominal is None:
@@ -530,11 +526,15 @@ class _Search:
         # Standard deviation that effects of usual size add to a reading, relative to the main
         # field.
         effect_field_sd = 0.003
+        # Smallest share of the observed values that a convention must use. One that puts a
+        # component of a cross-section along z, which is not observed there, has less to explain
+        # than the others.
+        least_used = 0.9
         old = self.study.instrument
         shown = to_magnet_axes(compose_axes(old.field_axes, convention.fields), self.values) * (
             old.flux_density_unit_T * convention.flux_density_unit)
         used = ~np.isnan(shown) & self.observed
-        if not used.any() or used.sum() < MIN_USED * self.present:
+        if not used.any() or used.sum() < least_used * self.present:
             return None
         whole = max(_size(shown), 1e-300)
         sd = np.sqrt(variance[used] + (effect_field_sd * max(whole, _size(field))) ** 2)

@@ -55,10 +55,6 @@ FAR = 0.5
 """Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
 block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
 
-ROOM_C, OTHER_TEMPERATURE_K = 20.0, 10.0
-"""Temperature in degrees Celsius at which data sheets state remanences, and the distance in K from
-it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
-
 MANY_SD = 5.0
 """Number of the study's standard deviations by which no mean of its own blocks is off by chance."""
 
@@ -274,13 +270,16 @@ def _temperature_doubts(magnet: Magnet, table: BlockTable) -> list[str]:
     """
     # Temperature coefficient of the remanence of NdFeB, for the size of the error that is told.
     ndfeb_per_k = -0.0012
+    # Temperature in degrees Celsius at which data sheets state remanences, and the distance in K
+    # from it at which the moments of NdFeB change by more than 1 %, a usual tolerance.
+    room_c, other_temperature_k = 20.0, 10.0
     known = table.temperature[~np.isnan(table.temperature)]
     if magnet.study.prior.temperature_coefficient_per_K is not None or not len(known):
         return []
     demagnetization = magnet.study.demagnetization
-    reference = ROOM_C if demagnetization is None else demagnetization.reference_temperature_C
+    reference = room_c if demagnetization is None else demagnetization.reference_temperature_C
     away = float(np.median(known)) - reference
-    if abs(away) <= OTHER_TEMPERATURE_K:
+    if abs(away) <= other_temperature_k:
         return []
     return [f"The blocks were measured at {np.median(known):g} °C, {abs(away):g} K from "
             f"{reference:g} °C, and the study has no temperature coefficient: their moments count "

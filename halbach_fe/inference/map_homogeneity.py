@@ -52,9 +52,8 @@ DEGREES = 28
 """Highest degree of the harmonics: at `WITHIN` the next ones are 3e-4 of what they are on the free
 sphere."""
 
-DIRECTIONS, SHELLS = 60, 8
-"""Degree of the directions in which the free sphere is looked for (6° apart), and number of radii
-that are tried at once."""
+DIRECTIONS = 60
+"""Degree of the directions in which the free sphere is looked for (6° apart)."""
 
 BEYOND = 0.02
 """How far a region may reach beyond the box around the readings, relative to its sides."""
@@ -328,9 +327,10 @@ def _free_radius(magnet: Magnet, centre: Floats) -> float:
     """Return the radius in m of the sphere about a point that blocks and iron leave free."""
     directions, _ = sphere_points(DIRECTIONS)
     low, high = 0.0, magnet.field_reach
+    tried = 8  # number of radii at once
     while high - low > 1e-3 * high:
         middle = (low + high) / 2
-        shells = np.linspace(low, middle, SHELLS)[1:, None, None] * directions
+        shells = np.linspace(low, middle, tried)[1:, None, None] * directions
         if magnet.contains(centre + shells.reshape(-1, 3)).any():
             high = middle
         else:

@@ -28,10 +28,6 @@ down to that of NdFeB which is 80 K hotter."""
 SQUARENESS, LEAST_SQUARE = 0.85, 0.3
 """Squareness from which the search starts, and the smallest one; the largest is `MOST_SQUARE`."""
 
-SIGNATURE_CELLS, FEWEST_CELLS = 2, 3
-"""Smallest number of cells along the side of a block for the losses of a signature, and of the
-model."""
-
 MOST_BLOCKS = 100
 """Largest number of blocks for which losses are searched unless the study describes the material:
 each place takes a solution of the whole magnet, of a few seconds for 64 blocks."""
@@ -113,7 +109,7 @@ class KneeEffect(Effect):
         return [place for place, tried in zip(places, likely.tolist(), strict=True) if tried]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        before, cells = nominal.study, _cells(nominal.study, SIGNATURE_CELLS)
+        before, cells = nominal.study, _cells(nominal.study, 2)
         if not nominal.magnet.is_vacuum:  # by the same route, so that both have the same cells
             before = before.with_(solver__route="moments", mesh__cells_per_side=cells)
         lost = self.apply(before, place, [1.0]).with_(mesh__cells_per_side=cells)
@@ -188,8 +184,10 @@ def _squareness(log_odds: float) -> float:
     return LEAST_SQUARE + (MOST_SQUARE - LEAST_SQUARE) * odds / (1 + odds)
 
 
-def _cells(study: Study, fewest: int = FEWEST_CELLS) -> int:
-    """Return the study's number of cells along a block's side, or the fewest for losses."""
+def _cells(study: Study, fewest: int = 3) -> int:
+    """Return the study's number of cells along a block's side, or the fewest for losses: those of
+    the model need 3, those of a signature 2.
+    """
     return max(fewest, study.mesh.cells_per_side or 0)
 
 

@@ -193,14 +193,11 @@ It is typical of iron that is not saturated. No other value is tried, because a 
 the product of permeability and thickness, and the thickness is varied.
 """
 
-THINNEST_M = 5e-4
-"""Smallest thickness of a ring."""
-
 WEAKEST = 0.1
 """Smallest strength, relative to the whole ring at one of the places, of what may be a ring. A ring
 is applied in full: of one that is found with 2 % of its strength, for a small error that looks like
 it, 98 % would be wrong in the next round. Around the magnet of studies/diagnosis, the thinnest ring
-of `THINNEST_M` has 0.5 of the strength of one of 10 mm, one of 25 mm 1.02; a ring 0.1 m off the
+of 0.5 mm has 0.5 of the strength of one of 10 mm, one of 25 mm 1.02; a ring 0.1 m off the
 blocks has 0.19, and one 0.2 m off 0.05: that one is no candidate."""
 
 STEP_M = 5e-4
@@ -249,9 +246,10 @@ class IronRingEffect(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         clearance_m = 2e-4  # smallest distance between blocks and iron
+        thinnest_m = 5e-4  # smallest thickness of a ring
         inner, outer = place.at_m
         farther, thicker = values[1:] or (0.0, 0.0)
-        thickness = max(outer - inner + thicker, THINNEST_M)
+        thickness = max(outer - inner + thicker, thinnest_m)
         inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
         return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness,
