@@ -38,7 +38,13 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import NominalSolver, Search, identify_effects, score_hypotheses
+from halbach_fe.diagnosis.search import (
+    Linearization,
+    NominalSolver,
+    Search,
+    identify_effects,
+    score_hypotheses,
+)
 from halbach_fe.diagnosis.unknown_cause import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
@@ -106,8 +112,7 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
         data, _ = simulated(0)
         update = infer(build_magnet(STUDY), data, session, None)
         effects = [effect for effect in catalogue() if effect.name in NAMES]
-        base = score_hypotheses(STUDY, (), update, update.prior.mean, Campaign.of(STUDY, data),
-                                NominalSolver(session), effects, (), {})
+        base = _scored(update, data, effects, session)
         _check_other_readings(base, update, effects, session)
         flexible = families_of(base, update)
         for seed in range(len(found), count):
@@ -130,6 +135,14 @@ def run_cases(count: int, path: Path = FOLDER / "suspicions.json") -> list[dict[
     return found
 
 
+def _scored(
+    update: InferenceResult, data: xr.Dataset, effects: Sequence[Effect], session: Session
+) -> Search:
+    return score_hypotheses(Linearization(
+        STUDY, (), update, update.prior.mean, Campaign.of(STUDY, data), NominalSolver(session)),
+        effects)
+
+
 def _check_other_readings(
     base: Search, update: InferenceResult, effects: Sequence[Effect], session: Session
 ) -> None:
@@ -139,8 +152,7 @@ def _check_other_readings(
     """
     data, _ = simulated(1)
     own = infer(build_magnet(STUDY), data, session, None)
-    expected = score_hypotheses(STUDY, (), own, own.prior.mean, Campaign.of(STUDY, data),
-                                NominalSolver(session), effects, (), {})
+    expected = _scored(own, data, effects, session)
     found = with_readings(base, update, data)
     for name in ("residual", "training", "absorbed"):
         if not np.allclose(getattr(found, name), getattr(expected, name), atol=1e-8):

@@ -29,19 +29,11 @@ from halbach_fe.core.errors import (
     printable,
 )
 
-BLAS_BUFFER_BYTES = 128 * 2**20
-"""What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by thread
-and library, on two threads."""
-
 SHORT_WAIT = "4"
 """Logarithm to base 2 of the processor cycles for which threads of OpenBLAS look for more work
 before they sleep: the least that it allows. By default they look for 30 ms, on the cores on which
 threads of the other OpenBLAS, of numba and GetDP compute. Beside another job on two cores a
 diagnosis of 192 blocks took 40 s instead of 31 s, and 47 s instead of 31 s of processor time."""
-
-AT_THE_LIMIT_BYTES = 256 * 2**20
-"""An import that fails so near to the limit of memory fails for want of it: the largest library,
-numba's LLVM, takes half of this."""
 
 NO_MEMORY = re.compile(
     r"bad_alloc|allocat|out of memory|failed to map segment|can't start new thread")
@@ -180,12 +172,15 @@ def _is_out_of_memory(error: BaseException) -> bool:
 
 def _at_the_limit() -> bool:
     """Tell whether this process has come near to the limit of its memory, if it has one."""
+    # An import that fails so near to the limit of memory fails for want of it: the largest library,
+    # numba's LLVM, takes half of this.
+    at_the_limit_bytes = 256 * 2**20
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY:
         return False
     status = Path("/proc/self/status").read_text(encoding="ascii")
     peak = re.search(r"VmPeak:\s*(\d+) kB", status)
-    return peak is None or limit - int(peak[1]) * 1024 < AT_THE_LIMIT_BYTES
+    return peak is None or limit - int(peak[1]) * 1024 < at_the_limit_bytes
 
 
 def claim_buffers() -> None:
@@ -199,12 +194,15 @@ def claim_buffers() -> None:
     MemoryError
         If there is not enough for the buffers.
     """
+    # What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by
+    # thread and library, on two threads.
+    blas_buffer_bytes = 128 * 2**20
     if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
         import numpy as np
         import scipy.linalg as linalg
 
         try:
-            mmap.mmap(-1, BLAS_BUFFER_BYTES).close()
+            mmap.mmap(-1, blas_buffer_bytes).close()
         except OSError:
             raise MemoryError("the limit leaves too little for the linear algebra") from None
         matrix = np.eye(200)

@@ -138,7 +138,7 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
 
     from halbach_fe.api import field
     from halbach_fe.core.files import write_text
-    from halbach_fe.core.tables import csv_text
+    from halbach_fe.core.numbers import csv_text
     from halbach_fe.inference.storage import disagreement_of
     from halbach_fe.measurement.field_map import field_map, write_map
     from halbach_fe.report.words import with_error

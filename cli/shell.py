@@ -15,8 +15,8 @@ import shtab
 from halbach_fe.cli import common
 from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, option, parser, path, verb
 from halbach_fe.cli.streams import show
+from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
-from halbach_fe.core.versions import version
 
 if TYPE_CHECKING:
     from halbach_fe.solver.getdp import GetDP

@@ -111,8 +111,7 @@ def figure_4(results: Path) -> Figure:
     """Draw the relative errors of B_x along the first FASER dipole, before and after the update."""
     paper = np.genfromtxt(STUDIES / "faser" / "fig4_faser_on_axis.csv", delimiter=",", names=True)
     ours = np.genfromtxt(results / "demo" / "inferred" / "prediction.csv", delimiter=",",
-                         names=True, usecols=("prior_mean_T", "posterior_mean_T", "measured_T",
-                                              "held_out"))
+                         names=True)
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for axis, title, before, after in (
@@ -147,4 +146,5 @@ def main(results: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:3] + ["results", DOCS / "_static" / "paper"][len(sys.argv[1:3]):]))
+    folders = [Path("results"), DOCS / "_static" / "paper"]
+    main(*map(Path, sys.argv[1:3]), *folders[len(sys.argv[1:3]):])

@@ -40,17 +40,8 @@ from halbach_fe.synthetic.optional_packages import import_extra
 WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
 """First line of the studies that `write_study` writes."""
 
-LEAST_SIGMA_T = 1e-6
-"""Noise of the best probes in T."""
-
-STAGES_M = (1e-5, 1e-4)
-"""Errors in m of good and of usual stages."""
-
 FIELDS = 200
 """About so many points suffice for the size of the field."""
-
-HALVES_DEG = ((0.0, 180.0), (180.0, 360.0))
-"""A whole ring of magpylib is two sectors here."""
 
 
 def halbach_ring(
@@ -189,15 +180,17 @@ def with_noise(template: MagnetTemplate, magnet: Magnet) -> MagnetTemplate:
     """Return a template with the noise of readings in T and of positions in m, of one digit, that
     suit a magnet.
 
-    A good probe reads to a ten-thousandth of the largest field, but not below `LEAST_SIGMA_T`. A
-    stage is so exact that its errors make about the same noise, within `STAGES_M`. The field is
-    that of the blocks alone.
+    A good probe reads to a ten-thousandth of the largest field, but not better than the best
+    probes. A stage is so exact that its errors make about the same noise, but neither better than
+    good ones nor worse than usual ones. The field is that of the blocks alone.
     """
+    stages_m = (1e-5, 1e-4)  # errors in m of good and of usual stages
+    least_sigma_t = 1e-6  # noise of the best probes in T
     points = points_from(magnet.study.observation.positions)
     points = points[::max(1, len(points) // FIELDS)]
-    sigma = max(LEAST_SIGMA_T, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
+    sigma = max(least_sigma_t, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
     slope = float(np.sqrt(np.mean(gradient_of(magnet.blocks, points) ** 2)))
-    stage = float(np.clip(sigma / slope if slope else np.inf, *STAGES_M))
+    stage = float(np.clip(sigma / slope if slope else np.inf, *stages_m))
     return replace(template, sigma_T=float(f"{sigma:.1g}"), position_sd_m=float(f"{stage:.1g}"))
 
 
@@ -284,6 +277,7 @@ def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:
 
 def _rows_of(source: Any, name: str) -> list[dict[str, Any]]:
     """Return the rows of a table of blocks that are a source of magpylib."""
+    halves_deg = ((0.0, 180.0), (180.0, 360.0))  # A whole ring of magpylib is two sectors here
     kind, what = type(source).__name__, f"source {name}"
     if kind not in ("Cuboid", "Cylinder", "CylinderSegment"):
         raise StudyError(must_be(what, "from_magpylib", "a Cuboid, Cylinder or CylinderSegment",
@@ -303,7 +297,7 @@ def _rows_of(source: Any, name: str) -> list[dict[str, Any]]:
         return [common | _turned(turn) | {
             "shape": "cylinder", "radius_m": size[0] / 2, "size_z_m": size[1]}]
     inner, outer, height, *angles = size
-    parts = HALVES_DEG if angles[1] - angles[0] == 360.0 else (tuple(angles),)
+    parts = halves_deg if angles[1] - angles[0] == 360.0 else (tuple(angles),)
     return [common | _turned(turn * Rotation.from_euler("z", (start + stop) / 2, degrees=True)) | (
         {"shape": "sector", "inner_radius_m": inner, "outer_radius_m": outer, "size_z_m": height,
          "angle_deg": stop - start, "name": name + ("ab"[number] if len(parts) > 1 else "")})

@@ -16,6 +16,8 @@ from mypy import build, main
 ROOT = Path(__file__).resolve().parent.parent
 OTHERS = ("benchmarks", "tests")
 """Packages that are not installed. Of the tests only names are followed, see pyproject.toml."""
+SCRIPTS = ("studies/*/*_page.py", "studies/diagnosis/drawn_studies.py", "docs/paper_figures.py")
+"""Modules that the studies and the documentation import, and tests by these names."""
 
 
 def sources() -> list[build.BuildSource]:
@@ -29,7 +31,10 @@ def sources() -> list[build.BuildSource]:
             parts = path.relative_to(ROOT / folder).with_suffix("").parts
             name = ".".join([package, *parts]).removesuffix(".__init__")
             found.append(build.BuildSource(str(path.relative_to(ROOT)), name))
-    return found
+    scripts = [path.relative_to(ROOT) for pattern in SCRIPTS
+               for path in sorted(ROOT.glob(pattern))]
+    return found + [build.BuildSource(str(path), ".".join(path.with_suffix("").parts))
+                    for path in scripts]
 
 
 def check() -> int:

@@ -2,7 +2,7 @@
 
 A response matrix or a Markov chain that an earlier version of a formula computed must not be
 reused. The files that a result depends on are found from the import statements themselves, so that
-no hand-written list of folders can go out of date.
+no hand-written list of folders can go out of date. The versions of other packages are here too.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import ast
 import hashlib
 import importlib.util
 from functools import cache, lru_cache
+from importlib import metadata
 from pathlib import Path
 
 
@@ -92,3 +93,9 @@ def _imported(path: Path, name: str) -> tuple[str, ...]:
             for block in ("body", "orelse", "finalbody", "handlers", "cases"):
                 waiting += getattr(node, block, [])
     return tuple(found)
+
+
+@cache
+def version(package: str) -> str:
+    """Return the version of an installed package, read once: its metadata take 5 ms to parse."""
+    return metadata.version(package)

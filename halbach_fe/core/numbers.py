@@ -1,11 +1,17 @@
-"""Numbers in text files, and those that a user gives to a function."""
+"""Numbers and tables in text files, and numbers that a user gives to a function."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.errors import StudyError, must_be
 
@@ -109,3 +115,33 @@ def check_number(
                   f" of at least {low:g}" if math.isfinite(low) else "")
         raise StudyError(must_be(name, function, f"a {'whole' if whole else 'finite'} number"
                                  + limits, repr(value) if isinstance(value, str) else value))
+
+
+WITH_COMMAS = "Separate columns by commas, and write decimals with points."
+"""What to do about a table with other separators."""
+
+
+def csv_text(columns: Mapping[str, NDArray[Any] | Sequence[object]]) -> str:
+    """Return columns of equal length, by name, as CSV; numbers read back to the last bit.
+
+    Examples
+    --------
+    >>> print(csv_text({"label": ["Bx", "By"], "value_T": np.array([0.1, 1e-9])}), end="")
+    label,value_T
+    Bx,0.1
+    By,1e-09
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(np.asarray(column).tolist() for column in columns.values()),
+                         strict=True))
+    return text.getvalue()
+
+
+def other_separator(header: str) -> str | None:
+    """Return what separates the names in a header that has no commas; None if nothing does."""
+    for character, name in ((";", "semicolons"), ("\t", "tabs")):
+        if "," not in header and character in header.strip():
+            return name
+    return None

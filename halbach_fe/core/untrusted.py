@@ -27,9 +27,6 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.errors import ExtraMissingError
 
-MAX_SHEET = 200_000_000
-"""Size in bytes of the largest unpacked workbook that is read."""
-
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""
 
@@ -65,8 +62,9 @@ def sheet_text(raw: bytes) -> bytes:
     ExtraMissingError
         If openpyxl, which reads it, is not installed.
     ValueError
-        If the file is damaged, or larger than `MAX_SHEET` cells or bytes.
+        If the file is damaged, or larger than 200 million cells or bytes.
     """
+    max_sheet = 200_000_000  # size in bytes of the largest unpacked workbook that is read
     try:
         import openpyxl
     except ImportError:
@@ -75,8 +73,8 @@ def sheet_text(raw: bytes) -> bytes:
             "the sheet as CSV.") from None
     with _refusing():
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
-            if sum(part.file_size for part in packed.infolist()) > MAX_SHEET:
-                raise ValueError(f"it unpacks to more than {MAX_SHEET} bytes")
+            if sum(part.file_size for part in packed.infolist()) > max_sheet:
+                raise ValueError(f"it unpacks to more than {max_sheet} bytes")
         book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
         for sheet in book.worksheets:
             rows = [["" if cell is None else str(cell) for cell in row]

@@ -40,15 +40,13 @@ from halbach_fe.study.grades import grade_of
 from halbach_fe.study.magnet import Demagnetization
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.model import Study
+from halbach_fe.study.sentences import ABSOLUTE_ZERO_C
 
 ACROSS = 6
 """Default number of cells across the radial thickness of a block."""
 
 SHARES = (0.0, 0.01)
 """Shares of the magnet's volume for which the limit temperature is reported."""
-
-
-ABSOLUTE_ZERO_C = -273.15
 
 LINEAR = 0.25, 2.0
 """Change of the coercivity up to which its coefficient is believed: that of NdFeB doubles at about

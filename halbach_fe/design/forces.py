@@ -52,9 +52,6 @@ FAR_ORDERS = (1, 2, 3, 4, 5)
 Field = Callable[[Floats], Floats]
 """Takes points (n, 3) in m and returns B (n, 3) in T."""
 
-STANDARD_GRAVITY = 9.80665
-"""Acceleration in m/s^2 that turns newtons into a weight."""
-
 DENSITY_KG_PER_M3 = 7500.0
 """Density of sintered NdFeB, for blocks whose grade is not known."""
 

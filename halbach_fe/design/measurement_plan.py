@@ -26,12 +26,12 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.design.objective import Deviations, deviation_model
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import study_prior
-from halbach_fe.response.deviations import Deviations, deviation_model
 from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.formulation_choice import check_points

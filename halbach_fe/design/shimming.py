@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.design.objective import Known, Objective
+from halbach_fe.design.objective import DeviationModel, Known, Objective
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.design.sorting import Slots
 from halbach_fe.geometry.magnet import Magnet
@@ -41,7 +41,6 @@ from halbach_fe.geometry.mounting import as_meant
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, rotation_roots
 from halbach_fe.study.model import Study

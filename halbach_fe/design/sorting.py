@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.design.objective import Objective
+from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant
@@ -48,15 +48,13 @@ from halbach_fe.inference.block_prior import (
 )
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.response.block_variation import with_variations
-from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.response.multipoles import MultipoleModel
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
 
-STARTS, STARTED_SLOTS = 20, 2000
-"""Largest number of random assignments from which the search starts, and the slots of all of them
-together: local optima of large magnets differ less, and take longer to find."""
+STARTS = 20
+"""Largest number of random assignments from which the search starts."""
 
 
 @dataclass(frozen=True)
@@ -188,29 +186,32 @@ def sort_blocks(
                       f"the same blocks{types_in_words(alike)}, or measure spare blocks.",
                       HalbachWarning, stacklevel=2)
     count = len(model.orders) if isinstance(model, MultipoleModel) else 1
-    numbered = _name_places(magnet, table, _table_order(blocks))
+    numbered = _name_places(magnet, table, _order(blocks))
     known = _assembled(magnet, numbered, model)
     as_numbered = model.of(known)
     floor = float(np.sum(as_numbered.root ** 2))
     peers = [np.flatnonzero(blocks.slot_types == number) for number in blocks.slot_types]
     fitting = [np.flatnonzero(blocks.types == number) for number in blocks.slot_types]
-    best = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset)
-    starts = min(STARTS, max(1, STARTED_SLOTS // len(blocks.slot_types)))
+    best = Assignment.of(blocks.slots, _order(blocks), blocks.offset)
+    # slots of all starts together: local optima of large magnets differ less, and take longer to
+    # find
+    started_slots = 2000
+    starts = min(STARTS, max(1, started_slots // len(blocks.slot_types)))
     # smallest decrease of the sum of squares for which blocks are exchanged, relative to what the
     # measurement's uncertainty contributes to that sum, which no assignment changes
     worthwhile = 1e-3
     for start in range(starts):
-        found = Assignment.of(blocks.slots, _random_order(blocks, generator), blocks.offset)
+        found = Assignment.of(blocks.slots, _order(blocks, generator), blocks.offset)
         descend(found, peers, fitting, worthwhile * floor, floor)
         if not start or found.square < best.square:
             best = found
         progress(start + 1, starts)
     random_orders = 2000  # number of random assignments with which the result is compared
     random = np.array([Assignment.of(
-        blocks.slots, _random_order(blocks, generator), blocks.offset).square
+        blocks.slots, _order(blocks, generator), blocks.offset).square
         for _ in range(random_orders)])
     # assignments count in units of a main multipole that no order changes; results in their own
-    in_these_units = Assignment.of(blocks.slots, _table_order(blocks), blocks.offset).square / count
+    in_these_units = Assignment.of(blocks.slots, _order(blocks), blocks.offset).square / count
     unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
     if (placed := _placed_order(table, magnet)) is not None:
         known = _assembled(magnet, _name_places(magnet, table, placed), model)
@@ -331,22 +332,16 @@ def sortable(magnet: Magnet, table: BlockTable) -> BlockTable:
     return table
 
 
-def _table_order(blocks: _Blocks) -> Ints:
-    """Return the assignment (slots,) that takes the blocks of each type in the table's order."""
+def _order(blocks: _Blocks, generator: np.random.Generator | None = None) -> Ints:
+    """Return the assignment (slots,) that takes the blocks of each type in the table's order, or in
+    random order.
+    """
     order = np.empty(len(blocks.slot_types), int)
     for number in np.unique(blocks.slot_types):
         slots = np.flatnonzero(blocks.slot_types == number)
-        order[slots] = np.flatnonzero(blocks.types == number)[:len(slots)]
-    return order
-
-
-def _random_order(blocks: _Blocks, generator: np.random.Generator) -> Ints:
-    """Return an assignment (slots,) that takes the blocks of each type in random order."""
-    order = np.empty(len(blocks.slot_types), int)
-    for number in np.unique(blocks.slot_types):
-        slots = np.flatnonzero(blocks.slot_types == number)
-        members = generator.permutation(np.flatnonzero(blocks.types == number))
-        order[slots] = members[:len(slots)]
+        members = np.flatnonzero(blocks.types == number)
+        order[slots] = (members if generator is None
+                        else generator.permutation(members))[:len(slots)]
     return order
 
 

@@ -115,7 +115,7 @@ class Competition:
         self._products: dict[tuple[int, int], Floats] = {}
         self._by_column: dict[int, Floats] = {}
         self._by_term: dict[int, Floats] = {}
-        self._extended: dict[tuple[int, ...], Explanation] = {}
+        self._extensions: dict[tuple[int, ...], Explanation] = {}
 
     def _of_terms(self, rows: Ints) -> Floats:
         """Return the information between some terms of any shape."""
@@ -159,7 +159,7 @@ class Competition:
             self._by_term |= dict(zip(missing.tolist(), found, strict=True))
         return np.array([self._by_term[row] for row in rows.tolist()])
 
-    def given(self, terms: Sequence[Term]) -> Evidence:
+    def evidence_beside(self, terms: Sequence[Term]) -> Evidence:
         """Return the evidence of all effects with terms integrated out."""
         if not terms:
             return self.evidence
@@ -169,7 +169,7 @@ class Competition:
         return self.evidence.beside(precision, self._cross_of_all(rows) * scale[:, None],
                                     self._score[rows] * scale)
 
-    def _given(
+    def _joint_evidence(
         self, terms: Sequence[Term], columns: Sequence[int], family: Ints | None = None
     ) -> Evidence:
         """Return the evidence of effects' columns, and of a family's terms after them, with terms
@@ -188,14 +188,14 @@ class Competition:
         kept = len(index) + len(family)
         return evidence.given(range(kept, len(index) + len(added))).only(range(kept))
 
-    def _alone(
+    def _evidence_of(
         self, effects: Sequence[int], terms: Sequence[Term]
     ) -> tuple[Evidence, list[Candidate]]:
         """Return the evidence of some effects only beside terms, and these effects as its
         candidates.
         """
         columns, chosen = self._renumbered(effects)
-        return self._given(terms, columns), chosen
+        return self._joint_evidence(terms, columns), chosen
 
     def _renumbered(self, effects: Sequence[int]) -> tuple[list[int], list[Candidate]]:
         """Return the columns of some effects, and the effects with their numbers among these."""
@@ -208,13 +208,13 @@ class Competition:
         """Judge effects and terms together."""
         total = float(self.prior[list(effects)].sum()) + len(terms) * self.prior_of_family
         if terms:
-            own = self._given((), (), np.concatenate([term.columns for term in terms]))
+            own = self._joint_evidence((), (), np.concatenate([term.columns for term in terms]))
             scale = np.concatenate([term.deviations for term in terms])
             own = replace(own, score=own.score * scale,
                           information=own.information * scale * scale[:, None])
             total += own.fit(range(len(scale))).log_evidence
             total -= sum(term.fitted.at_best - term.fitted.log_bayes_factor for term in terms)
-        evidence, chosen = self._alone(effects, terms)
+        evidence, chosen = self._evidence_of(effects, terms)
         total += log_evidence(evidence, chosen)
         rest = with_candidates(evidence, chosen)
         return Explanation(tuple(effects), tuple(terms), total, rest.chi2 / rest.readings)
@@ -249,7 +249,7 @@ class Competition:
         columns, renumbered = self._renumbered(effects)
         for number, (family, part) in enumerate(zip(self.families, self._parts, strict=True)):
             if not any(term.family is family for term in terms):
-                both = with_candidates(self._given(terms, columns, part), renumbered)
+                both = with_candidates(self._joint_evidence(terms, columns, part), renumbered)
                 yield number, both.only(range(len(columns), len(columns) + len(part)))
 
     def _term(self, number: int, evidence: Evidence) -> Term:
@@ -259,28 +259,21 @@ class Competition:
         used = fitted.deviations > 0
         return Term(family, fitted, part[used], fitted.deviations[used])
 
-    def extended(self, effects: Sequence[int]) -> Explanation:
+    def extension(self, effects: Sequence[int]) -> Explanation:
         """Add terms while the readings demand them, and drop effects that these make needless."""
-        key = tuple(effects)
-        if key not in self._extended:
-            self._extended[key] = self._extend(key)
-        return self._extended[key]
-
-    def _extend(self, effects: Sequence[int]) -> Explanation:
         most_terms = 3  # largest number of families in one explanation
-        kept = list(effects)
-        terms: list[Term] = []
-        while len(terms) < most_terms:
-            term = self.likeliest_term(kept, terms)
-            if term is None:
-                break
-            terms.append(term)
-            kept = self.needed(kept, terms)
-        return self.explanation(kept, terms)
+        key = tuple(effects)
+        if key not in self._extensions:
+            kept, terms = list(effects), list[Term]()
+            while len(terms) < most_terms and (term := self.likeliest_term(kept, terms)):
+                terms.append(term)
+                kept = self.detected_effects(kept, terms)
+            self._extensions[key] = self.explanation(kept, terms)
+        return self._extensions[key]
 
-    def needed(self, effects: Sequence[int], terms: Sequence[Term]) -> list[int]:
+    def detected_effects(self, effects: Sequence[int], terms: Sequence[Term]) -> list[int]:
         """Drop effects whose odds beside the others and the terms are too small."""
-        evidence, candidates = self._alone(effects, terms)
+        evidence, candidates = self._evidence_of(effects, terms)
         kept = list(range(len(effects)))
         while kept:
             tempered = _tempered(evidence, [candidates[k] for k in kept])
@@ -295,7 +288,7 @@ class Competition:
 
     def with_more_effects(self, start: Explanation) -> Explanation:
         """Add effects beside the terms of an explanation, one at a time."""
-        kept, evidence = list(start.effects), self.given(start.terms)
+        kept, evidence = list(start.effects), self.evidence_beside(start.terms)
         while start.terms and len(kept) < MAX_EFFECTS:
             chosen = [self.candidates[k] for k in kept]
             odds = log_bayes_factors(with_candidates(_tempered(evidence, chosen), chosen),
@@ -309,12 +302,12 @@ class Competition:
             best = int(np.argmax(odds))
             if odds[best] < DETECTION_LOG_ODDS:
                 break
-            kept = self.needed([*kept, best], start.terms)
+            kept = self.detected_effects([*kept, best], start.terms)
             if best not in kept:
                 break
         return self.explanation(kept, start.terms)
 
-    def necessary(self, effects: Sequence[int]) -> list[int]:
+    def irreplaceable_effects(self, effects: Sequence[int]) -> list[int]:
         """Return those effects that nothing of any shape could replace: all families together,
         each as large as may be.
         """
@@ -326,7 +319,7 @@ class Competition:
             deviations = large_size * family.spectra[-2]
             terms.append(Term(family, Fitted(0.0, 0.0, (), False, deviations, deviations), part,
                               deviations))
-        return self.needed(effects, terms)
+        return self.detected_effects(effects, terms)
 
     def best_explanations(
         self, catalogued: Sequence[int], scattered: Collection[int] = ()
@@ -349,7 +342,7 @@ class Competition:
         # well: effects seldom come together.
         several = 2
         by_catalogue = self.explanation(catalogued, ())
-        without = self.extended(())
+        without = self.extension(())
         beside = self.with_more_effects(without)
         if beside == without and without.chi2 < fits and (
                 without.log_odds > by_catalogue.log_odds + DETECTION_LOG_ODDS):
@@ -357,12 +350,12 @@ class Competition:
         found = [without, beside]
         for start in dict.fromkeys((tuple(catalogued), tuple(catalogued[:1]))):
             if start:
-                extended = self.extended(start)
+                extended = self.extension(start)
                 found += [extended, self.with_more_effects(extended)]
         best = max((by_catalogue, *found), key=lambda one: one.log_odds)
         if not best.terms and set(scattered) & set(best.effects):
             others = [number for number in best.effects if number not in scattered]
-            best = self.extended(others) if others else without
+            best = self.extension(others) if others else without
         if not best.terms:
             tie = without.log_odds > best.log_odds - INDISTINGUISHABLE_LOG_EVIDENCE
             instead = tie and len(best.effects) >= several
@@ -374,12 +367,13 @@ class Competition:
         doubtful: list[int] = []
         for number in best.effects:
             others = [other for other in best.effects if other != number]
-            rest = self.extended(others) if others else without
+            rest = self.extension(others) if others else without
             (kept if best.log_odds - rest.log_odds > by_terms else doubtful).append(number)
-        kept += [number for number in self.necessary(best.effects) if number in doubtful]
+        kept += [number for number in self.irreplaceable_effects(best.effects)
+                 if number in doubtful]
         if not kept:
             return without, without
-        return best if len(kept) == len(best.effects) else self.extended(kept), without
+        return best if len(kept) == len(best.effects) else self.extension(kept), without
 
 
 def _tempered(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:

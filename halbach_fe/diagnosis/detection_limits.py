@@ -20,7 +20,7 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import DetectionLimits
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import marginal_of
+from halbach_fe.diagnosis.search import Training
 from halbach_fe.inference.result import InferenceResult
 
 
@@ -48,7 +48,7 @@ def detection_limits(
     places = each_block(update.study)
     if not places:
         return None
-    whitened, _, marginal, _ = marginal_of(update, campaign)
+    training = Training.of(update, campaign)
     scene = campaign.scene(update.study)  # changes of single blocks need their field in vacuum only
     threshold = DETECTION_LOG_ODDS - float(np.log(EFFECT_PRIOR_ODDS / len(places)))
 
@@ -56,10 +56,9 @@ def detection_limits(
         """Return the limits (places,) of an effect by its first ``count`` parameters."""
         sd, found = effect.parameters[0].sd, []
         for first in range(0, len(places), blocks_at_once):
-            signatures = [sd * whitened(update.observation.read(
-                scene.signature(Hypothesis(effect, place))[:count]))
+            signatures = [sd * training.shown(scene.signature(Hypothesis(effect, place))[:count])
                 for place in places[first:first + blocks_at_once]]
-            evidence = marginal.evidence(np.hstack([columns, *signatures]),
+            evidence = training.marginal.evidence(np.hstack([columns, *signatures]),
                                          np.zeros(len(columns))).given(range(columns.shape[1]))
             for number in range(len(signatures)):
                 own = slice(columns.shape[1] + count * number, columns.shape[1] + count * (

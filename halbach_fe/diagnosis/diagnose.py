@@ -31,7 +31,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -42,9 +41,8 @@ from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.evidence import Marginal, ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.flexible_causes import Family
-from halbach_fe.diagnosis.loo_residuals import ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
     blocks_of,
@@ -72,6 +70,7 @@ from halbach_fe.diagnosis.result import (
 )
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
+    Linearization,
     NominalSolver,
     Say,
     Search,
@@ -201,185 +200,296 @@ def diagnose(
             "Of a map of |B| no gross errors are looked for (units, axes, signs).",
             HalbachWarning, stacklevel=2)
     with session.with_cache() as cached:
-        found = _diagnose(study, data, cached, blocks,
-                          catalogue() if effects is None else effects, validation_map, say, solver,
-                          floor_T, time_limit_s)
+        found = _Diagnosing(_Task(
+            study, data, cached, blocks, catalogue() if effects is None else effects,
+            validation_map, say, solver, floor_T, time_limit_s)).diagnosis()
         return found if effects is None else replace(
             found, looked_for=tuple(effect.name for effect in effects))
 
 
-def _diagnose(
-    study: Study, data: Data, session: Session, blocks: BlockTable | None,
-    effects: Sequence[Effect], validation_map: xr.Dataset | None, say: Say,
-    solver: NominalSolver | None, floor_T: Floor | None, time_limit_s: float | None,
-    left: tuple[Outlier, ...] | None = None,
-) -> Diagnosis:
-    """See `diagnose`; the session has a cache.
+@dataclass(frozen=True)
+class _Task:
+    """The arguments of `diagnose`; the session has a cache."""
 
-    The outliers are those that an earlier run has ``left``, if there was one.
+    study: Study
+    data: Data
+    session: Session
+    blocks: BlockTable | None
+    effects: Sequence[Effect]
+    validation_map: xr.Dataset | None
+    say: Say
+    solver: NominalSolver | None
+    floor_T: Floor | None
+    time_limit_s: float | None
+
+
+class _Diagnosing:
+    """The state of a diagnosis from round to round.
+
+    Attributes
+    ----------
+    corrected : Study
+        The study corrected for gross errors and outliers, without any effects.
+    identified : tuple of IdentifiedEffect
+        The effects that are in the model, or come into it in the next round.
+    closing : bool
+        Whether the time is up, so that no further signatures are computed.
+    update, search, judgement
+        Those of the round under way, or of the answer.
+    first : tuple of InferenceResult and Search
+        Of the first round; that of another noise of positions has none of its own.
     """
-    pace = Pace(say, session.progress, time_limit_s)
-    session = replace(session, progress=pace.advance)
-    pace.begin("looking for gross errors of the map")
-    gross_errors, corrected, starts = correct_map_errors(study, data, blocks, effects)
-    for error in gross_errors:
-        say(f"gross error: {error.text}")
-    poses: tuple[FoundPose, ...] = ()
-    if not starts:  # which are places that explain the map
-        pace.begin("looking where the map lies")
-        poses, corrected = find_poses(corrected, data, _subsession(session, "pose"), say)
-    blocks = blocks_of(blocks, study, corrected)
-    campaign = replace(Campaign.of(corrected, data, validation_map),
-                       blocks=beside_amplitudes(blocks, corrected))
-    signatures: Signatures = {}
-    solver = solver or NominalSolver(replace(_subsession(session, "signatures"), progress=None))
-    first: tuple[InferenceResult, Search] | None = None
-    position_noise: tuple[PositionNoise, ...] = ()
-    converged, closing = True, False
-    outliers: tuple[Outlier, ...] = ()
-    solver_error: SolverErrorExplanation | None = None
-    flexible: list[Family] = []
-    best: _Round | None = None
-    rivals: Rivals = {}
-    solved: Magnet | None = None  # the last whose single blocks were solved for
 
-    def changed(identified: Sequence[IdentifiedEffect]) -> Study:
-        return with_position_noise(apply_effects(corrected, identified), position_noise)
+    update: InferenceResult
+    search: Search
+    judgement: Judgement
 
-    def updated(identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
-        nonlocal solved
-        known = beside_amplitudes(blocks, corrected) if identified else blocks
-        update = infer(build_magnet(changed(identified)), data, _subsession(session, name), known,
-                       validation_map=validation_map, similar=solved)
-        solved = solved if update.response.of_similar else update.magnet
-        return update
+    def __init__(self, task: _Task, left: tuple[Outlier, ...] | None = None) -> None:
+        """Correct gross errors. The outliers are those that an earlier run has ``left``, if any."""
+        self.pace = Pace(task.say, task.session.progress, task.time_limit_s)
+        self.task = task = replace(
+            task, session=replace(task.session, progress=self.pace.advance))
+        self.left, self.say = left, task.say
+        self.pace.begin("looking for gross errors of the map")
+        self.gross_errors, self.corrected, starts = correct_map_errors(
+            task.study, task.data, task.blocks, task.effects)
+        for error in self.gross_errors:
+            self.say(f"gross error: {error.text}")
+        self.poses: tuple[FoundPose, ...] = ()
+        if not starts:  # which are places that explain the map
+            self.pace.begin("looking where the map lies")
+            self.poses, self.corrected = find_poses(
+                self.corrected, task.data, self._subsession("pose"), self.say)
+        self.blocks = blocks_of(task.blocks, task.study, self.corrected)
+        self.campaign = replace(
+            Campaign.of(self.corrected, task.data, task.validation_map),
+            blocks=beside_amplitudes(self.blocks, self.corrected))
+        self.solver = task.solver or NominalSolver(
+            replace(self._subsession("signatures"), progress=None))
+        self.signatures: Signatures = {}
+        self.first: tuple[InferenceResult, Search] | None = None
+        self.position_noise: tuple[PositionNoise, ...] = ()
+        self.converged, self.closing = True, False
+        self.outliers: tuple[Outlier, ...] = ()
+        self.solver_error: SolverErrorExplanation | None = None
+        self.flexible: list[Family] = []
+        self.best: _Round | None = None
+        self.rivals: Rivals = {}
+        self.solved: Magnet | None = None  # the last whose single blocks were solved for
+        if len(starts) > 1:
+            self.say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
+        self.start, self.positions = possible_positions(starts, self._updated, self.campaign)
+        self.identified = self.start
 
-    if len(starts) > 1:
-        say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
-    start, positions = possible_positions(starts, updated, campaign)
-    identified = start
+    def diagnosis(self) -> Diagnosis:
+        """Go from round to round, and return the one that predicts held-out readings best."""
+        rounds = next((number for number in range(1, MAX_ROUNDS + 1) if self._is_last(number)),
+                      MAX_ROUNDS)
+        answer = self._choose_answer(rounds)
+        if self._has_other_outliers():
+            return _Diagnosing(replace(self.task, blocks=self.blocks), self.left).diagnosis()
+        return self._result(rounds, answer)
 
-    for number in range(MAX_ROUNDS):
+    def _is_last(self, number: int) -> bool:
+        """Solve the model with what was found, and compare all effects at that point.
+
+        The iteration ends if nothing has changed, if the time is up, or if the solver's own error
+        explains the misfit.
+        """
+        self._solve(number)
+        self._compare(number)
+        if self.solver_error:
+            self.say("the solver's own error explains the misfit")
+            return True
+        found = self._select(number)
+        if self._noise_has_changed():
+            self.closing = self.pace.is_over
+            return False
+        self.converged = _has_converged(self.identified, found)
+        self._keep_if_best(number)
+        if self.converged:
+            # the model has the old amplitudes; their sd and evidence are those of this round
+            present = {effect.hypothesis: effect.values for effect in self.identified}
+            self.identified = tuple(replace(effect, values=present[effect.hypothesis])
+                                    for effect in found)
+            return True
+        if self.closing:  # the model has the effects of the previous round
+            return True
+        self.converged = only_equals_took_turns(self.identified, found)
+        if self.converged:
+            return True
+        short = with_short_steps(found, self.identified)
+        # a step that ends inside material is made as a whole, which was found to be possible
+        self.identified = short if possible(self.corrected, short, self.campaign) else found
+        self.closing = self.pace.is_over
+        if self.closing:
+            self.say("the time is up: the effects so far are put into the model")
+        return False
+
+    def _solve(self, number: int) -> None:
+        """Update the model with the effects so far; in the first round, look for outliers."""
         added = "; ".join(
             " ".join(filter(None, (effect.hypothesis.effect.title, place_in_words(effect.place))))
-            for effect in identified)
-        say(f"round {number + 1}: the model with {added or 'no effect added'}")
-        pace.begin(f"round {number + 1}, solving")
-        update = updated(identified, f"round-{number + 1}")
-        if number == 0:
-            with_all = corrected
-            outliers = outliers_of(update, campaign) if left is None else left
-        if number == 0 and outliers:
-            say(f"outliers: {len(outliers)} readings are excluded")
-            corrected = excluding(corrected, outliers)
-            update = updated(identified, "without-outliers")
-        pace.begin(f"round {number + 1}, effects")
-        if update.terms is not None:
-            signatures.clear()  # they were at the poses of the last round
-        prior_mean = (first[0] if first else update).prior.mean
-        search = score_hypotheses(
-            corrected, start, update, prior_mean, campaign, solver, effects, identified, signatures,
-            pace.advance, partial(_is_over, pace, closing))
-        first = first or (update, search)
-        solver_error = None if identified else explain_by_solver_error(update)
-        if solver_error:
-            say("the solver's own error explains the misfit")
-            break
-        found = identify_effects(corrected, search)
-        flexible = flexible or families_of(search, update)
-        judgement = judge(search, update, found, flexible)
-        if number > 0 or judgement.is_clear or _has_converged(identified, found):
-            found = named_effects(corrected, search, judgement, found)
-        found = with_first_rivals(found, identified, rivals)
-        estimate = vibration_beyond(judgement, update, campaign, search, position_noise)
-        if not closing and not have_settled(position_noise, estimate):
-            sizes = [f"{1e3 * noise.sd_m:.2g} mm{f' in map {noise.map}' if noise.map else ''}"
-                     for noise in estimate]
-            say("vibration: positions with a standard deviation of "
-                f"{' and '.join(sizes) or '0 mm'} are added to the noise")
-            position_noise = estimate
-            signatures.clear()  # they were whitened by the previous noise
-            closing = pace.is_over
-            continue
-        converged = _has_converged(identified, found)
-        this = _Round(number + 1, update, search, judgement, identified,
-                      _held_out_misfit(update, search, first[0]))
+            for effect in self.identified)
+        self.say(f"round {number}: the model with {added or 'no effect added'}")
+        self.pace.begin(f"round {number}, solving")
+        self.update = self._updated(self.identified, f"round-{number}")
+        if number > 1:
+            return
+        self.with_all = self.corrected
+        self.outliers = (outliers_of(self.update, self.campaign) if self.left is None
+                         else self.left)
+        if self.outliers:
+            self.say(f"outliers: {len(self.outliers)} readings are excluded")
+            self.corrected = excluding(self.corrected, self.outliers)
+            self.update = self._updated(self.identified, "without-outliers")
+
+    def _compare(self, number: int) -> None:
+        """Compare all effects at the point of the model."""
+        self.pace.begin(f"round {number}, effects")
+        if self.update.terms is not None:
+            self.signatures.clear()  # they were at the poses of the last round
+        prior_mean = (self.first[0] if self.first else self.update).prior.mean
+        self.search = score_hypotheses(
+            Linearization(self.corrected, self.start, self.update, prior_mean, self.campaign,
+                          self.solver, self.identified, self.signatures),
+            self.task.effects, self.pace.advance, lambda: self.closing or self.pace.is_over)
+        self.first = self.first or (self.update, self.search)
+        self.solver_error = None if self.identified else explain_by_solver_error(self.update)
+
+    def _select(self, number: int) -> tuple[IdentifiedEffect, ...]:
+        """Select effects, and let causes of any shape compete with them.
+
+        In the first round effects give way only if these explain far more.
+        """
+        found = identify_effects(self.corrected, self.search)
+        self.flexible = self.flexible or families_of(self.search, self.update)
+        self.judgement = judge(self.search, self.update, found, self.flexible)
+        if number > 1 or self.judgement.is_clear or _has_converged(self.identified, found):
+            found = named_effects(self.corrected, self.search, self.judgement, found)
+        return with_first_rivals(found, self.identified, self.rivals)
+
+    def _noise_has_changed(self) -> bool:
+        """Add the errors of positions to the noise, and tell whether they are others than so far.
+
+        In the last round they stay.
+        """
+        estimate = vibration_beyond(
+            self.judgement, self.update, self.campaign, self.search, self.position_noise)
+        if self.closing or have_settled(self.position_noise, estimate):
+            return False
+        sizes = [f"{1e3 * noise.sd_m:.2g} mm{f' in map {noise.map}' if noise.map else ''}"
+                 for noise in estimate]
+        self.say("vibration: positions with a standard deviation of "
+                 f"{' and '.join(sizes) or '0 mm'} are added to the noise")
+        self.position_noise = estimate
+        self.signatures.clear()  # they were whitened by the previous noise
+        return True
+
+    def _keep_if_best(self, number: int) -> None:
+        """Keep the round if it predicts held-out readings as well as the best so far."""
+        assert self.first is not None
+        first = self.first[0]
+        this = _Round(number, self.update, self.search, self.judgement, self.identified,
+                      _held_out_misfit(self.update, self.search, first))
         # residuals below the error bars, of mean square 1, tell no round from another
-        if not this.gives_way and (
-                best is None or this.misfit <= max(best.misfit, 1.0) * _chance(first[0])):
-            best = this
-        if converged:
-            # the model has the old amplitudes; their sd and evidence are those of this round
-            present = {effect.hypothesis: effect.values for effect in identified}
-            identified = tuple(replace(effect, values=present[effect.hypothesis])
-                               for effect in found)
-            break
-        if closing:  # the model has the effects of the previous round
-            break
-        if converged := only_equals_took_turns(identified, found):
-            break
-        short = with_short_steps(found, identified)
-        # a step that ends inside material is made as a whole, which was found to be possible
-        identified = short if possible(corrected, short, campaign) else found
-        closing = pace.is_over
-        if closing:
-            say("the time is up: the effects so far are put into the model")
-    assert first is not None
-    answer = number + 1
-    if best is not None and not solver_error and best.number < answer:
-        say(f"round {best.number} predicts the held-out readings best, and is the answer")
-        answer, update, search, judgement, identified = (
-            best.number, best.update, best.search, best.judgement, best.identified)
-        if not identified:  # what explains the map is none of the effects
-            judgement = replace(judgement, best=judgement.without)
-    if outliers and identified and left is None and not pace.is_over:
-        # near a block that is wrong, readings had seemed to disagree with their neighbours
-        left = outliers_of(infer(
-            build_magnet(with_position_noise(apply_effects(with_all, identified), position_noise)),
-            data, _subsession(session, "all-readings"), beside_amplitudes(blocks, corrected),
-            validation_map=validation_map), campaign)
-        if {_place_of(one) for one in left} != {_place_of(one) for one in outliers}:
-            say(f"outliers: with these effects in the model they are {len(left)} readings; again")
-            return _diagnose(study, data, session, blocks, effects, validation_map, say, solver,
-                             floor_T, time_limit_s, left)
-    unknown: UnknownCause | None = None
-    suspected: tuple[Suspicion, ...] = ()
-    imitation: Imitation | None = None
-    further: Further | None = None
-    if not solver_error:
-        unknown = describe_unknown(judgement, update, search, identified)
-        if unknown is None:
-            further = Further.of(judgement)
-            if answer == number + 1:
-                suspected = suspicions(judgement, further, corrected, search)
-            imitation = imitated(judgement, further, update, search, suspected)
-    if unknown is not None and unknown.alone and not start and not position_noise:
-        update, search = first
-    identified = with_rivals(search, identified)
-    if further is not None:
-        identified = with_further_causes(search, identified, further.probabilities)
-    numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
-    in_model = [column for number in numbers for column in search.candidates[number].columns]
-    limits = detection_limits(update, campaign, search.columns[:, in_model])
-    return Diagnosis(
-        corrected_study=corrected, before=first[0], after=update,
-        study=with_position_noise(with_uncertain_effects(
-            corrected, identified, [each for one in (*suspected, imitation) if one
-                                    for each in one.fitted]), position_noise),
-        identified=identified, unknown=unknown,
-        probabilities=probabilities(
-            first[1].evidence, first[1].candidates,
-            judgement.best.log_odds if unknown is not None and unknown.alone else -np.inf),
-        evidence=first[1].evidence, candidates=first[1].candidates,
-        groups_before=_groups(first[0], first[1].marginal, first[1].training),
-        groups_after=_groups(update, search.marginal, search.training),
-        loo_residuals_before=loo_residuals(first[1].marginal, first[1].training),
-        loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=number + 1,
-        answer=answer, gross_errors=gross_errors, poses=poses, outliers=outliers,
-        position_noise=position_noise,
-        solver_error=solver_error, imitated=imitation, converged=converged, positions=positions,
-        limits=limits, floor_T=floor_T, suspected=suspected,
-        uncompared=search.uncompared if closing or search.uncompared else None)
+        if not this.gives_way and (self.best is None or this.misfit <= max(
+                self.best.misfit, 1.0) * _chance(first)):
+            self.best = this
+
+    def _choose_answer(self, rounds: int) -> int:
+        """Return to the round that predicts best, and return its number."""
+        best = self.best
+        if best is None or self.solver_error or best.number == rounds:
+            return rounds
+        self.say(f"round {best.number} predicts the held-out readings best, and is the answer")
+        self.update, self.search, self.judgement, self.identified = (
+            best.update, best.search, best.judgement, best.identified)
+        if not self.identified:  # what explains the map is none of the effects
+            self.judgement = replace(self.judgement, best=self.judgement.without)
+        return best.number
+
+    def _has_other_outliers(self) -> bool:
+        """Look for outliers once more with the effects in the model, and tell whether they differ.
+
+        Near a block that is wrong, readings had seemed to disagree with their neighbours.
+        """
+        if not (self.outliers and self.identified and self.left is None
+                and not self.pace.is_over):
+            return False
+        self.left = outliers_of(infer(
+            build_magnet(with_position_noise(
+                apply_effects(self.with_all, self.identified), self.position_noise)),
+            self.task.data, self._subsession("all-readings"),
+            beside_amplitudes(self.blocks, self.corrected),
+            validation_map=self.task.validation_map), self.campaign)
+        if {_place_of(one) for one in self.left} == {_place_of(one) for one in self.outliers}:
+            return False
+        self.say(f"outliers: with these effects in the model they are {len(self.left)} readings; "
+                 "again")
+        return True
+
+    def _result(self, rounds: int, answer: int) -> Diagnosis:
+        """Describe what is unknown, suspected or imitated, and put everything together."""
+        assert self.first is not None
+        before, first = self.first
+        update, search = self.update, self.search
+        unknown: UnknownCause | None = None
+        suspected: tuple[Suspicion, ...] = ()
+        imitation: Imitation | None = None
+        further: Further | None = None
+        if not self.solver_error:
+            unknown = describe_unknown(self.judgement, update, search, self.identified)
+            if unknown is None:
+                further = Further.of(self.judgement)
+                if answer == rounds:
+                    suspected = suspicions(self.judgement, further, self.corrected, search)
+                imitation = imitated(self.judgement, further, update, search, suspected)
+        alone = unknown is not None and unknown.alone
+        if alone and not self.start and not self.position_noise:
+            update, search = self.first
+        identified = with_rivals(search, self.identified)
+        if further is not None:
+            identified = with_further_causes(search, identified, further.probabilities)
+        numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
+        in_model = [column for number in numbers for column in search.candidates[number].columns]
+        study = with_uncertain_effects(self.corrected, identified, [
+            each for one in (*suspected, imitation) if one for each in one.fitted])
+        return Diagnosis(
+            corrected_study=self.corrected, before=before, after=update,
+            study=with_position_noise(study, self.position_noise),
+            identified=identified, unknown=unknown,
+            probabilities=probabilities(
+                first.evidence, first.candidates,
+                self.judgement.best.log_odds if alone else -np.inf),
+            evidence=first.evidence, candidates=first.candidates,
+            groups_before=_groups(before, first.marginal, first.training),
+            groups_after=_groups(update, search.marginal, search.training),
+            loo_residuals_before=loo_residuals(first.marginal, first.training),
+            loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=rounds,
+            answer=answer, gross_errors=self.gross_errors, poses=self.poses,
+            outliers=self.outliers, position_noise=self.position_noise,
+            solver_error=self.solver_error, imitated=imitation, converged=self.converged,
+            positions=self.positions,
+            limits=detection_limits(update, self.campaign, search.columns[:, in_model]),
+            floor_T=self.task.floor_T, suspected=suspected,
+            uncompared=search.uncompared if self.closing or search.uncompared else None)
+
+    def _updated(self, identified: Sequence[IdentifiedEffect], name: str) -> InferenceResult:
+        """Infer the blocks with some effects in the model."""
+        known = beside_amplitudes(self.blocks, self.corrected) if identified else self.blocks
+        study = with_position_noise(
+            apply_effects(self.corrected, identified), self.position_noise)
+        update = infer(
+            build_magnet(study), self.task.data, self._subsession(name), known,
+            validation_map=self.task.validation_map, similar=self.solved)
+        self.solved = self.solved if update.response.of_similar else update.magnet
+        return update
+
+    def _subsession(self, name: str) -> Session:
+        """Return a session that works in a subfolder."""
+        session = self.task.session
+        return replace(session, folder=session.folder / name)
 
 
 def vibration_beyond(
@@ -461,11 +571,6 @@ def with_first_rivals(
     return tuple(changed)
 
 
-def _is_over(pace: Pace, closing: bool) -> bool:
-    """Tell whether no further signatures are computed: in the last round, or the time is up."""
-    return closing or pace.is_over
-
-
 def _has_converged(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]) -> bool:
     """Tell whether a round changed neither the selected effects nor their amplitudes."""
     before = {effect.hypothesis: effect for effect in old}
@@ -531,8 +636,3 @@ def _groups(update: InferenceResult, marginal: Marginal, residual: Floats) -> li
                   for name, label in zip(maps, labels, strict=True)]}
     used = {kind: names for kind, names in members.items() if 1 < len(set(names)) <= 40}
     return residual_groups(marginal, residual, used)
-
-
-def _subsession(session: Session, name: str) -> Session:
-    """Return a session that works in a subfolder."""
-    return replace(session, folder=session.folder / name)

@@ -59,13 +59,6 @@ MIN_READINGS = 12
 """Smallest number of readings for the search. With fewer readings some gross error would fit any
 map."""
 
-MIN_USED = 0.9
-"""Smallest share of the observed values that a convention must use. One that puts a component of a
-cross-section along z, which is not observed there, has less to explain than the others."""
-
-WRONG_BLOCK_FACTORS = (1.0, 2.0)
-"""Multiple of a block's field that is lacking if it is missing, and if it is upside down."""
-
 INDISTINGUISHABLE_MISFIT_RATIO = 1.2
 """Ratio of misfits below which the map does not distinguish two errors."""
 
@@ -505,6 +498,8 @@ class _Search:
 
     def with_a_wrong_block(self, convention: MapConvention) -> _Misfit:
         """Return the smallest misfit with one block missing or upside down."""
+        # Multiple of a block's field that is lacking if it is missing, and if it is upside down.
+        wrong_block_factors = (1.0, 2.0)
         turned, nominal = self.nominal_of(convention)
         if nominal is None:
             return INFINITE_MISFIT
@@ -516,7 +511,7 @@ class _Search:
         blocks = self.blocks[None if turned else convention.magnet]
         for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             own = unit @ (rotation_about_z(turn) @ block.easy_axis) * block.remanence @ sensors
-            for factor in WRONG_BLOCK_FACTORS if block.remanence else ():
+            for factor in wrong_block_factors if block.remanence else ():
                 found = self.compared(convention, whole - factor * own, nominal.variance)
                 if found is not None:
                     misfit = _Misfit(float(np.sqrt(np.mean(found[0]**2))), found[1])
@@ -529,7 +524,7 @@ class _Search:
         """Return standardized residuals (values,), their rms relative to that of the map, and the
         common factor of the readings.
 
-        None if points are inside material, or less than `MIN_USED` of the observed values remain.
+        None if points are inside material, or too few of the observed values remain.
         """
         turned, nominal = self.nominal_of(convention)
         if nominal is None:
@@ -551,11 +546,15 @@ class _Search:
         # Standard deviation that effects of usual size add to a reading, relative to the main
         # field.
         effect_field_sd = 0.003
+        # Smallest share of the observed values that a convention must use. One that puts a
+        # component of a cross-section along z, which is not observed there, has less to explain
+        # than the others.
+        least_used = 0.9
         old = self.study.instrument
         shown = to_magnet_axes(compose_axes(old.field_axes, convention.fields), self.values) * (
             old.flux_density_unit_T * convention.flux_density_unit)
         used = ~np.isnan(shown) & (self.observed | np.isin(COMPONENTS, convention.components))
-        if not used.any() or used.sum() < MIN_USED * self.present:
+        if not used.any() or used.sum() < least_used * self.present:
             return None
         whole = max(_size(shown), 1e-300)
         sd = np.sqrt(variance[used] + (effect_field_sd * max(whole, _size(field))) ** 2)

@@ -24,7 +24,7 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect, PossiblePosition
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import marginal_of
+from halbach_fe.diagnosis.search import Training
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Data
@@ -100,12 +100,13 @@ def _refined(
         update = updated(start, name)
         if step == STEPS:
             break
-        whitened, _, marginal, training = marginal_of(update, campaign)
+        training = Training.of(update, campaign)
         scene = campaign.scene(update.study)  # displacements need the field in vacuum only
-        columns = np.hstack([whitened(update.observation.read(
-            scene.signature(effect.hypothesis))) for effect in start])
+        columns = np.hstack([
+            training.shown(scene.signature(effect.hypothesis)) for effect in start])
         sd = np.array([parameter.sd for effect in start for parameter in effect.parameters])
-        change = sd * marginal.evidence(columns * sd, training).fit(range(len(sd))).mean
+        change = sd * training.marginal.evidence(
+            columns * sd, training.residual).fit(range(len(sd))).mean
         ends = np.cumsum([len(effect.values) for effect in start])[:-1]
         start = tuple(replace(effect, values=effect.values + part) for effect, part in zip(
             start, np.split(change, ends), strict=True))

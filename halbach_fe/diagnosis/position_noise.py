@@ -20,9 +20,9 @@ from scipy.optimize import minimize_scalar
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.flexible_causes import DECAY_RATES, harmonic_fields, sensor_errors
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, EFFECT_PRIOR_ODDS
 from halbach_fe.diagnosis.scene import Campaign, ScannedMap
-from halbach_fe.diagnosis.smooth_discrepancy import DECAY_RATES, harmonic_fields, sensor_errors
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.reading_noise import readings_per_displacement
 from halbach_fe.stats.noise import NoiseCovariance

@@ -5,17 +5,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachError, HalbachWarning
 from halbach_fe.core.pace import Progress
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, with_fewer_columns
+from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     PINNED_SD,
@@ -35,18 +37,14 @@ from halbach_fe.diagnosis.screening import (
     near_the_likeliest,
     renumbered,
 )
-from halbach_fe.diagnosis.smooth_discrepancy import fields_of_rms, harmonic_fields
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.mesh import with_rough_mesh
 from halbach_fe.solver.session import Session
+from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import FIELD_KEYS, Study
-
-MAX_PLACE_STEPS, PLACE_TOLERANCE = 20, 0.1
-"""Largest number of steps that improve a place, and the length in standard deviations of a step
-that ends them."""
 
 SHOWN_PROBABILITY = 1e-3
 """Probability of a candidate below which it is not asked what would be otherwise with it."""
@@ -160,10 +158,305 @@ def apply_effects(study: Study, identified: Sequence[IdentifiedEffect]) -> Study
     return study
 
 
+@dataclass(frozen=True)
+class Linearization:
+    """A point at which all effects are linearized, with some of them in the model already.
+
+    The signatures of all effects outside the model are those of the study from which the search
+    started, so that later rounds reuse them.
+    """
+
+    corrected: Study
+    """The study corrected for gross errors and outliers, without any effects."""
+    start: Sequence[IdentifiedEffect]
+    """Effects from which the search started."""
+    update: InferenceResult
+    """The inference with the identified effects in the model."""
+    prior_mean: Floats
+    """Prior mean (parameters,) in A/m of the magnetizations of the study without effects."""
+    campaign: Campaign
+    solver: NominalSolver
+    identified: Sequence[IdentifiedEffect] = ()
+    """The effects in the model of ``update``."""
+    signatures: Signatures = field(default_factory=dict)
+    """Signatures of effects outside the model; those that are missing are added."""
+
+    @cached_property
+    def training(self) -> Training:
+        """The training readings of the inference."""
+        return Training.of(self.update, self.campaign)
+
+    @cached_property
+    def study(self) -> Study:
+        """The study from which the search started."""
+        return self.campaign.with_terms(
+            apply_effects(self.corrected, self.start), self.update.terms)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """That of the study with the identified effects."""
+        return self._scene_of(self.update.study, self.solver.field)
+
+    @cached_property
+    def scene_at_start(self) -> Scene:
+        """That of the study from which the search started."""
+        return self._scene_of(self.study, self.solver.rough_field)
+
+    @cached_property
+    def known(self) -> Signatures:
+        """Signatures that an earlier search has computed for the same study and maps."""
+        return self.solver.signatures(self.study, self.update, self.prior_mean, self.campaign)
+
+    @cached_property
+    def in_model(self) -> dict[tuple[str, Place], IdentifiedEffect]:
+        """The identified effects by name and place."""
+        return {effect.hypothesis.key: effect for effect in self.identified}
+
+    def places(self, effects: Sequence[Effect]) -> dict[str, list[Place]]:
+        """Return the places of every effect, by its name, which are worth a signature."""
+        response, marginal = self.training.response, self.training.marginal
+        kept = marginal.remove(response)
+        uniform = slice(0, self.update.magnet.dimension * len(self.update.magnet.blocks))
+        information = response[:, uniform].T @ kept[:, uniform]
+        score = kept[:, uniform].T @ self.training.residual
+        found: dict[str, list[Place]] = {}
+        for effect in effects:
+            shortlist: Sequence[Place] = ()
+            if stated := self.campaign.places(effect, self.study):
+                shortlist = (self.campaign.places(effect, self.update.study)
+                             if effect.kind == "instrument" else effect.shortlist(
+                    self.update.study, self.update.prior.mean[uniform], information, score))
+            before = [place for name, place in (*self.signatures, *self.in_model)
+                      if name == effect.name]
+            found[effect.name] = list(dict.fromkeys((*shortlist, *before))) if stated else []
+        return found
+
+    def stored(self, hypothesis: Hypothesis) -> Floats | None:
+        """Return the whitened signature (rows, k) of a hypothesis outside the model, if known."""
+        signature = self.signatures.get(hypothesis.key, self.known.get(hypothesis.key))
+        if signature is not None:
+            self.signatures[hypothesis.key] = signature
+        return signature
+
+    def exact(self, hypothesis: Hypothesis) -> Floats:
+        """Compute the whitened signature (rows, k) of a hypothesis outside the model."""
+        signature = self._by_response(hypothesis, self.scene_at_start)
+        self.known[hypothesis.key] = self.signatures[hypothesis.key] = signature
+        return signature
+
+    def rough(self, hypothesis: Hypothesis, is_over: bool) -> Floats | None:
+        """Return the whitened rough signature (rows, k) of a hypothesis outside the model.
+
+        It is None if there is none, or if it is not known and the time is over.
+        """
+        key = f"{hypothesis.effect.name}, roughly", hypothesis.place
+        if key not in self.signatures and not is_over:
+            fields = self.scene_at_start.rough_signature(hypothesis)
+            if fields is not None:
+                self.signatures[key] = self.training.shown(fields)
+        return self.signatures.get(key)
+
+    def of_identified(self, present: IdentifiedEffect) -> tuple[Floats, Floats]:
+        """Return the whitened signature (rows, k) of an effect in the model, and its amounts (k,).
+
+        That of an effect which is applied in full is the difference that it makes.
+        """
+        hypothesis = present.hypothesis
+        effect, scale = hypothesis.effect, amplitude_scale(hypothesis.effect)
+        amounts = np.pad(present.values, (0, len(scale) - len(present.values)))
+        if not effect.applied_in_full:
+            return self.training.shown(self.scene.derivative(hypothesis, amounts)), amounts
+        amounts[0] = 1.0
+        without = self._scene_of(self.campaign.with_terms(apply_effects(self.corrected, [
+            one for one in self.identified if one is not present]), self.update.terms),
+            self.solver.field)
+        if effect.refinements:
+            return self.training.shown(_discrete_signature(hypothesis, amounts, without)), amounts
+        return self._by_response(hypothesis, without), amounts
+
+    def refined(self, hypothesis: Hypothesis) -> Floats:
+        """Compute the whitened signature (rows, k) at a place that `_improved_place` has found."""
+        signature = self.training.shown(self.scene_at_start.signature(hypothesis))
+        self.signatures[hypothesis.key] = signature
+        return signature
+
+    def _scene_of(self, study: Study, field: FieldAt) -> Scene:
+        return self.campaign.scene(
+            study, field, self.solver.iron_change, self.update.by_block(self.prior_mean))
+
+    def _by_response(self, hypothesis: Hypothesis, scene: Scene) -> Floats:
+        """Return the whitened signature (rows, k), by the response matrix if that is possible."""
+        change = hypothesis.effect.magnetization_change(scene.fields[0], hypothesis.place)
+        if change is None:
+            return self.training.shown(scene.signature(hypothesis))
+        size = self.update.magnet.dimension
+        return np.sum([self.training.response[:, size * block:size * (block + 1)] @ vector
+                       for block, vector in change.items()], axis=0)[:, None]
+
+
+@dataclass(frozen=True)
+class _Competitor:
+    """A hypothesis in the comparison.
+
+    The columns (rows, k) are its whitened signature per prior standard deviation. A rough one may
+    have any size.
+    """
+
+    hypothesis: Hypothesis
+    candidate: Candidate
+    columns: Floats
+    in_model: bool
+    is_rough: bool
+
+    @property
+    def can_improve(self) -> bool:
+        """Whether its place is one of a grid, between whose points there are better ones."""
+        effect = self.hypothesis.effect
+        return not self.in_model and bool(effect.refinements) and not effect.applied_in_full
+
+
+class _Comparison:
+    """The competitors at one point of linearization, as long as there is time."""
+
+    def __init__(
+        self, point: Linearization, effects: Sequence[Effect], progress: Progress,
+        is_over: Callable[[], bool],
+    ) -> None:
+        self.point, self.progress, self.is_over = point, progress, is_over
+        self.places = point.places(effects)
+        self.hypotheses = [Hypothesis(effect, place) for effect in effects
+                           for place in self.places[effect.name]]
+        self.marginal, self.residual = point.training.marginal, point.training.residual
+        self.competitors: list[_Competitor] = []
+        self.uncompared = self._done = 0
+
+    def compare_all(self) -> None:
+        """Compare the representatives of every effect, and then other places of noticed ones.
+
+        What is in the model or known already is compared in any case.
+        """
+        first = {(effect.name, place) for effect in {one.effect for one in self.hypotheses}
+                 for place in effect.representatives(self.places[effect.name])}
+        first |= {*self.point.in_model, *self.point.signatures}
+        later = []
+        for hypothesis in self.hypotheses:
+            if hypothesis.key in first:
+                self._compare(hypothesis)
+            else:
+                later.append(hypothesis)
+        fixed, few = self._fixed(), {one.effect.name for one in later}
+        noticed = {one.candidate.effect for one in self.competitors
+                   if one.candidate.effect in few
+                   and is_noticeable(one.columns, fixed, self.marginal, self.residual)}
+        for hypothesis in later:
+            if hypothesis.effect.name in noticed:
+                self._compare(hypothesis)
+        self.progress(len(self.hypotheses), len(self.hypotheses))
+        self._improve_places(fixed)
+
+    def search(self) -> Search:
+        """Return the comparison of the most likely ones, of which none that is near is rough."""
+        while True:
+            compared = most_likely(
+                [one.candidate for one in self.competitors],
+                [one.columns for one in self.competitors], self.marginal, self.residual,
+                {number for number, one in enumerate(self.competitors) if one.in_model})
+            chosen = [self.competitors[number] for number in compared.numbers]
+            candidates = tuple(renumbered([one.candidate for one in chosen]))
+            rough = frozenset(number for number, one in enumerate(chosen) if one.is_rough)
+            near = [compared.numbers[number] for number in near_the_likeliest(
+                compared.evidence, candidates, rough)]
+            if not near:
+                return Search(
+                    tuple(one.hypothesis for one in chosen), candidates, compared.evidence,
+                    compared.columns, compared.absorbed, self.residual, self.marginal,
+                    self.point.training.residual, self.point.campaign, self.point.scene_at_start,
+                    self.uncompared, rough)
+            if self.is_over():  # no time is left to solve for them
+                self.uncompared += len(near)
+                self.competitors = [one for number, one in enumerate(self.competitors)
+                                    if number not in near]
+                continue
+            for done, number in enumerate(near):
+                self.progress(done, len(near))
+                hypothesis = self.competitors[number].hypothesis
+                self.competitors[number] = self._competitor(
+                    hypothesis, self.point.exact(hypothesis))
+            self.progress(len(near), len(near))
+
+    def _compare(self, hypothesis: Hypothesis) -> None:
+        """Add a hypothesis, unless its signature is not known and the time is up.
+
+        The contribution of one in the model is added back to the residual.
+        """
+        self.progress(self._done, len(self.hypotheses))
+        self._done += 1
+        present = self.point.in_model.get(hypothesis.key)
+        if present is not None:
+            signature, amounts = self.point.of_identified(present)
+            self.residual = self.residual + signature @ amounts
+            self.competitors.append(self._competitor(hypothesis, signature))
+            return
+        known, is_rough = self.point.stored(hypothesis), False
+        if known is None:
+            over = self.is_over()
+            known = self.point.rough(hypothesis, over)
+            is_rough = known is not None
+            if known is None and over:
+                self.uncompared += 1
+                return
+        self.competitors.append(self._competitor(
+            hypothesis, self.point.exact(hypothesis) if known is None else known, is_rough))
+
+    def _competitor(
+        self, hypothesis: Hypothesis, signature: Floats, is_rough: bool = False
+    ) -> _Competitor:
+        """Return the competitor that has a whitened signature (rows, k)."""
+        effect, in_model = hypothesis.effect, hypothesis.key in self.point.in_model
+        columns = signature * amplitude_scale(effect)[:signature.shape[1]]
+        # What all blocks share is known this well only, as the calibration of the coil. A block
+        # that is reversed or elsewhere has it with another sign or direction, which the prior does
+        # not know.
+        common = self.point.update.study.prior.common_mode_sd
+        if effect.is_binary and common and not in_model and not is_rough:
+            columns = np.hstack([columns, common * columns])
+        count = columns.shape[1]
+        is_binary = effect.is_binary or (effect.applied_in_full and count > len(effect.parameters))
+        return _Competitor(hypothesis, Candidate(
+            effect.name, hypothesis.place.name, tuple(range(count)), is_binary and not is_rough,
+            effect.unique, len(self.places[effect.name]), _parts(effect, count), effect.shared,
+            effect.relative_odds), columns, in_model, is_rough)
+
+    def _fixed(self) -> Floats:
+        """Return the columns (rows, f) of what is in the model."""
+        return np.hstack([np.zeros((len(self.residual), 0)), *(
+            one.columns for one in self.competitors if one.in_model)])
+
+    def _improve_places(self, fixed: Floats) -> None:
+        """Add a better place than those of the grid of each effect that has one."""
+        grids: dict[str, list[_Competitor]] = {}
+        for one in self.competitors:
+            if one.can_improve:
+                grids.setdefault(one.candidate.effect, []).append(one)
+        for name, grid in grids.items():
+            effect = grid[0].hypothesis.effect
+
+            def slopes(place: Place, amounts: Floats, effect: Effect = effect) -> Floats:
+                return self.point.training.shown(self.point.scene_at_start.derivative(
+                    Hypothesis(effect, place), amounts))
+
+            better = _improved_place(
+                effect, [one.hypothesis.place for one in grid], [one.columns for one in grid],
+                slopes, fixed, self.marginal, self.residual)
+            if better is not None and (name, better) not in self.point.signatures:
+                self.places[name].append(better)
+                hypothesis = Hypothesis(effect, better)
+                self.competitors.append(self._competitor(
+                    hypothesis, self.point.refined(hypothesis)))
+
+
 def score_hypotheses(
-    corrected: Study, start: Sequence[IdentifiedEffect], update: InferenceResult,
-    prior_mean: Floats, campaign: Campaign, solver: NominalSolver, effects: Sequence[Effect],
-    identified: Sequence[IdentifiedEffect], signatures: Signatures,
+    point: Linearization, effects: Sequence[Effect],
     progress: Progress = lambda done, total: None, is_over: Callable[[], bool] = lambda: False,
 ) -> Search:
     """Compare all effects at a point where some effects are in the model already.
@@ -173,221 +466,16 @@ def score_hypotheses(
 
     Parameters
     ----------
-    corrected : Study
-        The study corrected for gross errors and outliers, without any effects.
-    start : sequence of IdentifiedEffect
-        Effects from which the search started. The signatures of all effects outside the model are
-        computed for the study with these.
-    update : InferenceResult
-        The inference with the identified effects in the model.
-    prior_mean : ndarray, shape (parameters,), in A/m
-        Prior mean of the magnetizations of the study without effects.
-    campaign : Campaign
-    solver : NominalSolver
+    point : Linearization
     effects : sequence of Effect
-    identified : sequence of IdentifiedEffect
-        The effects in the model of ``update``.
-    signatures : dict
-        Signatures of effects outside the model. Missing entries are computed and stored, so that
-        later rounds reuse them.
     progress : callable, optional
         Called with the numbers of finished and of all hypotheses.
     is_over : callable, optional
         Tells whether the time is up. Signatures that are not known by then are left out.
     """
-    whitened, response, marginal, training = marginal_of(update, campaign)
-    residual = training
-    study = campaign.with_terms(apply_effects(corrected, start), update.terms)
-
-    def scene_of(other: Study, field: FieldAt = solver.field) -> Scene:
-        return campaign.scene(other, field, solver.iron_change, update.by_block(prior_mean))
-
-    nominal, nominal_start = scene_of(update.study), scene_of(study, solver.rough_field)
-    known = solver.signatures(study, update, prior_mean, campaign)
-    in_model = {(effect.hypothesis.effect.name, effect.hypothesis.place): effect
-                for effect in identified}
-    kept = marginal.remove(response)
-    uniform = slice(0, update.magnet.dimension * len(update.magnet.blocks))
-    information = response[:, uniform].T @ kept[:, uniform]
-    score = kept[:, uniform].T @ training
-
-    def shortlist(effect: Effect) -> Sequence[Place]:
-        if effect.kind == "instrument":
-            return campaign.places(effect, update.study)
-        return effect.shortlist(update.study, update.prior.mean[uniform], information, score)
-
-    # What all blocks share is known this well only, as the calibration of the coil. A block that is
-    # reversed or elsewhere has it with another sign or direction, which the prior does not know.
-    common = update.study.prior.common_mode_sd
-    shortlisted = [Hypothesis(effect, place) for effect in effects
-                    if campaign.places(effect, study)
-                    for place in dict.fromkeys((
-                        *shortlist(effect),
-                        *(place for name, place in (*signatures, *in_model)
-                          if name == effect.name)))]
-    candidates: list[Candidate] = []
-    columns: list[Floats] = []
-    scored: list[Hypothesis] = []
-    rough: set[int] = set()  # numbers of those whose signature is a rough one
-    uncompared = done = 0
-    improvable: dict[str, list[int]] = {}
-    places = {effect.name: [one.place for one in shortlisted if one.effect is effect]
-              for effect in effects}
-    first = {effect.name: set(effect.representatives(places[effect.name])) for effect in effects}
-
-    def by_response(hypothesis: Hypothesis, scene: Scene) -> Floats:
-        """Return the whitened signature (rows, k), by the response matrix if that is possible."""
-        change = hypothesis.effect.magnetization_change(scene.fields[0], hypothesis.place)
-        if change is None:
-            return whitened(update.observation.read(scene.signature(hypothesis)))
-        size = update.magnet.dimension
-        return np.sum([response[:, size * block:size * (block + 1)] @ vector
-                       for block, vector in change.items()], axis=0)[:, None]
-
-    def exact(hypothesis: Hypothesis) -> Floats:
-        """Compute the whitened signature (rows, k) of a hypothesis outside the model."""
-        key = hypothesis.effect.name, hypothesis.place
-        known[key] = signatures[key] = by_response(hypothesis, nominal_start)
-        return signatures[key]
-
-    def roughly(hypothesis: Hypothesis, over: bool) -> Floats | None:
-        """Return the whitened rough signature (rows, k); None if there is none, or if it is not
-        known and the time is over.
-        """
-        key = f"{hypothesis.effect.name}, roughly", hypothesis.place
-        if key not in signatures and not over:
-            fields = nominal_start.rough_signature(hypothesis)
-            if fields is not None:
-                signatures[key] = whitened(update.observation.read(fields))
-        return signatures.get(key)
-
-    def competitor(
-        hypothesis: Hypothesis, signature: Floats, is_rough: bool = False
-    ) -> tuple[Floats, Candidate]:
-        """Return columns (rows, k) of a hypothesis per prior standard deviation, and the candidate
-        that has them. Rough signatures may have any size.
-        """
-        effect, place = hypothesis.effect, hypothesis.place
-        own = signature * amplitude_scale(effect)[:signature.shape[1]]
-        if (effect.name, place) not in in_model and effect.is_binary and common and not is_rough:
-            own = np.hstack([own, common * own])
-        return own, Candidate(
-            effect.name, place.name, tuple(range(own.shape[1])), not is_rough and (
-                effect.is_binary or (effect.applied_in_full
-                                     and own.shape[1] > len(effect.parameters))),
-            effect.unique, len(places[effect.name]), _parts(effect, own.shape[1]),
-            effect.shared, effect.relative_odds)
-
-    def compare(hypothesis: Hypothesis) -> None:
-        """Compute the signature of a hypothesis, unless it is known or the time is up."""
-        nonlocal residual, uncompared, done
-        progress(done, len(shortlisted))
-        done += 1
-        effect, place = hypothesis.effect, hypothesis.place
-        key = effect.name, place
-        present = in_model.get(key)
-        is_rough = False
-        if present is None:
-            signature = signatures.get(key, known.get(key))
-            if signature is not None:
-                signatures[key] = signature
-            else:
-                over = is_over()
-                signature = roughly(hypothesis, over)
-                if signature is not None:
-                    is_rough = True
-                    rough.add(len(scored))
-                elif over:
-                    uncompared += 1
-                    return
-                else:
-                    signature = exact(hypothesis)
-        elif effect.applied_in_full:
-            others = campaign.with_terms(apply_effects(
-                corrected, [other for other in identified if other is not present]), update.terms)
-            amounts = np.pad(present.values,
-                             (0, len(amplitude_scale(effect)) - len(present.values)))
-            amounts[0] = 1.0
-            signature = (whitened(update.observation.read(_discrete_signature(
-                present.hypothesis, amounts, scene_of(others)))) if effect.refinements
-                else by_response(hypothesis, scene_of(others)))
-            residual = residual + signature @ amounts
-        else:
-            amounts = np.pad(present.values,
-                             (0, len(amplitude_scale(effect)) - len(present.values)))
-            signature = whitened(update.observation.read(nominal.derivative(hypothesis, amounts)))
-            residual = residual + signature @ amounts
-        scored.append(hypothesis)
-        own, candidate = competitor(hypothesis, signature, is_rough)
-        columns.append(own)
-        candidates.append(candidate)
-        if present is None and effect.refinements and not effect.applied_in_full:
-            improvable.setdefault(effect.name, []).append(len(scored) - 1)
-
-    def is_first(hypothesis: Hypothesis) -> bool:
-        """Tell whether a signature is computed whatever those of other places are."""
-        name, place = hypothesis.effect.name, hypothesis.place
-        return place in first[name] or (name, place) in in_model or (name, place) in signatures
-
-    for hypothesis in filter(is_first, shortlisted):
-        compare(hypothesis)
-    fixed = np.hstack([np.zeros((len(residual), 0)), *(
-        part for part, one in zip(columns, scored, strict=True)
-        if (one.effect.name, one.place) in in_model)])
-    noticed = {one.effect.name for part, one in zip(columns, scored, strict=True)
-               if len(first[one.effect.name]) < len(places[one.effect.name])
-               and is_noticeable(part, fixed, marginal, residual)}
-    for hypothesis in shortlisted:
-        if not is_first(hypothesis) and hypothesis.effect.name in noticed:
-            compare(hypothesis)
-    progress(len(shortlisted), len(shortlisted))
-    for numbers in improvable.values():
-        effect = scored[numbers[0]].effect
-
-        def of(place: Place, amounts: Floats, effect: Effect = effect) -> Floats:
-            return whitened(update.observation.read(
-                nominal_start.derivative(Hypothesis(effect, place), amounts)))
-
-        better = _improved_place(effect, [scored[number].place for number in numbers],
-                                 [columns[number] for number in numbers], of, fixed, marginal,
-                                 residual)
-        if better is not None and (effect.name, better) not in signatures:
-            hypothesis = Hypothesis(effect, better)
-            signature = whitened(update.observation.read(nominal_start.signature(hypothesis)))
-            signatures[effect.name, better] = signature
-            scored.append(hypothesis)
-            columns.append(signature * amplitude_scale(effect)[:signature.shape[1]])
-            candidates.append(Candidate(effect.name, better.name, tuple(range(signature.shape[1])),
-                                        effect.is_binary, effect.unique,
-                                        len(places[effect.name]) + 1,
-                                        _parts(effect, signature.shape[1]), effect.shared,
-                                        effect.relative_odds))
-    while True:
-        kept_in = {number for number, hypothesis in enumerate(scored)
-                   if (hypothesis.effect.name, hypothesis.place) in in_model}
-        compared = most_likely(candidates, columns, marginal, residual, kept_in)
-        numbered = tuple(renumbered([candidates[number] for number in compared.numbers]))
-        near = [compared.numbers[k] for k in near_the_likeliest(
-            compared.evidence, numbered, {k for k, number in enumerate(compared.numbers)
-                                          if number in rough})]
-        if not near:
-            break
-        if is_over():  # no time is left to solve for them
-            uncompared += len(near)
-            for number in reversed(near):
-                del scored[number], columns[number], candidates[number]
-            rough = {number - sum(gone < number for gone in near) for number in rough - {*near}}
-            continue
-        for done, number in enumerate(near):
-            progress(done, len(near))
-            rough.discard(number)
-            columns[number], candidates[number] = competitor(
-                scored[number], exact(scored[number]))
-        progress(len(near), len(near))
-    return Search(tuple(scored[number] for number in compared.numbers), numbered,
-                  compared.evidence, compared.columns, compared.absorbed, residual, marginal,
-                  training, campaign, nominal_start, uncompared, frozenset(
-                      k for k, number in enumerate(compared.numbers) if number in rough))
+    comparison = _Comparison(point, effects, progress, is_over)
+    comparison.compare_all()
+    return comparison.search()
 
 
 def _improved_place(
@@ -417,6 +505,9 @@ def _improved_place(
     Place or None
         None if no place explains anything.
     """
+    # Largest number of steps that improve a place, and the length in standard deviations of a step
+    # that ends them.
+    max_place_steps, place_tolerance = 20, 0.1
     size, scale = len(effect.parameters), amplitude_scale(effect)
     # one product with the response for all places, instead of one for each
     shared, own = fixed.shape[1], np.cumsum([0, *(part.shape[1] for part in columns)])
@@ -435,7 +526,7 @@ def _improved_place(
     values[:size] = scale[:size] * fits[best].mean[fixed.shape[1]:]
     longest = np.array([parameter.longest_step for parameter in (
         *effect.parameters, *effect.refinements)])
-    for _ in range(MAX_PLACE_STEPS):
+    for _ in range(max_place_steps):
         slopes = derivative(places[best], values)
         evidence = marginal.evidence(np.hstack([fixed, slopes * scale]),
                                      residual + slopes[:, size:] @ values[size:])
@@ -443,45 +534,51 @@ def _improved_place(
         sd = scale * np.sqrt(np.diag(fit.covariance))[fixed.shape[1]:]
         step = np.clip(scale * fit.mean[fixed.shape[1]:] - values, -longest, longest)
         values = values + step
-        if (np.abs(step[size:]) <= PLACE_TOLERANCE * sd[size:]).all():
+        if (np.abs(step[size:]) <= place_tolerance * sd[size:]).all():
             break
     return effect.refined_place(places[best], values.tolist())
 
 
-def marginal_of(
-    update: InferenceResult, campaign: Campaign
-) -> tuple[Callable[[Floats], Floats], Floats, Marginal, Floats]:
-    """Return the training readings of an inference with blocks and solver error integrated out.
+@dataclass(frozen=True)
+class Training:
+    """The training readings of an inference, with blocks and solver error integrated out.
 
     So are the terms of instruments that the study leaves open.
-
-    Returns
-    -------
-    whitened : callable
-        Takes all readings (..., readings) in T and returns the whitened training readings
-        (rows, ...).
-    response : ndarray, shape (rows, parameters)
-        Whitened response of the training readings to the magnetizations.
-    marginal : Marginal
-    residual : ndarray, shape (rows,)
-        Whitened residual of the training readings from the prior mean.
     """
-    rows = np.flatnonzero(~update.held_out)
-    noise = update.errors.subset(rows)
 
-    def whitened(readings: Floats) -> Floats:
-        return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
+    update: InferenceResult
+    rows: Ints
+    noise: NoiseCovariance
+    response: Floats
+    """Whitened response (rows, parameters) of the readings to the magnetizations."""
+    marginal: Marginal
+    residual: Floats
+    """Whitened residual (rows,) of the readings from the prior mean."""
 
-    response = noise.whiten(update.response.matrix[rows])
-    marginal = Marginal.of(with_fewer_columns(np.hstack([
-        noise.whiten(update.prediction_prior.root(rows)),
-        whitened(_solver_error(update, campaign))])))
-    residual = whitened(update.readings - update.prediction_prior.mean)
-    return whitened, response, marginal, residual
+    @classmethod
+    def of(cls, update: InferenceResult, campaign: Campaign) -> Training:
+        """Integrate out what the effects of a campaign are not to explain."""
+        rows = np.flatnonzero(~update.held_out)
+        noise = update.errors.subset(rows)
+        residual = update.readings - update.prediction_prior.mean
+        marginal = Marginal.of(with_fewer_columns(np.hstack([
+            noise.whiten(update.prediction_prior.root(rows)),
+            _whitened(noise, rows, update.observation.read(_solver_error(update, campaign)))])))
+        return cls(update, rows, noise, noise.whiten(update.response.matrix[rows]), marginal,
+                   _whitened(noise, rows, residual))
+
+    def shown(self, fields: Floats) -> Floats:
+        """Return the whitened readings (rows, k) of changes (k, n, 3) in T of the maps."""
+        return _whitened(self.noise, self.rows, self.update.observation.read(fields))
+
+
+def _whitened(noise: NoiseCovariance, rows: Ints, readings: Floats) -> Floats:
+    """Return some of all readings (..., readings) in T, whitened, as (rows, ...)."""
+    return noise.whiten(np.ascontiguousarray(readings[..., rows].T))
 
 
 def _solver_error(update: InferenceResult, campaign: Campaign) -> Floats:
-    """Return readings (k, n) in T of smooth fields as large as the solver's error.
+    """Return what maps show (k, n, 3) in T of smooth fields as large as the solver's error.
 
     The solver's error is smooth, unlike noise. These fields are integrated out with the blocks, so
     that no effect is identified for a misfit that the solver's error can explain.
@@ -489,7 +586,7 @@ def _solver_error(update: InferenceResult, campaign: Campaign) -> Floats:
     size = float(np.sqrt(np.mean(update.response.error**2)))
     points = campaign.points_of(update.study)
     fields = fields_of_rms(harmonic_fields(points), size) if size else np.zeros((1, *points.shape))
-    return update.observation.read(campaign.seen(update.study, fields))
+    return campaign.seen(update.study, fields)
 
 
 def _discrete_signature(hypothesis: Hypothesis, amounts: Floats, scene: Scene) -> Floats:

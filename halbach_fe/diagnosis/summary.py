@@ -15,8 +15,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
+from halbach_fe.diagnosis.evidence import ResidualGroup
 from halbach_fe.diagnosis.gross_errors import GrossError
-from halbach_fe.diagnosis.loo_residuals import ResidualGroup
 from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.map_pose import FoundPose, with_poses
 from halbach_fe.diagnosis.model_selection import Candidate

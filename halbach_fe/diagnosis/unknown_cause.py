@@ -61,10 +61,6 @@ MANY = 3
 SUSPECTED = 0.5
 """Probability from which an effect that is not certain enough to be named is suspected."""
 
-IMITATED = 0.2
-"""Expected chi-squared per parameter of an update's blocks, beyond that of their error bars, from
-which what they imitate has to be in the model: the mean is to be below 1.2."""
-
 
 @dataclass(frozen=True)
 class Judgement:
@@ -177,7 +173,7 @@ def named_effects(
     best, competition = judgement.best, judgement.competition
     if best == judgement.catalogued:
         return tuple(identified)
-    evidence = competition.given(best.terms)
+    evidence = competition.evidence_beside(best.terms)
     selected = [selected_effect(evidence, search.candidates, best.effects, number,
                                 competition.prior, ()) for number in best.effects]
     found = amplitudes(replace(search, evidence=evidence), selected)
@@ -360,8 +356,11 @@ def imitated(
     An effect J theta that the study lacks changes the posterior mean of the blocks by ``C H' J
     theta``, the chi-squared of which is ``theta' J' H C H' J theta``. What an effect changes of
     the magnetizations themselves is no error of the update, and what is suspected is in the study.
-    Of the rest, weighed with its probability, as much is returned as leaves less than `IMITATED`.
+    Of the rest, weighed with its probability, as much is returned as leaves less than `least_chi2`.
     """
+    # Expected chi-squared per parameter of an update's blocks, beyond that of their error bars,
+    # from which what they imitate has to be in the model: the mean is to be below 1.2.
+    least_chi2 = 0.2
     candidates, best = search.candidates, judgement.best
     if best.terms:
         return None
@@ -379,7 +378,7 @@ def imitated(
             expected[number] = float(further.probabilities[number]) * chi2 / count
     rest, chosen = sum(expected.values()), []
     for number in sorted(expected, key=lambda each: -expected[each]):
-        if rest < IMITATED:
+        if rest < least_chi2:
             break
         chosen.append(number)
         rest -= expected[number]

@@ -55,16 +55,6 @@ FAR = 0.5
 """Limit of the deviation relative to the nominal magnetization: 50 %, or 29 degrees. No intact
 block exceeds it; a larger deviation indicates a wrong unit, wrong axes, or a wrong type."""
 
-ROOM_C, OTHER_TEMPERATURE_K = 20.0, 10.0
-"""Temperature in degrees Celsius at which data sheets state remanences, and the distance in K from
-it at which the moments of NdFeB change by more than 1 %, a usual tolerance."""
-
-NDFEB_PER_K = -0.0012
-"""Temperature coefficient of the remanence of NdFeB, for the size of the error that is told."""
-
-NAMED = 3
-"""Number of blocks far from the others that a sentence names."""
-
 MANY_SD = 5.0
 """Number of the study's standard deviations by which no mean of its own blocks is off by chance."""
 
@@ -247,6 +237,7 @@ def _far_blocks(magnet: Magnet, table: BlockTable, deviations: Floats) -> str:
 
     ``deviations`` (rows, d) are along the nominal magnetization, and angles across it.
     """
+    most_named = 3  # number of blocks far from the others that a sentence names
     if len(deviations) < MIN_SAMPLES:
         return ""
     settings = magnet.study.prior
@@ -266,8 +257,8 @@ def _far_blocks(magnet: Magnet, table: BlockTable, deviations: Floats) -> str:
         side = "stronger" if along > 0 else "weaker"
         return f"{table.serial[row]} is {100 * abs(along):.2g} % {side}"
 
-    named = ", block ".join(map(words, far[:NAMED].tolist()))
-    more = f" and {len(far) - NAMED} more are so far off" if len(far) > NAMED else ""
+    named = ", block ".join(map(words, far[:most_named].tolist()))
+    more = f" and {len(far) - most_named} more are so far off" if len(far) > most_named else ""
     return (f"Relative to the median of all, block {named}{more}: up to {times.max():.0f} times "
             "what is usual here. Are these rows of the table right?")
 
@@ -277,17 +268,22 @@ def _temperature_doubts(magnet: Magnet, table: BlockTable) -> list[str]:
 
     Tables whose temperatures differ from each other are refused elsewhere.
     """
+    # Temperature coefficient of the remanence of NdFeB, for the size of the error that is told.
+    ndfeb_per_k = -0.0012
+    # Temperature in degrees Celsius at which data sheets state remanences, and the distance in K
+    # from it at which the moments of NdFeB change by more than 1 %, a usual tolerance.
+    room_c, other_temperature_k = 20.0, 10.0
     known = table.temperature[~np.isnan(table.temperature)]
     if magnet.study.prior.temperature_coefficient_per_K is not None or not len(known):
         return []
     demagnetization = magnet.study.demagnetization
-    reference = ROOM_C if demagnetization is None else demagnetization.reference_temperature_C
+    reference = room_c if demagnetization is None else demagnetization.reference_temperature_C
     away = float(np.median(known)) - reference
-    if abs(away) <= OTHER_TEMPERATURE_K:
+    if abs(away) <= other_temperature_k:
         return []
     return [f"The blocks were measured at {np.median(known):g} °C, {abs(away):g} K from "
             f"{reference:g} °C, and the study has no temperature coefficient: their moments count "
-            f"as they were read there, for NdFeB some {abs(100 * NDFEB_PER_K * away):.2g} % off. "
+            f"as they were read there, for NdFeB some {abs(100 * ndfeb_per_k * away):.2g} % off. "
             "Add temperature_coefficient_per_K and reference_temperature_C to [prior]."]
 
 

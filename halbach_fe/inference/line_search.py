@@ -26,9 +26,6 @@ least squares would not find the way."""
 STEP = 0.2
 """Distance of the points of the table, and step of the shifts, in units of the bore's radius."""
 
-IMPROVED = 12
-"""Largest number of candidates that are improved."""
-
 POINTS = 40
 """Number of readings that are used."""
 
@@ -76,6 +73,7 @@ def poses_along(
         Prior standard deviation of the line's distance from the axis along x and y.
     pace : Pace
     """
+    most_starts = 12  # largest number of candidates that are improved
     rows = np.flatnonzero(training.any(axis=1))
     rows = rows[np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).astype(int)]
     points, used, seen = points[rows], np.where(training, readings, 0.0)[rows], training[rows]
@@ -99,7 +97,7 @@ def poses_along(
         if not any(np.array_equal(matrix, other) and np.array_equal(place[:2], known[:2])
                    for known, other in chosen):
             chosen.append((place, matrix))
-        if len(chosen) == IMPROVED:
+        if len(chosen) == most_starts:
             break
     found: list[tuple[float, Floats]] = []
     pace.begin("search of the line, candidates improved")

@@ -52,9 +52,8 @@ DEGREES = 28
 """Highest degree of the harmonics: at `WITHIN` the next ones are 3e-4 of what they are on the free
 sphere."""
 
-DIRECTIONS, SHELLS = 60, 8
-"""Degree of the directions in which the free sphere is looked for (6° apart), and number of radii
-that are tried at once."""
+DIRECTIONS = 60
+"""Degree of the directions in which the free sphere is looked for (6° apart)."""
 
 BEYOND = 0.02
 """How far a region may reach beyond the box around the readings, relative to its sides."""
@@ -66,12 +65,6 @@ readings are too far apart for the field between them, or noisier than stated.""
 OPEN = 0.2
 """Deviation of |B| that readings leave open, relative to the one that they show, above which they
 do not carry it: how much of it is left then depends on the prior of the amplitudes."""
-
-WIDE = 0.05
-"""Width of the 95 % range of the rms deviation, relative to it, from which a held-out part does not
-carry it if the whole map does. Of maps of cuboids a 20th of the scan lines had 1 %; a 30th or 40th
-had 8 to 10 %, with estimates up to 5 % too low, and a 60th 38 to 42 %: that is the prior of the
-amplitudes rather than the readings."""
 
 SEEN = 0.1
 """Part of the readings' sensitivity from which the field along a direction is measured: above the
@@ -137,15 +130,20 @@ def map_homogeneity(
 def not_carried(part: Homogeneity, whole: Homogeneity) -> str:
     """Say why the fit of a held-out part does not count beside that of the whole map, or nothing.
 
-    Its range either excludes what the whole map shows, or is `WIDE` where the whole map's is not.
+    Its range either excludes what the whole map shows, or is wide where the whole map's is not.
     """
+    # Width of the 95 % range of the rms deviation, relative to it, from which a held-out part does
+    # not carry it if the whole map does. Of maps of cuboids a 20th of the scan lines had 1 %; a
+    # 30th or 40th had 8 to 10 %, with estimates up to 5 % too low, and a 60th 38 to 42 %: that is
+    # the prior of the amplitudes rather than the readings.
+    wide = 0.05
     (low, _, high), (least, _, most) = part.rms_range_ppm, whole.rms_range_ppm
     has = (f"Its held-out part by itself has {part.rms_ppm:.0f} ppm rms (95 %: {low:.0f} to "
            f"{high:.0f})")
     if not low <= whole.rms_ppm <= high:
         return (f"{has}, which contradicts the {whole.rms_ppm:.0f} ppm of the whole map: its "
                 "readings are too few to tell it, or differ from the others. It is left out.")
-    if high - low > WIDE * part.rms_ppm and most - least <= WIDE * whole.rms_ppm:
+    if high - low > wide * part.rms_ppm and most - least <= wide * whole.rms_ppm:
         return (f"{has}, which its readings are too few to tell, unlike the whole map. It is left "
                 "out.")
     return ""
@@ -329,9 +327,10 @@ def _free_radius(magnet: Magnet, centre: Floats) -> float:
     """Return the radius in m of the sphere about a point that blocks and iron leave free."""
     directions, _ = sphere_points(DIRECTIONS)
     low, high = 0.0, magnet.field_reach
+    tried = 8  # number of radii at once
     while high - low > 1e-3 * high:
         middle = (low + high) / 2
-        shells = np.linspace(low, middle, SHELLS)[1:, None, None] * directions
+        shells = np.linspace(low, middle, tried)[1:, None, None] * directions
         if magnet.contains(centre + shells.reshape(-1, 3)).any():
             high = middle
         else:

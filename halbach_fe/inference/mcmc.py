@@ -45,9 +45,6 @@ from halbach_fe.stats.pcn import (
     sample,
 )
 
-CHUNK = 250
-"""Number of draws of every chain between two stored states."""
-
 LAPLACE_STEPS = (1.0, 1.0, 0.6, 1.0, 1.0, 0.3, 1.0, 1.0, 0.6)
 """Step sizes of the moves that are proposed from Laplace's approximation, in turn. Long steps suit
 the region where the posterior is nearly normal. Short steps lead a chain out of the tails, where
@@ -56,29 +53,8 @@ long ones are never accepted."""
 PRIOR_STEP = 0.1
 """Step size of the moves that are proposed from the prior."""
 
-OVERDISPERSED = 2.0
-"""Spread of the starting points of the chains, in standard deviations of Laplace's approximation.
-R-hat detects chains that have not converged only if the starting points are overdispersed."""
-
-VERIFIED_DRAWS = 3
-"""Number of draws that are compared with GetDP's Newton method."""
-
-PREDICTED_DRAWS = 200
-"""Number of draws for which all readings are predicted."""
-
-LIKELIHOOD_ERROR = 1e-2
-"""Approximate error of the log likelihood that stopping a solve early may cause. If n readings
-deviate by about a standard deviation each, every reading may be wrong by this fraction of its
-standard deviation divided by n."""
-
-SMALLEST_TOLERANCE_T = 1e-9
-"""Smallest tolerance of a solve in T."""
-
 Map = Callable[..., Iterable[Any]]
 """Type of `map`, and of the method ``map`` of a `concurrent.futures.Executor`."""
-
-MIN_DRAWS = 20
-"""Smallest accepted number of draws of each chain."""
 
 
 @dataclass(frozen=True)
@@ -162,16 +138,29 @@ def sample_posterior(
     GetDPError
         If the condensed model does not agree with GetDP.
     """
-    if draws < MIN_DRAWS:
-        raise SamplingError(f"Input draws must be at least {MIN_DRAWS} of each chain; instead "
+    min_draws = 20  # smallest accepted number of draws of each chain
+    smallest_tolerance_t = 1e-9  # smallest tolerance of a solve in T
+    # Approximate error of the log likelihood that stopping a solve early may cause. If n readings
+    # deviate by about a standard deviation each, every reading may be wrong by this fraction of its
+    # standard deviation divided by n.
+    likelihood_error = 1e-2
+    predicted_draws = 200  # number of draws for which all readings are predicted
+    verified_draws = 3  # number of draws that are compared with GetDP's Newton method
+    # Spread of the starting points of the chains, in standard deviations of Laplace's
+    # approximation. R-hat detects chains that have not converged only if the starting points are
+    # overdispersed.
+    overdispersed = 2.0
+    chunk = 250  # number of draws of every chain between two stored states
+    if draws < min_draws:
+        raise SamplingError(f"Input draws must be at least {min_draws} of each chain; instead "
                             f"received {draws}. About 1500 are usual.")
     check_sampling(update.magnet)
     model = nonlinear_model(update.magnet, update.observation, session,
                             np.random.default_rng(seed), update.prior)
     train = ~update.held_out
     errors = update.noise.with_independent_errors(model.error).subset(train)
-    tolerance = max(SMALLEST_TOLERANCE_T,
-                    LIKELIHOOD_ERROR * errors.uniform_error_scale / len(errors))
+    tolerance = max(smallest_tolerance_t,
+                    likelihood_error * errors.uniform_error_scale / len(errors))
     target = Posterior(_Readings(model, tolerance, train), update.readings[train], errors,
                        update.prior)
     reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
@@ -182,12 +171,12 @@ def sample_posterior(
     say(f"mode found; {chains} chains of {draws} draws")
     path = session.folder / "chains.nc"
     runs = [_Run(generator, reference.to_z(
-        OVERDISPERSED * generator.standard_normal(len(reference.centre))))
+        overdispersed * generator.standard_normal(len(reference.centre))))
         for generator in generators]
     key = _key(update, model, chains, seed)
     target.solves += _resume(path, key, runs)
     while len(runs[0].samples) < draws:
-        steps = [(target, moves, min(CHUNK, draws - len(run.samples)), run.generator, run.last,
+        steps = [(target, moves, min(chunk, draws - len(run.samples)), run.generator, run.last,
                   len(run.samples)) for run in runs]
         for run, (chain, generator, solves) in zip(
                 runs, mapped(_advance, *zip(*steps, strict=True)), strict=True):
@@ -198,10 +187,10 @@ def sample_posterior(
     kept = np.array([run.samples[draws // 10:draws] for run in runs])
     diagnostics = _assessed(kept, model.parameters, update.prior.sd > 0, effective)
     flat = kept.reshape(-1, kept.shape[2])
-    chosen = flat[np.linspace(0, len(flat) - 1, PREDICTED_DRAWS).astype(int)]
+    chosen = flat[np.linspace(0, len(flat) - 1, predicted_draws).astype(int)]
     predicted = model(chosen, tolerance)
     spread = (predicted - predicted.mean(axis=0)) / np.sqrt(len(predicted))
-    verified = chosen[np.linspace(0, len(chosen) - 1, VERIFIED_DRAWS).astype(int)]
+    verified = chosen[np.linspace(0, len(chosen) - 1, verified_draws).astype(int)]
     agreement = compare_with_newton(model, update.magnet, update.observation, session, verified)
     return SampledPosterior(
         kept, model.parameters, float(np.mean([run.accepted for run in runs])),

@@ -56,7 +56,6 @@ and those of a validation map."""
 COVERAGE_Z = 1.959964
 """Half width of a central 95 % band in standard deviations."""
 
-
 PREDICTION_COLUMNS = (
     "label", "x_m", "y_m", "z_m", "map", "region", "held_out", "part", "measured_T", "sigma_T",
     "solver_error_T", "prior_mean_T", "prior_sd_T", "posterior_mean_T", "posterior_sd_T",
@@ -64,7 +63,6 @@ PREDICTION_COLUMNS = (
     "field_T", "field_sd_T", "place_x_m", "place_y_m", "place_z_m",
     "along_x", "along_y", "along_z")
 """Columns of prediction.csv, one row per reading. The last eight are those of `SensedField`."""
-
 
 TOO_NEAR = 0.1
 """chi-squared per reading below which the noise or the prior is stated too large, by a factor of
@@ -77,10 +75,6 @@ OWN_NOISE = ("(A column sigma_T of the map counts in place of the study's.) Run 
 TOO_FAR = 1.3
 """chi-squared per held-out reading, with the covariance of the predictions, up to which there is no
 word however many readings there are: error bars are then too small by a seventh."""
-
-FEWEST_LEFT = 20
-"""Readings beyond the parameters learnt from which their noise is judged. chi-squared of 20 is
-below a tenth of its mean with a probability of 1e-9."""
 
 
 @dataclass(frozen=True)
@@ -658,11 +652,14 @@ class InferenceResult(ShownInNotebook):
 
         It is 1 on average if the noise is right, whatever the prior: of n readings an update
         explains as much as belongs to the parameters that it learns. The solver's error does not
-        count as noise here. NaN if fewer than `FEWEST_LEFT` readings are left.
+        count as noise here. NaN if too few readings are left.
         """
+        # Readings beyond the parameters learnt from which their noise is judged. chi-squared of 20
+        # is below a tenth of its mean with a probability of 1e-9.
+        fewest_left = 20
         training = ~self.held_out
         count = float(training.sum()) - self.parameters_learnt
-        if count < FEWEST_LEFT:
+        if count < fewest_left:
             return np.nan
         left = self.noise.subset(training).whiten(
             (self.readings - self.prediction_posterior.mean)[training])

@@ -17,7 +17,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
 from halbach_fe.core.files import write_text
 from halbach_fe.core.hdf5 import ChangedContentError, read_hdf5, with_checksum, write_hdf5
-from halbach_fe.core.tables import csv_text
+from halbach_fe.core.numbers import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Reservation
 from halbach_fe.response.block_variation import distribution_of

@@ -15,8 +15,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import WITH_COMMAS, other_separator
 from halbach_fe.core.numbers import parse_number as number_in
-from halbach_fe.core.tables import WITH_COMMAS, other_separator
 
 
 def csv_table(

@@ -46,7 +46,6 @@ TAKE_LISTED_MAPS = ("infer", "diagnose", "register")
 
 _NAMES: ContextVar[Mapping[str, object] | None] = ContextVar("names", default=None)
 
-
 _INPUTS: ContextVar[Mapping[str, str] | None] = ContextVar("inputs", default=None)
 
 
@@ -242,7 +241,7 @@ WIDEST_IN = 6.9
 being made smaller, so that its texts keep their size on paper, and on a screen of 500 px they are
 `LEGIBLE_PX` high."""
 
-LEGIBLE_PX, POINTS_PER_INCH = 9, 72
+LEGIBLE_PX = 9
 """Size in px at which a text can still be read on a screen."""
 
 
@@ -265,7 +264,7 @@ class Picture(NamedTuple):
     @property
     def legible_px(self) -> int:
         """Width in px of a page below which its smallest texts could not be read."""
-        return round(self._width_px * LEGIBLE_PX / (SMALLEST_PT * DPI / POINTS_PER_INCH))
+        return round(self._width_px * LEGIBLE_PX / (SMALLEST_PT * DPI / 72))  # points of an inch
 
     @property
     def width_in(self) -> float:

@@ -24,9 +24,6 @@ from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import Page, Section, Table, csv_file, page_of, rendered
 from halbach_fe.report.words import counted
 
-TABLES, SHORTEST_TABLE = 3, 8
-"""Number of tables side by side under a drawing, and of rows from which there is another one."""
-
 FLAT = 0.1
 """Part of a magnetization in the plane of a drawing below which it has no arrow."""
 
@@ -279,6 +276,8 @@ def _arrow(
 
 def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[list[dict[str, str]]]:
     """Return the rows of the tables under a drawing, side by side."""
+    # Number of tables side by side under a drawing, and of rows from which there is another one.
+    most_tables, shortest = 3, 8
     several = len(sheet.rings) > 1
     kinds = len({one.kind.number for one in sheet.blocks}) > 1
     rows = []
@@ -295,7 +294,7 @@ def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[list[dict[str, 
             row["kind"] = str(number) if other == number else f"{other}, upside down"
         rows.append(row | {"way round": one.way_round.replace("counter-clockwise", "ccw")
                            .replace("clockwise", "cw").replace("from outwards, ", "")})
-    tables = min(TABLES, -(-len(rows) // SHORTEST_TABLE))
+    tables = min(most_tables, -(-len(rows) // shortest))
     length = -(-len(rows) // tables)
     return [rows[start:start + length] for start in range(0, len(rows), length)]
 
@@ -419,6 +418,7 @@ def write_stl(triangles: Floats, title: str, path: Path) -> None:
     with atomic(path) as temporary, temporary.open("wb") as file:
         file.write(head + np.uint32(len(triangles)).astype("<u4").tobytes())
         file.write(records.tobytes())
+
 
 FRAME = ("x, y, z of the magnet; x is at the large notch of a plate, the pockets are open towards "
          "+z, and angles count counter-clockwise as seen from +z")

@@ -42,9 +42,6 @@ PAST = "#D55E00"
 ROOM_C = 20.0
 """Temperature in °C at which a magnet is kept at least."""
 
-WORST_ROWS = 12
-"""Number of blocks in the page's table."""
-
 
 def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
     """Return the content of demagnetization.json: margins, shares and limit temperatures."""
@@ -180,14 +177,15 @@ _SCALED = ". At other temperatures the field of the iron is scaled with the rema
 
 
 def _worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Return the rows of the `WORST_ROWS` blocks with the smallest margins, as text."""
+    """Return the rows of the few blocks with the smallest margins, as text."""
+    worst_rows = 12  # number of blocks in the page's table
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
              "lowest H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
              "past the knee": f"{100 * row['share_beyond_knee']:.1f} %",
              "H_cJ needed in kA/m": f"{1e-3 * row['needed_coercivity_A_per_m']:.0f}"}
-            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:WORST_ROWS]]
+            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:worst_rows]]
 
 
 def _layers(found: DemagnetizationMap) -> dict[str, Ints]:

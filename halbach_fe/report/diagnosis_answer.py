@@ -132,6 +132,7 @@ def _alternative(text: str) -> str:
     said = f"{acts_on} along {COORDINATES[along]}" if along else "a field"
     return f"{said} in map {where}" if where else said
 
+
 NOT_NAMED = {
     "odds": "Suspected with a probability of {} % (odds {} : 1), which is too little to name it: "
             "{}.",
@@ -173,11 +174,6 @@ def more_readings(suspicion: Suspicion) -> str:
     return (f"Measure the same map {times} times in all to decide on what is suspected: if it is "
             "there, the mean of these maps is enough to name it; if not, the suspicion fades.")
 
-
-UNUSUAL_AMPLITUDE = 10.0
-"""Amplitude in prior standard deviations above which the page warns and does not say "Yes": twice
-the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the errors of a magnet that
-is built with care."""
 
 OTHER_SOURCES = ("background", "ferromagnetic_object")
 """Effects by which a neighbouring magnet's field can be corrected."""
@@ -543,7 +539,11 @@ def _over_prior_sd(identified: IdentifiedEffect) -> float:
 
 def _unusual(diagnosis: Diagnosis) -> list[IdentifiedEffect]:
     """Return the effects that are far larger than their priors expect."""
-    return [each for each in diagnosis.identified if _over_prior_sd(each) > UNUSUAL_AMPLITUDE]
+    # Amplitude in prior standard deviations above which the page warns and does not say "Yes":
+    # twice the standard deviation of the wide prior (`WIDE_PRIOR_SD`), far beyond the errors of a
+    # magnet that is built with care.
+    unusual_amplitude = 10.0
+    return [each for each in diagnosis.identified if _over_prior_sd(each) > unusual_amplitude]
 
 
 def _effect_in_words(identified: IdentifiedEffect, titles: dict[str, str]) -> str:

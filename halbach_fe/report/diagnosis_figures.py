@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.diagnosis.loo_residuals import ResidualGroup
+from halbach_fe.diagnosis.evidence import ResidualGroup
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.summary import label_in_words, place_in_words, rivals
@@ -37,9 +37,6 @@ from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings, res
 
 NONE, UNKNOWN, OUTSIDE = "none", "unknown", "outside the catalogue"
 """Names of the probabilities that nothing is missing, and an unlisted cause, and that in words."""
-
-BAR_IN, LINE_IN = 0.3, 0.14
-"""Height in inches of a bar, and of every further line of its name."""
 
 MAX_BARS = 8
 """Largest number of bars of a chart, and of rows of residuals."""
@@ -221,6 +218,7 @@ def _colours(limit: float) -> ScalarMappable:
 
 def probabilities(diagnosis: Diagnosis) -> Figure:
     """Draw the probabilities of effects, and Bayes factors of identified effects and rivals."""
+    bar_in, line_in = 0.3, 0.14  # height in inches of a bar, and of every further line of its name
     longest_name = 38  # number of characters in a line of an effect's name beside its bar
     top = sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])[:MAX_BARS]
     titles = catalogue_titles(diagnosis)
@@ -241,7 +239,7 @@ def probabilities(diagnosis: Diagnosis) -> Figure:
         bars.append((OUTSIDE, diagnosis.unknown.log_bayes_factor, SECOND))
     bars = bars[:2 * MAX_BARS]
     names = [in_words(name) for name, _ in top]
-    heights = [0.7 + (BAR_IN + LINE_IN * max(name.count("\n") for name in own)) * len(own)
+    heights = [0.7 + (bar_in + line_in * max(name.count("\n") for name in own)) * len(own)
                for own in (names, [name for name, *_ in bars]) if own]
     figure = figure_of(sum(heights) + 0.2)
     left, *others = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]

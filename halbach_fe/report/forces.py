@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.design.forces import STANDARD_GRAVITY, Forces, Loads
+from halbach_fe.design.forces import Forces, Loads
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -134,7 +134,7 @@ def _newton(size: float) -> str:
 
 def _heavy(size: float) -> str:
     """Return the mass whose weight a force in N is."""
-    mass = size / STANDARD_GRAVITY
+    mass = size / 9.80665  # standard gravity in m/s^2
     value, unit = (mass, "kg") if mass >= 1 else (1e3 * mass, "g")
     return f"{value:.0f} {unit}" if value >= 10 else f"{value:.2g} {unit}"
 

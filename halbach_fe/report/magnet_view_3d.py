@@ -27,9 +27,6 @@ from halbach_fe.study.types import COMPONENTS
 UNSIGNED = "Cividis"
 """Colour scale of unsigned numbers, readable with any colour vision."""
 
-CUT = (19, 27)
-"""Numbers of points of the plane in which |B| is shown."""
-
 AROUND = 1.5
 """How far that plane reaches around a magnet without a bore, relative to its outer radius."""
 
@@ -61,14 +58,15 @@ def cut_trace(magnet: Magnet) -> go.Surface | None:
     Without a bore it is the plane through and around the magnet. It is None if nothing of the plane
     is in air, or of more than `MOST_SUMMED` blocks.
     """
+    cut = (19, 27)  # numbers of points of the plane in which |B| is shown
     # Part of the plane that the colours span: beside the blocks |B| is many times larger.
     near_blocks = 0.9
     if len(magnet.blocks) > MOST_SUMMED:
         return None
     reach = 0.9 * magnet.bore_radius if magnet.has_bore else AROUND * magnet.radius
-    first = np.linspace(-reach, reach, CUT[0])
+    first = np.linspace(-reach, reach, cut[0])
     far = reach if magnet.dimension == 2 else magnet.half_length + reach
-    a, b = np.meshgrid(first, np.linspace(-far, far, CUT[1]))
+    a, b = np.meshgrid(first, np.linspace(-far, far, cut[1]))
     x, y, z = (a, b, 0 * a) if magnet.dimension == 2 else (a, 0 * a, b)
     points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
     size = 1e3 * np.linalg.norm(field_of(magnet.blocks, points), axis=1)
@@ -120,9 +118,6 @@ LARGE = 4.0
 
 CAMERA_2D, CAMERA_3D = {"x": 0.3, "y": 0.3, "z": 2.5}, {"x": 1.4, "y": 1.0, "z": 1.2}
 
-DIAGONAL_2D, DIAGONAL_3D = 2.4, 1.5
-"""Diagonals of the drawn box, in plotly's own length, that these cameras see as a whole."""
-
 SCRIPT = """
 var view = document.getElementById('{plot_id}');
 var owners = view.data[0].customdata, texts = view.data[0].meta;
@@ -138,9 +133,6 @@ once, and takes the camera back where what the colour scales leave of the view i
 more than in proportion, as numbers beside the axes have the same size on any screen)."""
 
 MM = 1e3
-
-BELOW = -0.1
-"""Height at which the camera looks, in plotly's own length: axes have their names at the bottom."""
 
 IDENTITY = "magnet-view"
 """HTML id of the view."""
@@ -323,6 +315,8 @@ def magnet_view(
     plane with |B| are hidden until their names are clicked. ``named`` are ring and slot of blocks
     that were found.
     """
+    # Height at which the camera looks, in plotly's own length: axes have their names at the bottom.
+    below = -0.1
     blocks, values = _merge_rings(magnet, values)
     bodies = [prism(block, _prism_height(magnet)) for block in blocks]
     figure = go.Figure([_blocks_trace(magnet, blocks, values, bodies),
@@ -351,7 +345,7 @@ def magnet_view(
                **{f"{axis}axis": {"title": {"text": f"{axis} in mm"}, "nticks": 6}
                   for axis in "xyz"},
                **({"zaxis": {"visible": False}} if magnet.dimension == 2 else {}),
-               "camera": {"eye": camera, "center": {"x": 0, "y": BELOW, "z": 0},
+               "camera": {"eye": camera, "center": {"x": 0, "y": below, "z": 0},
                           "up": {"x": 0, "y": 1, "z": 0}}})
     return Markup(plotly.io.to_html(
         figure, full_html=False, include_plotlyjs=True, div_id=IDENTITY, post_script=SCRIPT,
@@ -387,12 +381,14 @@ def _camera(figure: go.Figure, dimension: int) -> dict[str, float]:
     plotly divides lengths by the geometric mean of the three sides of the drawn box, so that long
     and flat magnets need a camera farther off.
     """
+    # Diagonals of the drawn box, in plotly's own length, that these cameras see as a whole.
+    diagonal_2d, diagonal_3d = 2.4, 1.5
     drawn = [np.array([np.ravel(trace[axis]) for axis in "xyz"], float) for trace in figure.data
              if trace.x is not None and len(trace.x)]
     sides = np.nanmax(np.hstack(drawn), axis=1) - np.nanmin(np.hstack(drawn), axis=1)
     sides = np.maximum(sides, 1e-3 * sides.max())
     diagonal = float(np.linalg.norm(sides / np.cbrt(sides.prod())))
-    place, whole = ((CAMERA_2D, DIAGONAL_2D) if dimension == 2 else (CAMERA_3D, DIAGONAL_3D))
+    place, whole = ((CAMERA_2D, diagonal_2d) if dimension == 2 else (CAMERA_3D, diagonal_3d))
     return {axis: max(1.0, diagonal / whole) * value for axis, value in place.items()}
 
 

@@ -29,9 +29,9 @@ from scipy.spatial import ConvexHull
 from tomlkit.items import Array, Trivia, Whitespace
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
-from halbach_fe.core.versions import version
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.measurement.tables import write_csv

@@ -119,10 +119,6 @@ def _axes(nominal: Floats) -> Floats:
     return np.stack([along, across, np.cross(along, across)], axis=1)
 
 
-MOSTLY = 0.5 ** 0.5
-"""Part of a standard deviation from which a contribution makes more than half of the variance."""
-
-
 def _common_sd(prior: MeasuredPrior) -> float:
     """Return the sd of the mean strength of all blocks, relative to it."""
     weights = prior.nominal / np.sum(prior.nominal**2)
@@ -131,6 +127,8 @@ def _common_sd(prior: MeasuredPrior) -> float:
 
 def answer(prior: MeasuredPrior) -> Answer:
     """Say how the measured blocks deviate from the study, and what to do next."""
+    # Part of a standard deviation from which a contribution makes more than half of the variance.
+    mostly = 0.5 ** 0.5
     size = np.sqrt(np.mean(prior.nominal**2))
     spread = float(np.sqrt(np.mean(prior.gaussian.sd**2))) / size
     shift = float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))) / size
@@ -142,7 +140,7 @@ def answer(prior: MeasuredPrior) -> Answer:
             "In length and direction together they deviate from it by "
             f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
             + (", most of which is the calibration of the coil, which all blocks share"
-               if common > MOSTLY * spread else "") + ". " + (
+               if common > mostly * spread else "") + ". " + (
                 "The place of every block is known: each has its own measurement."
                 if prior.placed else "Which block is in which place is not known: all blocks of a "
                 "type have its mean and spread."))

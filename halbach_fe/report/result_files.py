@@ -40,8 +40,6 @@ QUESTIONS = (assembly, campaign, demagnetization, diagnosis, forces, homogeneity
              verification)
 """Modules that register the page of their result, see `page_of`."""
 
-DOTS_PER_INCH = 100
-
 
 @typed
 def write_report(result: object, folder: str | Path) -> Path:
@@ -113,7 +111,7 @@ def words(answer: Answer) -> str:
 def picture(figure: Figure, text: str) -> str:
     """Return a figure as an HTML image element with an alternative text."""
     raw = io.BytesIO()
-    figure.savefig(raw, format="png", dpi=DOTS_PER_INCH)
+    figure.savefig(raw, format="png", dpi=100)
     data = base64.b64encode(raw.getvalue()).decode("ascii")
     return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
 

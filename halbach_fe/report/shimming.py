@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
@@ -41,7 +42,6 @@ from halbach_fe.report.page import (
     page_of,
 )
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
-from halbach_fe.response.deviations import DeviationModel
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")
@@ -51,9 +51,6 @@ LITTLE = 0.05
 
 MOST = 0.9
 """Part of the gain of all moves that the first of them make, which the answer names."""
-
-LIKELY = 0.5
-"""Probability below which the answer says that moves do not reach the limit."""
 
 STUDY_FILE = "study.shimmed.toml"
 
@@ -214,6 +211,7 @@ def _place_text(shim: Shim, number: int) -> str:
 
 def answer(shim: Shim) -> Answer:
     """Say which moves are worthwhile and what they gain, and what to do next."""
+    likely = 0.5  # probability below which the answer says that moves do not reach the limit
     question = "Which blocks should be exchanged, turned or replaced?"
     aim = aim_of(shim.model)
     before, after = (aim.size(known.rms) for known in (shim.before, shim.after))
@@ -242,7 +240,7 @@ def answer(shim: Shim) -> Answer:
         limit = f"{shim.limit:g}" if shim.fields is None else ppm(shim.limit)
         said += f" {within.format(limit)} with a probability of {first}"
         said += f" before and {last} after." if shim.steps else "."
-        if shim.steps and shim.within[1] < LIKELY:
+        if shim.steps and shim.within[1] < likely:
             said += " These moves do not reach that limit."
     ended = f"The search ended because {STOPS[shim.stop]}."
     if shim.result.disagreement:

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.sorting import SortedBlocks, types_in_words
 from halbach_fe.measurement.block_table import write_blocks
@@ -36,12 +37,8 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.shimming import aim_of, values_summary, values_table
 from halbach_fe.report.words import counted, in_a_row, ppm
-from halbach_fe.response.deviations import DeviationModel
 
 T = TypeVar("T")
-
-SLOTS_A_ROW = 8
-"""Largest number of slots in a row of the table of places."""
 
 LITTLE = 0.05
 """Part of the rms below which the gain of sorting is called hardly worth the work."""
@@ -90,13 +87,14 @@ def _turn_table(found: SortedBlocks) -> list[dict[str, str]]:
 
 
 def place_table(found: SortedBlocks) -> list[dict[str, str]]:
-    """Return the rows of the table of places, each of up to `SLOTS_A_ROW` slots of a ring."""
+    """Return the rows of the table of places, each of a few slots of a ring."""
+    slots_a_row = 8  # largest number of slots in a row of the table of places
     table, rows = found.table, []
     for ring in np.unique(table.ring).tolist():
         mine = np.flatnonzero(table.ring == ring)
         mine = mine[np.argsort(table.slot[mine], kind="stable")]
-        for first in range(0, len(mine), SLOTS_A_ROW):
-            some = mine[first:first + SLOTS_A_ROW]
+        for first in range(0, len(mine), slots_a_row):
+            some = mine[first:first + slots_a_row]
             rows.append({"ring": str(ring), "slots": f"{table.slot[some[0]]} to "
                          f"{table.slot[some[-1]]}" if len(some) > 1 else str(table.slot[some[0]]),
                          "blocks, slot by slot": ", ".join(table.serial[row] for row in some)})

@@ -25,10 +25,6 @@ from halbach_fe.response.stray_field import NEAREST, StrayField
 
 STRAY_FIGURE = "stray_field.png"
 
-OTHERS_T = (1e-4, 2e-4, 1e-3, 5e-3, 2e-2)
-"""Flux densities of the thinner lines of the figure."""
-
-
 AROUND = 1.15
 """Half width of the figure's planes, relative to the largest distance of the line."""
 
@@ -100,6 +96,7 @@ def stray_pictures(stray: StrayField | None) -> Figures:
 
 def stray_figure(stray: StrayField) -> Figure:
     """Draw lines of equal |B| around the magnet in three planes, in mm and mT."""
+    others_t = (1e-4, 2e-4, 1e-3, 5e-3, 2e-2)  # flux densities of the thinner lines of the figure
     figure = figure_of(6.6)
     axes = figure.subplots(2, 2).ravel()
     radius, half = 1e3 * stray.radius_m, 1e3 * stray.half_length_m
@@ -109,7 +106,7 @@ def stray_figure(stray: StrayField) -> Figure:
     for axis, plane in zip(axes[:-1], stray.planes, strict=True):
         names = [name for name in "xyz" if name != plane.across]
         first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
-        size = np.log(np.maximum(plane.size_T, min(*OTHERS_T, stray.limit_T) / 10))  # may be 0
+        size = np.log(np.maximum(plane.size_T, min(*others_t, stray.limit_T) / 10))  # may be 0
         if plane.across == "z":
             axis.add_patch(Circle((0, 0), radius, color="#cccccc", lw=0))
             limits: list[Patch] = [Circle(
@@ -125,7 +122,7 @@ def stray_figure(stray: StrayField) -> Figure:
         for patch in limits:
             axis.add_patch(patch)
         low, high = float(plane.size_T.min()), float(plane.size_T.max())
-        thin = [value for value in OTHERS_T if low < value < high and value != stray.limit_T]
+        thin = [value for value in others_t if low < value < high and value != stray.limit_T]
         if thin:
             lines = axis.contour(first, second, size, np.log(thin), colors="#777777",
                                  linewidths=0.6, linestyles="solid")

@@ -13,13 +13,8 @@ from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import Study, iron_of
 
-SMALL_T, LARGE_T = 1e-3, 1.0
-"""Flux density below which texts and tables give it in µT, and from which they give it in T. A
-residual of 120 µT stands beside one of 5 µT without a change of unit."""
-
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
-
 
 MOST_PLACES = 4
 """Largest number of blocks that a line names."""
@@ -43,10 +38,13 @@ def flux_density(value: float, digits: int = 3, zeros: bool = False) -> str:
 
     With ``zeros`` the last digits are there if they are 0 too, as beside numbers that have them.
     """
+    # Flux density below which texts and tables give it in µT, and from which they give it in T. A
+    # residual of 120 µT stands beside one of 5 µT without a change of unit.
+    small_t, large_t = 1e-3, 1.0
     if np.isnan(value):
         return EMPTY_CELL
-    size, unit = ((value, "T") if abs(value) >= LARGE_T else (1e3 * value, "mT")
-                  if abs(value) >= SMALL_T or not value else (1e6 * value, "µT"))
+    size, unit = ((value, "T") if abs(value) >= large_t else (1e3 * value, "mT")
+                  if abs(value) >= small_t or not value else (1e6 * value, "µT"))
     text = decimals(size, digits)
     if zeros and text != "0":
         text = f"{size:#.{digits}g}".rstrip(".") if abs(size) < 10**digits else text

@@ -451,9 +451,12 @@ def _aliases(
     the difference of the sums over the circle's own angles and over a multiple of them.
     """
     magnet, points = deviations.magnet, observation.map_points
-    here = points[np.isclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=SAME_RADIUS)
+    # relative difference of radii up to which points are on one circle, and angle in rad up to
+    # which points on it are one
+    same_radius, same_angle = 2e-6, 1e-6
+    here = points[np.isclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=same_radius)
                   & np.isclose(points[:, 2], z, atol=SAME_HEIGHT_M)]
-    own = len(np.unique(np.round(np.arctan2(here[:, 1], here[:, 0]) / SAME_ANGLE)))
+    own = len(np.unique(np.round(np.arctan2(here[:, 1], here[:, 0]) / same_angle)))
     # orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
     # first; where circles are near the blocks or outside of the bore, the second is their decay
     alias_left, slowest_decay = 1e-6, 0.95
@@ -634,9 +637,8 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
                        positions[:2 * highest])
 
 
-SAME_RADIUS, SAME_HEIGHT_M, SAME_ANGLE = 2e-6, 1e-6, 1e-6
-"""Relative difference of radii, and difference of z in m, up to which points are on one circle, and
-angle in rad up to which points on it are one."""
+SAME_HEIGHT_M = 1e-6
+"""Difference of z in m up to which points are on one circle."""
 
 
 def text_table(**columns: Multipoles) -> list[dict[str, str]]:

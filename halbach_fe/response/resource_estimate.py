@@ -105,9 +105,8 @@ STEPPED = CostLaw(10_700, 0, 8e-5, 0)
 """Law for multigrid in Newton's steps. Together with the bytes for the Jacobian it fits the memory
 of runs with 61 000 and 203 000 unknowns within 1 %."""
 
-PYTHON_BYTES, ELEMENT_BYTES = 0.27 * GIB, 2000
-"""Memory in bytes of this program with its libraries, and per element for the mesh and the unknowns
-that it reads. The latter was 1000 to 2100 for meshes of 10 000 to 208 000 elements."""
+PYTHON_BYTES = 0.27 * GIB
+"""Memory in bytes of this program with its libraries."""
 
 MESH_BYTES = {"cross_section": 104, "meridian": 70, "extruded": 104}
 """Bytes per element of a mesh file, by the kind of mesh."""
@@ -374,7 +373,10 @@ def _estimate(
     # memory in bytes and time in s per reading for labels, tables and figures, measured with a
     # million readings
     reading_bytes, reading_seconds = 1200, 6e-5
-    own = (PYTHON_BYTES + ELEMENT_BYTES * elements + max(building, updating)
+    # memory in bytes per element for the mesh and the unknowns that are read: it was 1000 to 2100
+    # for meshes of 10 000 to 208 000 elements
+    element_bytes = 2000
+    own = (PYTHON_BYTES + element_bytes * elements + max(building, updating)
            + (reading_bytes * readings if parameters else 0)
            + (8 * matrix if 8 * matrix <= LOADED_BYTES else 8 * NUMBERS_AT_ONCE)) / GIB
     side_by_side = 0.0

@@ -46,15 +46,9 @@ REMANENCE_VECTOR = ("remanence_x_T", "remanence_y_T", "remanence_z_T")
 """Components of the remanence along x, y and z of the magnet."""
 
 MAX_BLOCKS = 1_000_000
-MAX_PLACES, MAX_PLACES_PER_BLOCK = 1_000_000, 100
-"""Largest number of rings times slots, and the same per block of a large table: results by ring and
-slot are stored for all places."""
 
 MAX_CORNERS = 100
 MAX_PATH = 4000
-
-HALF_TURN_DEG = 0.99 * 180.0
-"""Arcs of this angle or more are cut in two, so that their sector has more than four edges."""
 
 LEVEL_M = 1e-6
 """Blocks whose heights differ by less than this, in m, form a ring."""
@@ -155,6 +149,9 @@ class FreeBlocks(StudyModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> FreeBlocks:
+        # Largest number of rings times slots, and the same per block of a large table: results by
+        # ring and slot are stored for all places.
+        max_places, max_places_per_block = 1_000_000, 100
         if self.file is not None:
             raise ValueError("the file has not been read; use read_study, which reads it")
         if not len(self):
@@ -173,7 +170,7 @@ class FreeBlocks(StudyModel):
         _check_unique(self.name, "name")
         _check_unique(list(zip(self.ring, self.slot, strict=True)), "ring and slot")
         if self.ring and (places := max(self.ring) * max(self.slot)) > max(
-                MAX_PLACES, MAX_PLACES_PER_BLOCK * len(self)):
+                max_places, max_places_per_block * len(self)):
             raise ValueError(f"the numbers of ring and slot make {places} places, of which most "
                              "would be empty; count from 1")
         self._check_sizes()
@@ -187,6 +184,8 @@ class FreeBlocks(StudyModel):
         return given if isinstance(given, cls) else handler(given)
 
     def _check_sizes(self) -> None:
+        # Arcs of this angle or more are cut in two, so that their sector has more than four edges.
+        half_turn_deg = 0.99 * 180.0
         shapes = np.array(self.shape)
         for column in dict.fromkeys(column for sizes in SIZES.values() for column in sizes):
             given = self.given(column)
@@ -213,7 +212,7 @@ class FreeBlocks(StudyModel):
                          f"{MAX_LENGTH_M:g} m wide; is it in mm? Then write 0.01 for 10 mm")
         has_four = (np.isin(shapes, ("cuboid", "trapezoid")) | (corners == 4)
                     | (self.numbers("sides", 0) == 4)
-                    | (self.numbers("angle_deg", 360.0) < HALF_TURN_DEG))
+                    | (self.numbers("angle_deg", 360.0) < half_turn_deg))
         for column in ("magnetization_gradient", "inner_corner_loss"):
             self._refuse((self.numbers(column, 0.0) != 0) & ~has_four, "which has not four edges, "
                          f"has no {column}; leave the cell empty")

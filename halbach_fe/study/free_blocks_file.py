@@ -22,8 +22,7 @@ from halbach_fe.core import untrusted
 from halbach_fe.core.errors import OutputError, StudyError, must_be
 from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
 from halbach_fe.core.hdf5 import write_hdf5
-from halbach_fe.core.numbers import MAX_CELL, parse_number
-from halbach_fe.core.tables import WITH_COMMAS, csv_text, other_separator
+from halbach_fe.core.numbers import MAX_CELL, WITH_COMMAS, csv_text, other_separator, parse_number
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import COLUMNS, MAX_BLOCKS, FreeBlocks, RowError
 

@@ -46,10 +46,6 @@ ENERGY_TOLERANCE = 0.05
 at the middle of B_r. Sheets round B_r to 0.01 T, at most 1 % of its square, and (BH)_max to 1 MGOe,
 at most 4 % of a SmCo5 of 13 MGOe."""
 
-SUGGESTIONS, SIMILARITY = 3, 0.6
-"""Largest number of names that an unknown name is compared with, and their least similarity (that
-of `difflib`)."""
-
 
 @dataclass(frozen=True)
 class Grade:
@@ -152,11 +148,14 @@ def grade(name: str) -> Grade:
     >>> grade("n42 sh").name
     'N42SH'
     """
+    # Largest number of names that an unknown name is compared with, and their least similarity
+    # (that of `difflib`).
+    suggestions, similarity = 3, 0.6
     names = _by_key()
     key = _key(name)
     if key in names:
         return names[key]
-    near = difflib.get_close_matches(key, names, SUGGESTIONS, SIMILARITY)
+    near = difflib.get_close_matches(key, names, suggestions, similarity)
     similar = list(dict.fromkeys(names[match].name for match in near))
     hint = f"similar are {', '.join(similar)}" if similar else f"there are {', '.join(grades())}"
     raise ValueError(f"no magnet grade is called '{name}'; {hint}")

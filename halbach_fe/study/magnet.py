@@ -22,10 +22,6 @@ from halbach_fe.study.types import (
     Temperature,
 )
 
-FERRITE_PER_K = -1.5e-3
-"""Temperature coefficient of the remanence above which a magnet is no ferrite, which has -0.002/K;
-that of NdFeB is -0.0012/K, of SmCo -0.0004/K and of AlNiCo -0.0002/K."""
-
 MOST_SQUARE = 0.99
 """Largest squareness for which irreversible losses are computed."""
 
@@ -106,11 +102,14 @@ class Demagnetization(StudyModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Demagnetization:
+        # Temperature coefficient of the remanence above which a magnet is no ferrite, which has
+        # -0.002/K; that of NdFeB is -0.0012/K, of SmCo -0.0004/K and of AlNiCo -0.0002/K.
+        ferrite_per_k = -1.5e-3
         if self.irreversible and self.squareness > MOST_SQUARE:
             raise ValueError(f"squareness must be at most {MOST_SQUARE} for irreversible losses, "
                              f"not {self.squareness}; the polarization would jump at the knee")
         if self.coercivity_coefficient_per_K > RISING_PER_K and (
-                self.remanence_coefficient_per_K > FERRITE_PER_K):
+                self.remanence_coefficient_per_K > ferrite_per_k):
             raise ValueError(
                 f"coercivity_coefficient_per_K ({self.coercivity_coefficient_per_K}) lets the "
                 "coercivity rise with the temperature, as that of ferrite alone does, but "

@@ -23,10 +23,6 @@ from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.iron import Iron, IronCurve, TableCurve
 from halbach_fe.study.model import Study, iron_of
 
-LARGE_TURN_RAD, OFF_STEP = 0.3, 0.05
-"""Angle above which no mapper is turned by mistake, and the distance, in steps of 15 degrees, from
-the next one beyond which it is not turned on purpose."""
-
 
 @typed
 def read_study(path: str | Path) -> Study:
@@ -106,13 +102,16 @@ def _syntax_hint(text: str, error: str) -> str:
 
 def _doubted_units(study: Study) -> list[str]:
     """Return sentences about numbers that are possible, but rather in another unit."""
+    # Angle above which no mapper is turned by mistake, and the distance, in steps of 15 degrees,
+    # from the next one beyond which it is not turned on purpose.
+    large_turn_rad, off_step = 0.3, 0.05
     large_block_m = 1.0  # size of no block of a magnet: it would weigh some tons
     found = []
     for instrument in (study.instrument, *(one.instrument for one in study.maps)):
         for turn in instrument.rotation_rad if instrument else ():
             steps = turn / (np.pi / 12)  # on purpose mappers are turned by some 15 degrees
             by_hand = round(turn, 2) == turn  # what halbach-fe register finds has more digits
-            if by_hand and abs(turn) > LARGE_TURN_RAD and abs(steps - round(steps)) > OFF_STEP:
+            if by_hand and abs(turn) > large_turn_rad and abs(steps - round(steps)) > off_step:
                 found.append(f"`instrument.rotation_rad` turns the map by {np.degrees(turn):.0f}°. "
                              f"Were degrees meant? Then write {np.radians(turn):.3g} for "
                              f"{turn:.4g}.")

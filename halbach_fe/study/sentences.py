@@ -60,7 +60,6 @@ EXPECTED = {
 }
 """What is expected, by the kind of error; the models raise no others."""
 
-
 UNITS = ("m", "T", "deg", "rad", "C", "K")
 """Units at the end of names."""
 
@@ -71,8 +70,9 @@ def did_you_mean(near: str, given: str) -> str:
     other = unit in UNITS and stem == given.rpartition("_")[0]
     return f"Did you mean `{near}`?" + (f" Then convert its values to {unit}." if other else "")
 
-KILOOERSTED, MOST_KILOOERSTED = 1e6 / (4 * math.pi), 45.0
-"""In A/m, and the largest intrinsic coercivity of magnets: a larger number is in kA/m."""
+
+KILOOERSTED = 1e6 / (4 * math.pi)
+"""In A/m."""
 
 WRONG_UNITS = (
     *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
@@ -90,7 +90,7 @@ WRONG_UNITS = (
 DEVIATIONS_FROM_1 = ("instrument.gain", "instrument.z_scale", "instrument.radius_scale")
 """Ends of the keys of factors of which the study states the deviation from 1."""
 
-ZERO_C_IN_K = 273.15
+ABSOLUTE_ZERO_C = -273.15
 
 
 def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
@@ -101,6 +101,8 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     """
     # Largest temperature coefficient of any material: what is larger is in per cent.
     most_per_k = 0.02
+    # Largest intrinsic coercivity of magnets in kOe: a larger number is in kA/m.
+    most_kilooersted = 45.0
     max_wrong_unit = 1e12  # values from this size on are not explained by a wrong unit
     key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
     if not abs(value) < max_wrong_unit:  # an integer may be beyond floats
@@ -111,9 +113,9 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     for suffix, unit, factor in WRONG_UNITS:
         if suffix == "coefficient_per_K" and (abs(factor) < 1) != (abs(value) > most_per_k):
             continue
-        if factor == KILOOERSTED and value > MOST_KILOOERSTED:
+        if factor == KILOOERSTED and value > most_kilooersted:
             continue
-        given = value * factor - (ZERO_C_IN_K if unit == "kelvin" else 0.0)
+        given = value * factor + (ABSOLUTE_ZERO_C if unit == "kelvin" else 0.0)
         if factor < 0 and value < 0:  # no sign was lost
             continue
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (

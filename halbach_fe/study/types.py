@@ -62,7 +62,7 @@ FluxDensityOffset = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)
 FluxDensityVector = tuple[FluxDensityOffset, FluxDensityOffset, FluxDensityOffset]
 GridCount = Annotated[int, Field(ge=1, le=10_000)]
 PositionSd = Annotated[float, Field(ge=0.0, le=0.01, allow_inf_nan=False)]
-Temperature = Annotated[float, Field(ge=-273.15, le=500.0, allow_inf_nan=False)]
+Temperature = Annotated[float, Field(ge=sentences.ABSOLUTE_ZERO_C, le=500.0, allow_inf_nan=False)]
 ReferenceTemperature = Annotated[float, Field(ge=-200.0, le=200.0, allow_inf_nan=False)]
 """Temperature in degrees Celsius at which a material was measured; room temperature in kelvin is
 beyond the limit."""

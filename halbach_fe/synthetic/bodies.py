@@ -111,10 +111,6 @@ def _free_shape(given: Any, kind: str, length: float) -> tuple[Shape, complex]:
     return PolygonBody(tuple((corners - middle).tolist()), length), middle
 
 
-CORNER_SHARE = 1 / 6
-"""Extent of a corner at the bore relative to a block's width and thickness."""
-
-
 def mounted(bodies: tuple[Body, ...], exceptions: Sequence[BlockException]) -> tuple[Body, ...]:
     """Return nominal bodies with the deviations that exceptions describe.
 
@@ -148,17 +144,18 @@ def uneven_parts(
     StudyError
         If the shape has not four edges.
     """
+    corner_share = 1 / 6  # extent of a corner at the bore relative to a block's width and thickness
     if not (gradient or corner_loss):
         return ()
     if not shape.has_four_edges:
         raise StudyError(must_be(f"magnetization_gradient and inner_corner_loss of block {name}",
                                  "study", "those of a shape of four edges", "another shape",
                                  "Leave the keys out there."))
-    side = 2 * CORNER_SHARE
+    side = 2 * corner_share
     halves = (BodyPart((0.0, 0.5), (-1.0, 1.0), 1 - gradient / 2),
               BodyPart((0.5, 1.0), (-1.0, 1.0), 1 + gradient / 2))
-    corners = (BodyPart((0.0, CORNER_SHARE), (-1.0, side - 1.0), 1 - corner_loss),
-               BodyPart((0.0, CORNER_SHARE), (1.0 - side, 1.0), 1 - corner_loss))
+    corners = (BodyPart((0.0, corner_share), (-1.0, side - 1.0), 1 - corner_loss),
+               BodyPart((0.0, corner_share), (1.0 - side, 1.0), 1 - corner_loss))
     return (halves if gradient else ()) + (corners if corner_loss else ())
 
 

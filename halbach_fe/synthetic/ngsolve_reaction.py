@@ -30,12 +30,6 @@ from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape
 from halbach_fe.synthetic.true_magnet import Body, TrueMagnet
 
-RESIDUAL = 1e-11
-"""Residual, relative to the first, at which Newton's method stops.
-
-Rounding errors limit it to some 1e-14, one or two steps further on.
-"""
-
 MAX_STEPS = 40
 """Largest number of steps of Newton's method."""
 
@@ -382,8 +376,11 @@ def newton(form: Any, solution: Any, iterate: bool = False) -> list[float]:
     Raises
     ------
     CheckFailedError
-        If the residual has not fallen to `RESIDUAL` of the first after `MAX_STEPS` steps.
+        If the residual has not fallen to `largest_residual` of the first after `MAX_STEPS` steps.
     """
+    # Residual, relative to the first, at which Newton's method stops. Rounding errors limit it to
+    # some 1e-14, one or two steps further on.
+    largest_residual = 1e-11
     ngs = import_extra("ngsolve")
     space = solution.space
     free = space.FreeDofs()
@@ -396,7 +393,7 @@ def newton(form: Any, solution: Any, iterate: bool = False) -> list[float]:
         return float(residual.Norm())
 
     norms = [norm()]
-    while norms[-1] > RESIDUAL * norms[0]:
+    while norms[-1] > largest_residual * norms[0]:
         if len(norms) > MAX_STEPS:
             raise CheckFailedError(f"NGSolve did not converge: residuals {norms}.")
         form.AssembleLinearization(solution.vec)

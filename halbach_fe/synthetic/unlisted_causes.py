@@ -39,9 +39,6 @@ INSTRUMENT = tuple(
 SOURCES = ("loop", "dipoles", "plate")
 
 SMOOTH_LENGTHS = (0.12, 0.3)
-ROUGH_LENGTHS = (0.04, 0.12)
-"""Correlation lengths as fractions of the range of the coordinate (of the circle's radius for
-angles)."""
 
 SIZES = (5.0, 50.0)
 """Rms change of the readings that a cause acts on, in units of their noise."""
@@ -173,11 +170,14 @@ def random_function(
     coordinate: Floats, periodic: bool, smooth: bool, generator: np.random.Generator
 ) -> Floats:
     """Return values (n,) of a Gaussian process of variance 1, with an rms of 1 at the points."""
+    # Correlation lengths as fractions of the range of the coordinate (of the circle's radius for
+    # angles).
+    rough_lengths = (0.04, 0.12)
     places, inverse = np.unique(coordinate.round(9), return_inverse=True)
     apart = np.abs(places[:, None] - places)
     if periodic:
         apart = 2 * np.sin(apart / 2)
-    length = generator.uniform(*(SMOOTH_LENGTHS if smooth else ROUGH_LENGTHS))
+    length = generator.uniform(*(SMOOTH_LENGTHS if smooth else rough_lengths))
     scaled = apart / (length * (2.0 if periodic else 1.0))
     covariance = np.exp(-scaled**2 / 2) if smooth else np.exp(-scaled)
     values, vectors = np.linalg.eigh(covariance)  # chordal distances and rounding: near-zero ones

@@ -1,6 +1,6 @@
 """Sealed cases of hidden effects, and how often the diagnosis names them.
 
-Each case draws a magnet, a map and sizes of the effects (`halbach_fe.synthetic.drawn_studies`).
+Each case draws a magnet, a map and sizes of the effects (`drawn_studies.py`).
 Campaigns are by magpylib and NGSolve; every case is kept, and an interrupted run goes on. Cases are
 independent, and --jobs of them run at a time::
 
@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from drawn_studies import MAGNETS, drawn_fault, drawn_magnet, drawn_study
 from sealed_cases_page import page
 
 from halbach_fe.cli import common
@@ -36,7 +37,7 @@ from halbach_fe.diagnosis.effects.material import TYPICAL_COEFFICIENT_PER_K
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import NominalSolver, marginal_of
+from halbach_fe.diagnosis.search import NominalSolver, Training
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT, InferenceResult
@@ -57,7 +58,6 @@ from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
-from halbach_fe.synthetic.drawn_studies import MAGNETS, drawn_fault, drawn_magnet, drawn_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
 from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
@@ -97,7 +97,6 @@ WANTED = {
     "axis_coverage": (0.9, 1.0), "control_naming_rate_shuffled_labels": (0.0, 0.2),
     "control_false_alarm_rate_without_blocks": (0.5, 1.0)}
 """Rates; of the controls, which must fail, too."""
-
 
 SLOW = ("iron_ring", "knee", "recoil_permeability", "recoil_permeability_across")
 """Effects whose true field takes minutes, of which no other magnet has one."""
@@ -357,11 +356,9 @@ def factor_of(found: Diagnosis, readings: xr.Dataset, added: xr.DataArray) -> fl
     """Log Bayes factor of what was added (n, 3) in T to the readings, of about that size, over
     blocks that deviate.
     """
-    before = found.before
-    whitened, _, marginal, residual = marginal_of(
-        before, Campaign.of(found.corrected_study, readings))
-    column = whitened(before.observation.read(np.nan_to_num(added.values)[None]))
-    return marginal.evidence(column, residual).fit([0]).log_evidence
+    training = Training.of(found.before, Campaign.of(found.corrected_study, readings))
+    column = training.shown(np.nan_to_num(added.values)[None])
+    return training.marginal.evidence(column, training.residual).fit([0]).log_evidence
 
 
 @cache

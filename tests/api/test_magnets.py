@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
 from halbach_fe.cli.verbs import VERBS
+from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError
-from halbach_fe.core.versions import version
 from halbach_fe.study.reader import parse_study
 from tests.support.short_dipole import TEXT, measured, truth
 

@@ -17,7 +17,7 @@ from scipy.stats import ks_2samp
 from halbach_fe.api import plan, shim, sort, tolerance
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, StudyError
-from halbach_fe.design.objective import check_objective, objective_of
+from halbach_fe.design.objective import check_objective, deviation_model, objective_of
 from halbach_fe.design.sorting import Assignment, Slots
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
@@ -26,7 +26,6 @@ from halbach_fe.report import sorting
 from halbach_fe.report.result_files import html_of, write_report
 from halbach_fe.report.tolerance import OF_THE_DESIGN
 from halbach_fe.report.tolerance import answer as answer_of_tolerance
-from halbach_fe.response.deviations import deviation_model
 from halbach_fe.response.homogeneity import default_region, homogeneity_model
 from halbach_fe.response.multipoles import MultipoleReference
 from halbach_fe.solver.session import Session

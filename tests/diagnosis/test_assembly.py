@@ -13,6 +13,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
+    Linearization,
     NominalSolver,
     apply_effects,
     identify_effects,
@@ -83,9 +84,14 @@ def selected(study, true, session, generator):
     """Effects that are selected in the first round of a diagnosis."""
     shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
     result = infer(build_magnet(study), shown, session)
-    search = score_hypotheses(study, (), result, result.prior.mean, Campaign.of(study, shown),
-                              NominalSolver(session), RIVALS, (), {})
-    return identify_effects(study, search)
+    return identify_effects(study, scored(study, result, shown, session))
+
+
+def scored(study, result, readings, session):
+    """The rivals, compared without any effect in the model."""
+    return score_hypotheses(
+        Linearization(study, (), result, result.prior.mean, Campaign.of(study, readings),
+                      NominalSolver(session)), RIVALS)
 
 
 def names_of(found):
@@ -239,10 +245,7 @@ def test_a_ring_that_was_filled_from_another_slot_on(session):
         campaign = simulate_campaign(study, 45, hide=hidden)
         blocks = campaign.blocks
         result = infer(build_magnet(study), campaign.readings, session, blocks)
-        search = score_hypotheses(
-            study, (), result, result.prior.mean, Campaign.of(study, campaign.readings),
-            NominalSolver(session), RIVALS, (), {})
-        found = identify_effects(study, search)
+        found = identify_effects(study, scored(study, result, campaign.readings, session))
         assert names_of(found) == names
     after = build_magnet(apply_effects(study, found))
     assert [block.mounted_from for block in after.blocks[:2]] == [(1, 12), (1, 1)]

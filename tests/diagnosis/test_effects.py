@@ -16,7 +16,7 @@ from halbach_fe.geometry.mounting import mountings
 from halbach_fe.measurement.instrument import nonlinear_part, sensor_model, with_memory
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.study.reader import parse_study
-from halbach_fe.synthetic.drawn_studies import drawn_study
+from studies.diagnosis.drawn_studies import drawn_study
 from tests.conftest import DIPOLE, changed, circle
 
 STUDY = parse_study(changed(

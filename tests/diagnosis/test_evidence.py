@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
-from halbach_fe.diagnosis.loo_residuals import loo_residuals, residual_groups
+from halbach_fe.diagnosis.evidence import (
+    Marginal,
+    loo_residuals,
+    residual_groups,
+    with_fewer_columns,
+)
 from halbach_fe.diagnosis.model_selection import (
     Candidate,
     best_factors,

@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.evidence import Marginal
-from halbach_fe.diagnosis.flexible_causes import field_family, fit_family, instrument_families
-from halbach_fe.diagnosis.smooth_discrepancy import harmonic_fields, sensor_errors
+from halbach_fe.diagnosis.flexible_causes import (
+    field_family,
+    fit_family,
+    harmonic_fields,
+    instrument_families,
+    sensor_errors,
+)
 from tests.conftest import circle
 
 STEP = 1e-5

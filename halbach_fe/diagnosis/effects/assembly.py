@@ -124,10 +124,6 @@ def brought_along(to: MagnetBlock, source: MagnetBlock) -> dict[str, Any]:
             "recoil_permeability_across": theirs[2]}
 
 
-OPPOSITE = -0.999
-"""Cosine below which a turn reverses the magnetization, which is the effect of a reversed block."""
-
-
 class BlockPutInWronglyEffect(AssemblyEffect):
     """One block is turned by a large angle, so that it fits its slot again."""
 
@@ -148,8 +144,10 @@ def _place(block: MagnetBlock, turn: Floats) -> Place | None:
     """Return a place whose ``at_m`` are the components of a rotation vector in degrees; None if
     the turn reverses the magnetization.
     """
+    # Cosine below which a turn reverses the magnetization, which is the effect of a reversed block.
+    opposite = -0.999
     easy = np.array(block.easy_axis)
-    if easy @ turn @ easy < OPPOSITE:
+    if easy @ turn @ easy < opposite:
         return None
     vector = Rotation.from_matrix(turn).as_rotvec(degrees=True)
     vector *= np.sign(vector[np.abs(vector) > 1e-6][-1]) if abs(

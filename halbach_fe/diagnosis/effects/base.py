@@ -389,6 +389,11 @@ class Hypothesis:
     effect: Effect
     place: Place
 
+    @property
+    def key(self) -> tuple[str, Place]:
+        """The name of the effect and its place, which outlive the object of the effect."""
+        return self.effect.name, self.place
+
     def apply(self, study: Study, values: Sequence[float]) -> Study:
         """Return the study with the effect, see `Effect.apply`; in a campaign, in its maps."""
         if not self.place.maps:

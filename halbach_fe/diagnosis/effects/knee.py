@@ -28,18 +28,9 @@ down to that of NdFeB which is 80 K hotter."""
 SQUARENESS, LEAST_SQUARE = 0.85, 0.3
 """Squareness from which the search starts, and the smallest one; the largest is `MOST_SQUARE`."""
 
-SIGNATURE_CELLS, FEWEST_CELLS = 2, 3
-"""Smallest number of cells along the side of a block for the losses of a signature, and of the
-model."""
-
 MOST_BLOCKS = 100
 """Largest number of blocks for which losses are searched unless the study describes the material:
 each place takes a solution of the whole magnet, of a few seconds for 64 blocks."""
-
-LIKELY_SCALES = (0.2, 5.0)
-"""Range of the factor between the losses that the readings want and the cheap estimate of them,
-within which a coercivity is tried. The estimate leaves out that lost polarization changes the field
-of the others, which changes the losses by less than a factor of two."""
 
 NODES = 3
 """Gauss nodes per direction and block at which the field is computed for the cheap estimate."""
@@ -97,6 +88,10 @@ class KneeEffect(Effect):
         A signature takes seconds. Here the losses are those in the field of the intact blocks in
         vacuum, and act by their mean over each block.
         """
+        # Range of the factor between the losses that the readings want and the cheap estimate of
+        # them, within which a coercivity is tried. The estimate leaves out that lost polarization
+        # changes the field of the others, which changes the losses by less than a factor of two.
+        likely_scales = (0.2, 5.0)
         # Gain in log likelihood, by the cheap estimate of the losses, from which a coercivity is
         # tried. To be named, a knee needs more than 11: log odds of 5 against prior odds of 1 to 50
         # for 12 places.
@@ -109,12 +104,12 @@ class KneeEffect(Effect):
         sizes = np.einsum("pi,ij,pj->p", losses, information, losses)
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(sizes > 0, gains / sizes, 0.0)
-        likely = (scale * gains > 2 * least_gain) & (scale > LIKELY_SCALES[0]) & (
-            scale < LIKELY_SCALES[1])
+        likely = (scale * gains > 2 * least_gain) & (scale > likely_scales[0]) & (
+            scale < likely_scales[1])
         return [place for place, tried in zip(places, likely.tolist(), strict=True) if tried]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        before, cells = nominal.study, _cells(nominal.study, SIGNATURE_CELLS)
+        before, cells = nominal.study, _cells(nominal.study, 2)
         if not nominal.magnet.is_vacuum:  # by the same route, so that both have the same cells
             before = before.with_(solver__route="moments", mesh__cells_per_side=cells)
         lost = self.apply(before, place, [1.0]).with_(mesh__cells_per_side=cells)
@@ -189,8 +184,10 @@ def _squareness(log_odds: float) -> float:
     return LEAST_SQUARE + (MOST_SQUARE - LEAST_SQUARE) * odds / (1 + odds)
 
 
-def _cells(study: Study, fewest: int = FEWEST_CELLS) -> int:
-    """Return the study's number of cells along a block's side, or the fewest for losses."""
+def _cells(study: Study, fewest: int = 3) -> int:
+    """Return the study's number of cells along a block's side, or the fewest for losses: those of
+    the model need 3, those of a signature 2.
+    """
     return max(fewest, study.mesh.cells_per_side or 0)
 
 

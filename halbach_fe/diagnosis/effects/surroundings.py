@@ -36,9 +36,6 @@ class BackgroundEffect(Effect):
         return study.with_(external__background_T=total)
 
 
-GAPS_M = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
-"""Distances between the facing ends of the two magnets, one candidate place each."""
-
 STEP_M = 1e-4
 """Step of the finite difference with respect to the distance."""
 
@@ -59,10 +56,12 @@ class NeighbourMagnetEffect(Effect):
     applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
+        # Distances between the facing ends of the two magnets, one candidate place each.
+        gaps_m = (0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.7)
         if study.dimension == 2:
             return []
         length = 2 * build_magnet(study).array_half_length
-        return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in GAPS_M]
+        return [Place(at_m=(side * (length + gap),)) for side in (-1, 1) for gap in gaps_m]
 
     def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
         """See `Effect.representatives`.
@@ -97,10 +96,6 @@ def _centre(place: Place, farther: float) -> float:
 STEP_M = 1e-4
 """Step of the finite differences with respect to the position."""
 
-BEYOND_M = (0.03, 0.08, 0.15, 0.25)
-"""Distances of the candidate places from the magnet's ends."""
-
-
 NEAREST_M = 1e-3
 """Distance in m from the object below which a reading shows nothing of it: a place of the grid may
 be one where the probe was, and the field of a point dipole is infinite there."""
@@ -122,12 +117,14 @@ class FerromagneticObjectEffect(Effect):
     refinements = tuple(Parameter(f"at {axis}", "m", 0.05, longest_step=0.02) for axis in "xyz")
 
     def places(self, study: Study) -> Sequence[Place]:
+        # Distances of the candidate places from the magnet's ends.
+        beyond_m = (0.03, 0.08, 0.15, 0.25)
         if study.dimension == 2:
             return []
         magnet = build_magnet(study)
         half, outer = magnet.array_half_length, magnet.array_outer_radius
         radii = [magnet.bore_radius, outer, 1.4 * outer]
-        heights = [side * (half + beyond) for side in (-1, 1) for beyond in BEYOND_M]
+        heights = [side * (half + beyond) for side in (-1, 1) for beyond in beyond_m]
         ends = [(r, z) for r in radii for z in heights]
         outside = [(1.2 * outer, z) for z in np.linspace(-half, half, 7)]
         angles = 2 * np.pi * np.arange(12) / 12
@@ -196,14 +193,11 @@ It is typical of iron that is not saturated. No other value is tried, because a 
 the product of permeability and thickness, and the thickness is varied.
 """
 
-THINNEST_M = 5e-4
-"""Smallest thickness of a ring."""
-
 WEAKEST = 0.1
 """Smallest strength, relative to the whole ring at one of the places, of what may be a ring. A ring
 is applied in full: of one that is found with 2 % of its strength, for a small error that looks like
 it, 98 % would be wrong in the next round. Around the magnet of studies/diagnosis, the thinnest ring
-of `THINNEST_M` has 0.5 of the strength of one of 10 mm, one of 25 mm 1.02; a ring 0.1 m off the
+of 0.5 mm has 0.5 of the strength of one of 10 mm, one of 25 mm 1.02; a ring 0.1 m off the
 blocks has 0.19, and one 0.2 m off 0.05: that one is no candidate."""
 
 STEP_M = 5e-4
@@ -252,18 +246,15 @@ class IronRingEffect(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         clearance_m = 2e-4  # smallest distance between blocks and iron
+        thinnest_m = 5e-4  # smallest thickness of a ring
         inner, outer = place.at_m
         farther, thicker = values[1:] or (0.0, 0.0)
-        thickness = max(outer - inner + thicker, THINNEST_M)
+        thickness = max(outer - inner + thicker, thinnest_m)
         inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
         return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness,
             relative_permeability=PERMEABILITY))
 
-
-SOFTER = 0.5
-"""Permeability of linear iron, relative to the study's, that stands for iron that saturates: it
-conducts less flux too."""
 
 STEEL = "aisi_1010"
 """Steel whose H(B) curve stands for that of structural steels."""
@@ -297,6 +288,9 @@ class IronSaturationEffect(Effect):
         return (nominal.solve(self.apply(before, place, [1.0])) - nominal.solve(before))[None]
 
     def rough_signature(self, nominal: NominalFields, place: Place) -> Floats | None:
+        # Permeability of linear iron, relative to the study's, that stands for iron that saturates:
+        # it conducts less flux too.
+        softer_by = 0.5
         ring = nominal.study.iron_ring
         if ring is None or ring.relative_permeability is None:
             return None
@@ -304,7 +298,7 @@ class IronSaturationEffect(Effect):
         if permeability == 1.0 or choose_route(nominal.magnet, nominal.points) in BOTH:
             return None  # nothing is softer than what conducts no flux
         softer = nominal.study.with_(iron_ring=ring.with_(
-            relative_permeability=1 + SOFTER * (permeability - 1)))
+            relative_permeability=1 + softer_by * (permeability - 1)))
         return (nominal.solve(softer) - nominal.finite_element_field)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:

@@ -32,12 +32,6 @@ none (``axes``).
 FEW_BLOCKS = 64
 """Largest number of blocks of a magnet whose losses are simulated, in a minute or two."""
 
-REFERENCE_OUTER_RADIUS_M = 0.2
-"""Outer radius in m of the magnets whose tolerances are drawn here.
-
-Lengths are drawn smaller in proportion for smaller magnets, and not larger for larger ones.
-"""
-
 
 @dataclass(frozen=True)
 class Site:
@@ -87,8 +81,11 @@ class Site:
 
     @property
     def scale(self) -> float:
-        """Factor of lengths that are drawn, see `REFERENCE_OUTER_RADIUS_M`."""
-        return min(1.0, self.outer / REFERENCE_OUTER_RADIUS_M)
+        """Factor of lengths that are drawn for a magnet of a certain size."""
+        # Outer radius in m of the magnets whose tolerances are drawn here. Lengths are drawn
+        # smaller in proportion for smaller magnets, and not larger for larger ones.
+        reference_outer_radius_m = 0.2
+        return min(1.0, self.outer / reference_outer_radius_m)
 
     def has(self, need: Need) -> bool:
         """Tell whether the study meets a requirement."""

@@ -36,13 +36,6 @@ BLOCK = (HiddenParameter("ring"), HiddenParameter("slot"))
 SMCO = -3.5e-4
 """Temperature coefficient of the remanence of Sm2Co17 in 1/K."""
 
-CORNER = (0.1, 0.2)
-"""Size of an inner corner of a block.
-
-It is the fraction of the block's thickness, counted from inside, and of its half width, counted
-from the side.
-"""
-
 Change = Callable[[Body], Body]
 
 
@@ -293,8 +286,11 @@ def block_demagnetized(
 
 
 def corners_demagnetized(magnet: TrueMagnet, site: Site, fraction: float) -> TrueMagnet:
-    """Take a fraction off the magnetization of both inner corners (`CORNER`) of all blocks."""
-    depth, width = CORNER
+    """Take a fraction off the magnetization of both inner corners of all blocks."""
+    # Size of an inner corner of a block. It is the fraction of the block's thickness, counted from
+    # inside, and of its half width, counted from the side.
+    corner = (0.1, 0.2)
+    depth, width = corner
     parts = (BodyPart((0.0, depth), (-1.0, width - 1.0), 1 - fraction),
              BodyPart((0.0, depth), (1.0 - width, 1.0), 1 - fraction))
     return _bodies(magnet, lambda body: replace(body, parts=(*body.parts, *parts)))
