@@ -1,6 +1,4 @@
-"""README's recipe on six maps that a new user would bring: ``new``, then ``explain``::
-
-python -m benchmarks.run recipe
+"""README's recipe on six maps that a new user would bring: ``new``, then ``explain``.
 """
 
 from __future__ import annotations
