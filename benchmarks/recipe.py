@@ -1,5 +1,4 @@
-"""README's recipe on six maps that a new user would bring: ``new``, then ``explain``.
-"""
+"""README's recipe on six maps that a new user would bring: ``new``, then ``explain``."""
 
 from __future__ import annotations
 
