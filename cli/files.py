@@ -268,6 +268,9 @@ def _block_columns(parser: argparse.ArgumentParser) -> None:
                 raise argparse.ArgumentTypeError(
                     f"must be like 'volume=12 cm^3', with one of {', '.join(QUANTITIES)}, not "
                     f"{text!r}")
+        given = [name.strip() for name, _, _ in pairs]
+        if twice := next((name for name in given if given.count(name) > 1), ""):
+            raise argparse.ArgumentTypeError(f"must give {twice} once, not {text!r}")
         return {name.strip(): value.strip() for name, _, value in pairs}
 
     parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",

@@ -273,6 +273,12 @@ def _frame(
     polygons = [pocket.polygon for pocket in pockets.values()]
     outermost = holder.corner_relief_m + max(
         float(np.hypot(*polygon.T).max()) for polygon in polygons)
+    most = 10 * outermost  # in m of any plate; lengths of a holder that are in mm are far beyond
+    for name in ("floor_m", "thickness_m", "inner_rim_m", "outer_rim_m", "outer_radius_m"):
+        if (length := getattr(holder, name) or 0.0) > most:
+            raise CannotBeMadeError(
+                f"`{name}` of {_mm(length)} about blocks within {_mm(outermost)} of the axis",
+                f"Was it meant in millimetres? Then write {length / 1e3:.6g}.")
     innermost = min(map(distance_from_origin, polygons))
     rods = _rods(holder.rods, outermost + holder.least_wall_m) if holder.rods else ()
     reach = max([outermost, *(float(np.hypot(*rod.polygon.T).max()) for rod in rods)])

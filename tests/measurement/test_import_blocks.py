@@ -165,6 +165,9 @@ def test_workbooks_and_the_command(tmp_path, capsys):
     free.write_text(FREE + "Br [mT]\nb;cuboid;10;0;0;0;0;0;10;20;30;1300\n")
     assert main(["import-blocks", str(free), "-o", str(tmp_path / "free.csv")]) == 0
     assert read_free_blocks(tmp_path / "free.csv")["remanence_T"] == [1.3]
+    with pytest.raises(SystemExit, match="2"):
+        main(["import-blocks", str(free), "-o", str(out), "--fixed", "type=1,type=2"])
+    assert "must give type once" in capsys.readouterr().err
     book = openpyxl.Workbook()
     for row in (["x [mm]", "y [mm]", "z [mm]", "Bx [mT]"], [1, 2, 3, 100.5], [1, 2, 4, 101]):
         book.active.append(row)
