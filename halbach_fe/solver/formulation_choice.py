@@ -485,7 +485,7 @@ def check_plane(magnet: Magnet, points: Floats, key: str) -> None:
     ------
     StudyError
     """
-    if magnet.dimension == 2 and not is_in_plane(points):
+    if magnet.dimension == 2 and len(points) and not is_in_plane(points):
         raise StudyError(
             f"Input `{key}` of study {magnet.name} must lie in one plane, since it "
             f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "
