@@ -1,4 +1,7 @@
-"""README's recipe on six maps that a new user would bring: ``new``, then ``explain``."""
+"""README's recipe on six maps that a new user would bring: ``new``, then ``explain``.
+
+``python -m benchmarks.run recipe`` brings them, and judges by `tests.support.brought_maps`.
+"""
 
 from __future__ import annotations
 

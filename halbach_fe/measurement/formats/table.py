@@ -482,8 +482,8 @@ def _missing(
     whole = ["Br", *(["Btheta"] if spherical else []), "Bphi"]
     half = [name for name in whole if name not in used]
     if half and half != whole:
-        others = " and ".join(name for name in whole if name in used)
-        missing.append(f"{' and '.join(half)}, without which {others} is no Bx or By (--columns)")
+        rest = " and ".join(name for name in whole if name in used)
+        missing.append(f"{' and '.join(half)}, without which {rest} is no Bx or By (--columns)")
     if table.anchor and declared.origin_m is None:
         missing.append(f"where {table.anchor} is along the magnet's axes (--origin-m=X,Y,Z)")
     return missing
