@@ -475,6 +475,25 @@ class State:
         return design, left, np.asarray(np.linalg.inv(
             design.T @ left + self.at.sigma**2 * np.eye(count)))
 
+    def feigned(self) -> Floats:
+        """Return the information (p, p) that an unknown field would feign, see `normal`.
+
+        It is that of fields drawn from what the readings leave open. Where `normal` has no more,
+        it is not the field that tells of a parameter, but what is not known of the field.
+        """
+        draws = 8  # they know each information to some 30 %
+        generator = np.random.default_rng(0)  # results are the same every time
+        found = np.zeros(2 * (len(self.at.instrument),))
+        for _ in range(draws):
+            prior = np.sqrt(self.width2) * generator.standard_normal(len(self.at.amplitudes))
+            read = self.free.by_amplitude @ prior + self.at.sigma * generator.standard_normal(
+                len(self.left))
+            design = self.model.by_parameter(replace(
+                self.at, amplitudes=prior - self.free.amplitudes(read)), self.rows).reshape(
+                    -1, len(found))
+            found += design.T @ self.free.left(design) / draws
+        return found
+
     def step(self, design: Floats, inverse: Floats) -> Floats:
         """Return the step (p,) of the instrument, see `normal`."""
         return np.asarray(inverse @ (
