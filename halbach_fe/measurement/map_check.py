@@ -757,7 +757,7 @@ def scan_of(
     if rough.any():
         broken["spike"] = (1 + np.flatnonzero(rough)).tolist()
     usable &= ~rough
-    off, sd = quadratic_residual(points[usable], field[usable][:, measured])
+    off, sd = quadratic_residual(points[usable], field[usable][:, measured], pace)
     scatter = scatter_around(points, points[usable], off / sd[:, None])
     directions = motion(points, time) if np.ptp(time) else np.zeros_like(points)
     return Scan(points, field, time, directions, scatter), usable, broken

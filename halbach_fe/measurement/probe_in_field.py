@@ -180,7 +180,7 @@ class ProbeModel:
         errors of many standard deviations that it does not have.
         """
         own = self.free(at, rows, at.sigma**2 / width2).diagonal().reshape(-1, len(self.sensors))
-        left = (self.field - self.readings(at))[rows] / np.maximum(own, LEAST_OWN)
+        left = (self.field[rows] - self.readings(at, rows)) / np.maximum(own, LEAST_OWN)
         other = copy(self)
         other.scatter = scatter_around(self.points, self.points[rows], left)
         other.weights = weights_of(other.scatter, len(self.sensors))
