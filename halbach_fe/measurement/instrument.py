@@ -259,8 +259,8 @@ def row_order_note(study: Study) -> str:
         ("keep a part of the reading before (memory)", any(one.memory for one in instruments)))
         if there]
     return (f"That readings {' and '.join(named)} is taken from the order of the rows, as that in "
-            "which they were read; a column time_s tells that of a memory, but not of a lag. If the "
-            "rows were sorted or joined afterwards, it means nothing: give them as they were read."
+            "which they were read; a column time_s tells that of a memory, not of a lag. If the "
+            "rows were sorted or joined later, it means nothing: give them as they were read."
             if named else "")
 
 
