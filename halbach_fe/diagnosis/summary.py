@@ -40,6 +40,7 @@ from halbach_fe.inference.result import (
     InferenceResult,
 )
 from halbach_fe.measurement.doubted_terms import factor_in_words
+from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.study.model import Study
 
 STUDY_FILE = "study.diagnosed.toml"
@@ -383,6 +384,7 @@ def diagnosis_summary(
         "study": diagnosis.before.study.name,
         "readings": {part: diagnosis.before.parts.count(part)
                      for part in (TRAINING, HELD_OUT, HELD_OUT_MAP)},
+        "row_order": row_order_note(diagnosis.study),
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
         "answer": diagnosis.answer or diagnosis.rounds,
         "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},

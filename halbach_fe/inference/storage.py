@@ -20,6 +20,7 @@ from halbach_fe.core.hdf5 import ChangedContentError, read_hdf5, with_checksum, 
 from halbach_fe.core.numbers import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Reservation
+from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.response.block_variation import distribution_of
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.study.model import Study, differences, magnet_description
@@ -254,6 +255,7 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
         "poses": None if update.terms is None else {
             pose.name: {key: value for key, value in asdict(pose).items() if key != "name"}
             for pose in update.terms.poses},
+        "row_order": row_order_note(update.study),
         "instrument_at_rest": None if update.terms is None else update.terms.at_rest,
         "stray_field": None if update.stray_field is None else update.stray_field.summary(),
         "magnetic_axis": (None if update.magnetic_axis is None

@@ -33,6 +33,7 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.study.measurement import Instrument
+from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes
 
 ROUNDS = 50
@@ -248,6 +249,19 @@ def map_time(data: xr.Dataset) -> Floats:
     count = data.sizes["point"]
     time = (data["time_s"].values if "time_s" in data else np.arange(count)).astype(float)
     return np.asarray((time - time.min()) / (np.ptp(time) or 1.0))
+
+
+def row_order_note(study: Study) -> str:
+    """Say that a lag or a memory of the instrument follows from the order of rows; else nothing."""
+    instruments = [study.instrument, *(one.instrument for one in study.maps if one.instrument)]
+    named = [what for what, there in (
+        ("lag behind the stage (lag_m)", any(one.lag_m for one in instruments)),
+        ("keep a part of the reading before (memory)", any(one.memory for one in instruments)))
+        if there]
+    return (f"That readings {' and '.join(named)} is taken from the order of the rows, as that in "
+            "which they were read; a column time_s tells that of a memory, not of a lag. If the "
+            "rows were sorted or joined later, it means nothing: give them as they were read."
+            if named else "")
 
 
 def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:

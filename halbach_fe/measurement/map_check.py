@@ -757,7 +757,7 @@ def scan_of(
     if rough.any():
         broken["spike"] = (1 + np.flatnonzero(rough)).tolist()
     usable &= ~rough
-    off, sd = quadratic_residual(points[usable], field[usable][:, measured])
+    off, sd = quadratic_residual(points[usable], field[usable][:, measured], pace)
     scatter = scatter_around(points, points[usable], off / sd[:, None])
     directions = motion(points, time) if np.ptp(time) else np.zeros_like(points)
     return Scan(points, field, time, directions, scatter), usable, broken
@@ -965,7 +965,7 @@ def _stated(
             told.append(each)
             pace.advance(number * parts + len(told), ROUNDS * parts)
         parameters = all_parameters(model.prior_sd, model.shares(fitted.at))
-        kept, terms = selected(parameters, told)
+        kept, terms = selected(parameters, told, flat=len(told) - 2 if halves else 0)
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
     return fitted, tuple(
         replace(term, value=float(parameter.row @ fitted.at.instrument)) if term.found else term
@@ -973,17 +973,20 @@ def _stated(
 
 
 def selected(
-    parameters: list[Parameter], told: list[Evidence], known: NDArray[np.bool_] | None = None
+    parameters: list[Parameter], told: list[Evidence], known: NDArray[np.bool_] | None = None,
+    flat: int = 0,
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
     """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
 
     ``told`` is what the whole map tells, and what its halves do. In a field along one axis, a turn
     of the probe and an angle between its sensors differ by little: of what explains the map, it is
-    what is certain, and near to 0 by what instruments do. ``known`` (p,) are kept already.
+    what is certain, and near to 0 by what instruments do. ``known`` (p,) are kept already, ``flat``
+    is the number of the half in which the field is flat, see `_term`.
     """
     kept = np.zeros(len(told[0].sums), bool) if known is None else known.copy()
     while True:
-        terms, away = zip(*(_term(parameter, kept, told) for parameter in parameters), strict=True)
+        terms, away = zip(*(_term(parameter, kept, told, flat) for parameter in parameters),
+                          strict=True)
         there = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
         new = [(abs(term.value) / term.sd / (1 + far), parameter.own)
                for parameter, term, far, old in zip(parameters, terms, away, there, strict=True)
@@ -1010,7 +1013,7 @@ def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[ND
 
 
 def _term(
-    parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence]
+    parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int
 ) -> tuple[InstrumentTerm, float]:
     """Return what the whole map and its halves show of a parameter, besides those that are kept.
 
@@ -1018,6 +1021,8 @@ def _term(
 
     If the halves scatter about the whole by more than their bars, its bar is as much longer. They
     support it if both of a pair could tell whether it is there, and none that could contradicts it.
+    What the charges do not follow is where the field is steep, in both halves along other axes:
+    the ``flat`` half (its number in ``told``, 0 if there is none) must be able to tell, too.
     """
     # A parameter is determined if its standard deviation is below this part of its prior one.
     determined = 0.5
@@ -1033,7 +1038,8 @@ def _term(
     beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if of_parts else 1.0
     sees = SEEN * beyond * sds < abs(value)
     off = np.abs(values - value) > np.maximum(SEEN * sds, UNLIKE * abs(value))
-    supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any())
+    supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any() and (
+        SEEN * ([sd, *sd_of_parts][flat] if flat else 0.0) < abs(value)))
     prior = float(np.linalg.norm(row))
     away = float(np.abs(estimates[0][0][np.isin(used, parameter.own)]).max())
     return InstrumentTerm(

@@ -180,7 +180,7 @@ class ProbeModel:
         errors of many standard deviations that it does not have.
         """
         own = self.free(at, rows, at.sigma**2 / width2).diagonal().reshape(-1, len(self.sensors))
-        left = (self.field - self.readings(at))[rows] / np.maximum(own, LEAST_OWN)
+        left = (self.field[rows] - self.readings(at, rows)) / np.maximum(own, LEAST_OWN)
         other = copy(self)
         other.scatter = scatter_around(self.points, self.points[rows], left)
         other.weights = weights_of(other.scatter, len(self.sensors))
@@ -474,6 +474,25 @@ class State:
         left = self.free.left(design)
         return design, left, np.asarray(np.linalg.inv(
             design.T @ left + self.at.sigma**2 * np.eye(count)))
+
+    def feigned(self) -> Floats:
+        """Return the information (p, p) that an unknown field would feign, see `normal`.
+
+        It is that of fields drawn from what the readings leave open. Where `normal` has no more,
+        it is not the field that tells of a parameter, but what is not known of the field.
+        """
+        draws = 8  # they know each information to some 30 %
+        generator = np.random.default_rng(0)  # results are the same every time
+        found = np.zeros(2 * (len(self.at.instrument),))
+        for _ in range(draws):
+            prior = np.sqrt(self.width2) * generator.standard_normal(len(self.at.amplitudes))
+            read = self.free.by_amplitude @ prior + self.at.sigma * generator.standard_normal(
+                len(self.left))
+            design = self.model.by_parameter(replace(
+                self.at, amplitudes=prior - self.free.amplitudes(read)), self.rows).reshape(
+                    -1, len(found))
+            found += design.T @ self.free.left(design) / draws
+        return found
 
     def step(self, design: Floats, inverse: Floats) -> Floats:
         """Return the step (p,) of the instrument, see `normal`."""

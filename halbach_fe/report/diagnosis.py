@@ -27,6 +27,7 @@ from halbach_fe.diagnosis.summary import (
     rivals,
 )
 from halbach_fe.inference.result import ALL_READINGS
+from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report import diagnosis_figures as figures
 from halbach_fe.report.diagnosis_answer import (
     answer,
@@ -167,7 +168,8 @@ def page(
         "diagnose", "what the model lacks", diagnosis.before.study, answer(diagnosis),
         diagnosis_summary(diagnosis, separations), [
             _what_is_missing(diagnosis, rows), *_what_else(diagnosis, separations, titles, rows),
-            *_grounds(diagnosis),
+            *_grounds(diagnosis), Section(order := [*filter(None, [row_order_note(
+                diagnosis.study)])]),
             Section([View(lambda: view_of_inference(diagnosis.after, places),
                           colours_in_words(diagnosis.after))]),
             Section([f"{STUDY_FILE} beside this page is the study's file {added}; halbach-fe solve "
@@ -176,7 +178,8 @@ def page(
         {"Missing from the study": found,
          "The model before and after": change_table(diagnosis),
          "Rms difference of model and readings": residual_table(diagnosis)},
-        rows, drawn, stem="diagnosis", remarks=[BAYES_FACTOR_IN_WORDS] if found else [],
+        rows, drawn, stem="diagnosis", remarks=[
+            *([BAYES_FACTOR_IN_WORDS] if found else []), *order],
         new_study=(STUDY_FILE, partial(
             changed_studies, study or diagnosis.corrected_study, diagnosis)))
 

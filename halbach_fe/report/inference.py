@@ -13,6 +13,7 @@ from matplotlib.patches import Rectangle
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import inference_summary, write_inference
+from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
@@ -301,6 +302,7 @@ def page(result: InferenceResult) -> Page:
     return Page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [
+             Section(order := [*filter(None, [row_order_note(result.study)])]),
             Section([*doubtful, Table(block_table(result)), Text(SHRUNK, "small")],
                     "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),
@@ -326,6 +328,7 @@ def page(result: InferenceResult) -> Page:
          "Where nobody measured": left_out_table(result),
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
+        remarks=order,
         new_study=None if result.terms is None else (STUDY_FILE, lambda: [(result.study, NOTE)]))
 
 

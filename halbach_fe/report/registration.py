@@ -37,7 +37,12 @@ from halbach_fe.measurement.field_map import (
     points_of,
     write_map,
 )
-from halbach_fe.measurement.instrument import in_si_and_magnet_axes, probe_points, turn_of
+from halbach_fe.measurement.instrument import (
+    in_si_and_magnet_axes,
+    probe_points,
+    row_order_note,
+    turn_of,
+)
 from halbach_fe.measurement.instrument_terms import CROSSTALK
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -407,6 +412,7 @@ def sentences(found: Sequence[Registration]) -> list[str]:
     if len(by_hypothesis(found)) > 1 and best.explains:
         said.append("Odds of what is open: " + "; ".join(
             f"{name} {100 * value:.3g} %" for name, value in by_hypothesis(found).items()) + ".")
+    said += filter(None, [row_order_note(best.study)])
     return said + [f"{key} is {value:.5g} ± {sd:.1g}."
                    for key, (value, sd) in best.open_keys.items()]
 
@@ -502,7 +508,7 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
     def numbers(values: np.ndarray) -> list[float | None]:
         return [None if np.isnan(value) else float(value) for value in values]
 
-    return {"poses": [{
+    return {"row_order": row_order_note(found[0].study), "poses": [{
         "odds": float(probability) if has_odds(found) else None,
         "at_rest": each.at_rest, "explains": each.explains, "sound": is_sound(each),
         "doubts": [one.plain() for one in each.doubts], "factor": each.factor,

@@ -14,8 +14,10 @@ from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.instrument import sensor_positions
+from halbach_fe.measurement.instrument import row_order_note, sensor_positions
 from halbach_fe.measurement.scan_lines import goes_both_ways, motion
+from halbach_fe.report.diagnosis import page as page_of_diagnosis
+from halbach_fe.report.inference import page as page_of_update
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.support.short_dipole import BODY, NOISE_T, TEXT, truth
@@ -50,6 +52,12 @@ def test_a_lag_is_named(session, generator):
     assert found.study.instrument.lag_m == pytest.approx(LAG_M, abs=4 * lag.sd[0])
     update = infer(build_magnet(found.study), data, session)
     assert update.prior_conflict < update.conflict_limit
+    for page in (page_of_diagnosis(found), page_of_update(update)):  # the order is no time
+        assert "is taken from the order of the rows" in page.remarks[-1]
+        assert page.summary["row_order"] == page.remarks[-1]
+    assert not row_order_note(found.before.study)
+    assert "(lag_m) and keep" in row_order_note(STUDY.with_(
+        instrument={"lag_m": LAG_M, "memory": 0.01}))
     # control: without it the update does not agree
     assert found.before.prior_conflict > found.before.conflict_limit
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import magpylib
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -263,3 +264,56 @@ def test_too_few_points_in_common_are_said(generator):
                      (lattice(2, 0.01, 0.0), 0.01, np.zeros(3)))
     with pytest.raises(MeasurementError, match="shares 20 points"):
         join_checked(maps, QUIET)
+
+
+def coarse_maps(seed, far):
+    """Two maps of 4 x 4 x 4 points of far dipoles, 20 mm apart, and where the second one stands.
+
+    One dipole is the same from everywhere around its axis; two, the control, are not.
+    """
+    generator = np.random.default_rng([seed, 50])
+    places = np.array([[0.1, 0.05, 0.08], [-0.1, 0.05, 0.024]])[:far]
+    magnets = magpylib.Collection([magpylib.misc.Dipole(
+        moment=10 * generator.standard_normal(3), position=place) for place in places])
+    turn = Rotation.from_rotvec(0.01 * generator.standard_normal(3))
+    shift = np.array([0, 0, 0.02]) + 1e-3 * generator.standard_normal(3)
+    points, maps = lattice(4, 0.01, 0.0), []
+    for name, (way, start) in {"first": (Rotation.identity(), 0 * shift),
+                               "second": (turn, shift)}.items():
+        field = magnets.getB(way.apply(points) + start) @ way.as_matrix()
+        noise = 2e-4 * np.median(np.linalg.norm(field, axis=1))
+        data = field_map(points, field + noise * generator.standard_normal(field.shape))
+        (one,) = as_checked({name: data}, 1.6 * noise)
+        maps.append(map_join.Checked.of(name, data, replace(
+            one.check, spacing_m=0.01, gap_m=0.025, noise_T=noise)))
+    return maps, [(Rotation.identity(), 0 * shift), (turn, shift)]
+
+
+def test_a_turn_about_a_far_dipole_is_not_determined(monkeypatch):
+    """What fields that readings leave open would feign is no information, and the page says so.
+
+    Control: counted as such, it makes bars of which errors are many.
+    """
+    off = []
+    for seed in (5, 7):  # of 8 draws those with the largest errors
+        maps, poses = coarse_maps(seed, 1)
+        joined = join_checked(maps, QUIET)
+        assert "does not determine the turn about" in answer(joined).trust
+        off.append(errors(joined, poses) / np.sqrt(np.diag(joined.covariance)))
+    assert np.abs(off).max() < 2.5  # a turn that is not determined has the bar of its prior
+    monkeypatch.setattr(map_join, "FEIGNED", 0.0)
+    joined = join_checked(maps, QUIET)
+    assert np.abs(errors(joined, poses) / np.sqrt(np.diag(joined.covariance))).max() > 4
+
+
+def test_two_far_dipoles_determine_a_pose():
+    """In coarse maps, too: errors are as large as their bars, and these are small."""
+    off = []
+    for seed in range(2):
+        maps, poses = coarse_maps(seed, 2)
+        joined = join_checked(maps, QUIET)
+        assert joined.poses[0].determined.all()
+        assert (joined.poses[0].shift_sd_m < 3e-4).all()
+        off.append(over_bars(joined, poses))
+    # 12 normal numbers have an rms of 0.5 to 1.6 in 99 % of all draws
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.6
