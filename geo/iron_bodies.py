@@ -18,6 +18,7 @@ from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions
 from halbach_fe.geometry.iron import IronSolid
+from halbach_fe.study.solver import MeshSettings
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,12 @@ class Sizes:
     growth: float
 
     @classmethod
-    def of(cls, size: float, coarseness: float = 1.0) -> Sizes:
-        """Return those for elements of a size in m; a larger ``coarseness`` is for error bars."""
-        return cls(coarseness * size, 1.2 * coarseness, 0.25 * coarseness, 0.4,
-                   0.35 * coarseness**0.6)
+    def of(cls, mesh: MeshSettings, coarseness: float = 1.0) -> Sizes:
+        """Return those of a study; a larger ``coarseness`` is for error bars."""
+        usual = 0.4  # growth - 1 for which the numbers below are
+        relative = coarseness * (mesh.growth - 1) / usual
+        return cls(coarseness * mesh.block_size_m, 1.2 * relative, 0.25 * relative, 0.4,
+                   0.35 * relative**0.6)
 
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""

@@ -160,7 +160,7 @@ def iron_solids(
         return (IronSolid(ring.inner_radius_m, ring.outer_radius_m, *limits(ring.length_m),
                           law=law_of(ring)),)
     solids: list[IronSolid] = []
-    for body in iron.bodies if iron else ():
+    for body in iron.each if iron else ():
         found: list[IronSolid] = []
         if body.kind == "tube":
             found = [IronSolid(body.inner_radius_m, body.outer_radius_m,

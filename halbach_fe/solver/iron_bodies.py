@@ -167,7 +167,7 @@ class Problem:
         excess, slope = self.law(field)
         differential = (excess[..., None, None] * np.eye(3)
                         + (slope[..., None] * field)[..., None] * field[..., None, :])
-        return Tangent.of(self, self.stiffness_of_vacuum + self.matrix(differential))
+        return Tangent.of(self, self.stiffness_of_vacuum + self.matrix(differential), self.coarse)
 
     def matrix(self, differential: Floats) -> sparse.csr_array:
         """Return the integrals (n, n) of (tensor (e, 15, 3, 3) grad u) . grad v."""
@@ -189,39 +189,46 @@ class Problem:
 
         It is free by a constant in every connected body, which the reaction does not depend on.
         """
-        own = self.matrix(np.broadcast_to(np.eye(3), (*self.weights.shape, 3, 3)))
-        outside = np.ones(own.shape[0])
-        outside[self.nodes] = 0
-        label = connected_components(own, directed=False)[1]
-        fixed = np.unique(label, return_index=True)[1]
-        size = own.diagonal()
-        extra = np.where(outside == 1, 1.0, 0.0)
-        extra[fixed] += size[fixed]  # the solution is 0 there, as the rows add up to 0
-        tangent = Tangent.of(self, sparse.csr_array(own + sparse.diags_array(extra)))
         right = -self.integrate(values.reshape(*self.weights.shape, 3, -1))
-        return tangent.solve(right, 1e-10)
+        inside, tangent = self._iron
+        found = np.zeros_like(right)
+        found[inside] = tangent.solve(right[inside], 1e-10)
+        return found
+
+    @cached_property
+    def _iron(self) -> tuple[Ints, Tangent]:
+        """The unknowns in the iron, and the problem of Poisson in it alone."""
+        inside = np.unique(self.nodes)
+        own = self.matrix(np.broadcast_to(np.eye(3), (*self.weights.shape, 3, 3)))
+        own = own[inside][:, inside]
+        fixed = np.unique(connected_components(own, directed=False)[1], return_index=True)[1]
+        extra = np.zeros(len(inside))
+        extra[fixed] = own.diagonal()[fixed]  # the solution is 0 there, as the rows add up to 0
+        up = self.coarse[inside]
+        up = up[:, np.unique(up.nonzero()[1])]
+        return inside, Tangent.of(self, own + sparse.diags_array(extra), up)
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """The derivative of the residual at a state, and its preconditioner."""
+    """The derivative of the residual at a state, and its preconditioner on two levels."""
 
     problem: Problem
     matrix: sparse.csr_array
+    up: sparse.csr_array
     coarse: sparse_linalg.SuperLU
 
     @classmethod
-    def of(cls, problem: Problem, matrix: sparse.csr_array) -> Tangent:
-        """Return the tangent of a matrix (n, n)."""
+    def of(cls, problem: Problem, matrix: sparse.csr_array, up: sparse.csr_array) -> Tangent:
+        """Return the tangent of a matrix (n, n), with ``up`` (n, corners) as `Problem.coarse`."""
         matrix = sparse.csr_array(matrix)
-        up = problem.coarse
-        return cls(problem, matrix, factorize(up.T @ (matrix @ up)))
+        return cls(problem, matrix, up, factorize(up.T @ (matrix @ up)))
 
     def precondition(self, residual: Floats) -> Floats:
         """Return approximate solutions (n, c) by a sweep, the coarse level and a sweep back."""
         from halbach_fe.solver.tetrahedra import sweep  # imports numba
 
-        a, up = self.matrix, self.problem.coarse
+        a, up = self.matrix, self.up
         found = np.zeros_like(residual)
         sweep(a.indptr, a.indices, a.data, residual, found, False)
         rest = np.ascontiguousarray(up.T @ (residual - a @ found))
@@ -382,7 +389,7 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
     make_folder(session.folder)
     try:
         regions, shell = mesh_iron(magnet.name, magnet.iron, Sizes.of(
-            magnet.study.mesh.block_size_m, coarseness), files.mesh)
+            magnet.study.mesh, coarseness), files.mesh)
         regions.write(files.regions)
     except OSError as error:
         raise OutputError(
@@ -427,7 +434,7 @@ def size_of(magnet: Magnet, coarseness: float) -> RunSize:
     """Estimate the size of the run for a magnet's iron, without meshing it."""
     from halbach_fe.geo.iron_bodies import Sizes
 
-    elements, unknowns = Sizes.of(magnet.study.mesh.block_size_m, coarseness).count(magnet.iron)
+    elements, unknowns = Sizes.of(magnet.study.mesh, coarseness).count(magnet.iron)
     return RunSize("scalar_potential", elements, unknowns, 1)
 
 
@@ -442,10 +449,11 @@ def _check_memory(magnet: Magnet, unknowns: int) -> None:
     needed, available = bytes_each * unknowns / 2**30, available_memory()
     if available is not None and needed > available:
         raise StudyError(must_be(
-            "`mesh.block_size_m`", f"study {magnet.name}",
+            "`mesh.growth`", f"study {magnet.name}",
             f"so large that the mesh of the iron fits into the {available:.2g} GiB of memory that "
-            "are left", f"{magnet.study.mesh.block_size_m:g}, for some {unknowns:.2g} unknowns "
-            f"and {needed:.2g} GiB", "Enlarge it, or leave out thin bodies of iron."))
+            f"are left", f"{magnet.study.mesh.growth:g}, for some {unknowns:.2g} unknowns and "
+            f"{needed:.2g} GiB", "Enlarge it and mesh.block_size_m, or leave out thin bodies of "
+            "iron."))
 
 
 def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,

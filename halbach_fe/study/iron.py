@@ -9,7 +9,9 @@ from pydantic import Field, model_validator
 
 from halbach_fe.study import materials
 from halbach_fe.study.types import (
+    COMPONENTS,
     MAX_LENGTH_M,
+    Component,
     Coordinate,
     Gap,
     Length,
@@ -140,10 +142,15 @@ class PlacedIron(StudyModel):
     ``centre_m`` is where the origin of the body's own axes lies in the magnet, and the rotation
     vector ``rotation_deg`` turns the magnet's axes into them. Without them, the axes are those of
     the magnet. Either ``relative_permeability`` or ``curve`` replaces the material of all bodies.
+    The body stands ``repeats`` times, each ``step_m`` beside the last one, and all of them once
+    more as mirror images for each axis in ``mirrored``, in the plane across it through the origin.
     """
 
     centre_m: Places = (0.0, 0.0, 0.0)
     rotation_deg: Rotation = (0.0, 0.0, 0.0)
+    repeats: Annotated[int, Field(ge=1, le=512)] = 1
+    step_m: Places = (0.0, 0.0, 0.0)
+    mirrored: Annotated[tuple[Component, ...], Field(max_length=3)] = ()
     relative_permeability: RelativePermeability | None = None
     curve: IronCurve | None = None
 
@@ -152,6 +159,37 @@ class PlacedIron(StudyModel):
         if self.relative_permeability is not None and self.curve is not None:
             raise ValueError("give at most one of relative_permeability and curve")
         return self
+
+    @model_validator(mode="after")
+    def _of_distinct_images(self) -> Self:
+        images = self.images
+        if any(one in images[:number] for number, one in enumerate(images)):
+            raise ValueError("repeats and mirrored must make bodies in different places; give "
+                             "step_m, and leave out of mirrored what leads to the same place")
+        return self
+
+    @property
+    def images(self) -> tuple[Self, ...]:
+        """The bodies that repeats and mirrored make, each of them alone."""
+        found = [self.model_copy(update={
+            "repeats": 1, "step_m": (0.0, 0.0, 0.0), "mirrored": (),
+            "centre_m": tuple(a + number * b for a, b in zip(
+                self.centre_m, self.step_m, strict=True))}) for number in range(self.repeats)]
+        for axis in self.mirrored:
+            found += [one.mirror_image(COMPONENTS.index(axis)) for one in found]
+        return tuple(found)
+
+    def mirror_image(self, axis: int) -> Self:
+        """Return the body mirrored in the plane across an axis, 0 for x, through the origin."""
+        sign = np.where(np.arange(3) == axis, -1.0, 1.0) + 0.0
+        update: dict[str, object] = {
+            "centre_m": tuple((sign * self.centre_m + 0.0).tolist()),
+            "rotation_deg": tuple((-sign * self.rotation_deg + 0.0).tolist())}
+        if axis == 2 and hasattr(self, "z_m"):
+            update["z_m"] = 0.0 - self.z_m
+        if axis < 2 and hasattr(self, "outline_m"):
+            update["outline_m"] = tuple(map(tuple, (sign[:2] * self.outline_m).tolist()))
+        return self.model_copy(update=update)
 
     @property
     def own_material(self) -> IronMaterial | None:
@@ -242,3 +280,8 @@ class Iron(StudyModel):
             raise ValueError("give exactly one of relative_permeability and curve, for all bodies "
                              "or for each")
         return self
+
+    @property
+    def each(self) -> tuple[IronBody, ...]:
+        """The bodies one by one, with those that repeats and mirrored make."""
+        return tuple(one for body in self.bodies for one in body.images)

@@ -176,7 +176,7 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
     if iron is None:
         return None
     bodies: list[Tube | Pole | Ball] = []
-    for body in iron.bodies:
+    for body in iron.each:
         own = body.own_material
         placed: dict[str, Any] = {
             "origin": body.centre_m, "law": None if own is None else law_of(own),

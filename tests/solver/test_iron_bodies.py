@@ -23,6 +23,7 @@ from halbach_fe.solver.formulation_choice import (
 from halbach_fe.solver.iron_bodies import COARSER, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.study.reader import parse_study
+from halbach_fe.study.solver import MeshSettings
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
 
@@ -68,7 +69,7 @@ def sphere(request, tmp_path_factory):
 def coarse_mesh(monkeypatch):
     """Larger elements of iron: errors and bars are larger, and the test is fast."""
     fine = Sizes.of
-    monkeypatch.setattr(Sizes, "of", lambda size, coarseness=1.0: fine(size, 2.0 * coarseness))
+    monkeypatch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 2.0 * coarseness))
 
 
 def test_sphere_in_a_uniform_field(sphere):
@@ -181,7 +182,8 @@ def test_size_is_foretold(sphere):
     """Within a factor of 1.5, of the mesh and of the coarser one: 1.25 was measured."""
     _, found = sphere
     for coarseness, solved in ((1.0, found), (COARSER, found.coarse)):
-        _, unknowns = Sizes.of(0.02, coarseness).count(solved.problem.bodies)
+        sizes = Sizes.of(MeshSettings(block_size_m=0.02), coarseness)
+        _, unknowns = sizes.count(solved.problem.bodies)
         assert unknowns / len(solved.total) == pytest.approx(1.0, abs=0.5)
 
 
