@@ -77,6 +77,33 @@ def test_copies(dipole, generator):
     assert magnet.radius == pytest.approx(0.25)
 
 
+@pytest.mark.parametrize("body", [
+    tube(0.02, 0.05, z_m=0.01), prism(copies=2, z_m=0.02, length_m=0.1), BOX,
+    {"kind": "sphere", "radius_m": 0.05}], ids=lambda body: body["kind"])
+def test_repeated_and_mirrored(short_dipole, generator, body):
+    """Eight bodies: two, and their images across z, and the images of all across y."""
+    placed = body | {"centre_m": [0.1, 0.4, 0.5], "rotation_deg": [20.0, -40.0, 5.0]}
+    step = [0.0, 0.3, 0.4]
+    plain = magnet_of(short_dipole, placed).iron
+    images = magnet_of(short_dipole, placed | {
+        "repeats": 2, "step_m": step, "mirrored": ["z", "y"]}).iron
+    assert len(images) == 8 * len(plain)
+    points = placed["centre_m"] + generator.uniform(-0.3, 0.3, (2_000, 3))
+    inside = np.any([each.contains(points) for each in plain], axis=0)
+    assert inside.any()
+    for number in range(8):
+        sign = [1.0, -1.0 if number & 4 else 1.0, -1.0 if number & 2 else 1.0]
+        seen = (points + np.multiply(number & 1, step)) * sign
+        some = images[number * len(plain):(number + 1) * len(plain)]
+        np.testing.assert_array_equal(
+            np.any([each.contains(seen) for each in some], axis=0), inside)
+    for wrong in ({"repeats": 2}, {"mirrored": ["y", "y"]}):
+        with pytest.raises(StudyError, match="bodies in different places"):
+            magnet_of(short_dipole, placed | wrong)
+    with pytest.raises(StudyError, match="bodies in different places"):
+        magnet_of(short_dipole, BOX | {"mirrored": ["x"]})  # its middle is at x = 0
+
+
 def test_several_bodies(short_dipole):
     magnet = magnet_of(short_dipole, tube(0.2, 0.25), tube(0.05, 0.25, length_m=0.02, z_m=0.2))
     assert magnet.iron_is_axisymmetric
