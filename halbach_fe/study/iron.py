@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.study import materials
 from halbach_fe.study.types import (
     COMPONENTS,
@@ -17,6 +20,7 @@ from halbach_fe.study.types import (
     Length,
     Line,
     Places,
+    Point,
     Rotation,
     StudyModel,
     crossing,
@@ -187,6 +191,10 @@ class PlacedIron(StudyModel):
             "rotation_deg": tuple((-sign * self.rotation_deg + 0.0).tolist())}
         if axis == 2 and hasattr(self, "z_m"):
             update["z_m"] = 0.0 - self.z_m
+        if hasattr(self, "triangles_m"):
+            update["triangles_m"] = tuple(
+                tuple(map(tuple, corners)) for corners in
+                (sign * self.triangles_m)[:, ::-1].tolist()) if self.triangles_m else ()
         if axis < 2 and hasattr(self, "outline_m"):
             update["outline_m"] = tuple(map(tuple, (sign[:2] * self.outline_m).tolist()))
         return self.model_copy(update=update)
@@ -259,7 +267,92 @@ class IronSphere(PlacedIron):
     radius_m: Length
 
 
-IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere, Field(discriminator="kind")]
+class IronMesh(PlacedIron):
+    """A body of any shape, by the triangles of its surface: a ``file`` of the kind STL.
+
+    Its coordinates are those of the file times ``unit_m``, along the body's own axes, and its path
+    is relative to the study's folder. The triangles must close the surface. When a study is read,
+    ``triangles_m`` in m replace the file's name; the field takes the body as it is, with flat
+    faces.
+    """
+
+    kind: Literal["stl"]
+    file: Annotated[Line, Field(min_length=1, max_length=4000)] | None = None
+    unit_m: Annotated[float, Field(ge=1e-6, le=1.0)] = 1e-3
+    triangles_m: Annotated[tuple[tuple[Point, Point, Point], ...], Field(max_length=5000)] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronMesh:
+        if (self.file is None) == (not self.triangles_m):
+            raise ValueError("give either a file or triangles_m")
+        if self.triangles_m:
+            closed_surface(np.array(self.triangles_m))
+        return self
+
+
+def closed_surface(triangles: Floats) -> Floats:
+    """Return the triangles (n, 3, 3) of a closed surface, with their normals outwards.
+
+    Raises
+    ------
+    ValueError
+        If the surface is open, or some triangles are turned over.
+    """
+    size = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    same = 1e-6  # distance of corners that are one, relative to the size: STL has seven digits
+    number = np.unique((triangles / max(same * size, 1e-300)).round().reshape(-1, 3), axis=0,
+                       return_inverse=True)[1].reshape(-1, 3)
+    edges = np.vstack([number[:, [0, 1]], number[:, [1, 2]], number[:, [2, 0]]])
+    found = {tuple(edge) for edge in edges.tolist()}
+    if (edges[:, 0] == edges[:, 1]).any():
+        raise ValueError("no triangle may have corners in one place; remove those of no area")
+    if len(found) < len(edges):
+        raise ValueError("an edge belongs to several triangles on the same side; the surface must "
+                         "go around the body once, with all normals outwards")
+    lone = [edge for edge in found if edge[::-1] not in found]
+    if lone:
+        x, y, z = triangles.reshape(-1, 3)[np.argmax(number.ravel() == lone[0][0])]
+        raise ValueError(f"the surface must be closed, but {len(lone)} edges belong to a single "
+                         f"triangle, one of them at ({x:g}, {y:g}, {z:g}) m; repair the surface, "
+                         "and export it as a solid")
+    volume = np.einsum("ni,ni->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2]))
+    return triangles if volume > 0 else triangles[:, ::-1]
+
+
+def read_stl(path: Path) -> Floats:
+    """Read the triangles (n, 3, 3) of an STL file, binary or text, in its own unit.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file.
+    OSError
+        If it cannot be read.
+    """
+    most_bytes = 5_000_000
+    with path.open("rb") as file:
+        raw = file.read(most_bytes + 1)
+    if len(raw) > most_bytes:
+        raise ValueError("it is too large; export it with fewer triangles")
+    count = int.from_bytes(raw[80:84], "little")
+    if len(raw) >= 84 and len(raw) == 84 + 50 * count:
+        rows = np.frombuffer(raw, np.dtype([("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")]),
+                             count, 84)
+        found = rows["c"].astype(float)
+    else:
+        number = rb"\s+([-+0-9.eE]{1,40})"
+        corners = re.findall(rb"vertex" + 3 * number + rb"(?=\s)", raw)
+        if not raw.lstrip().startswith(b"solid") or len(corners) != raw.count(b"vertex") or (
+                len(corners) % 3):
+            raise ValueError("it is no STL file; export the body as one")
+        found = np.array([[float(part) for part in corner] for corner in corners]).reshape(-1, 3, 3)
+    if not len(found) or not np.isfinite(found).all():
+        raise ValueError("it has no triangles, or such without finite corners")
+    return found
+
+
+IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere | IronMesh,
+                     Field(discriminator="kind")]
 
 
 class Iron(StudyModel):

@@ -26,6 +26,7 @@ from halbach_fe.study.reader import parse_study
 from halbach_fe.study.solver import MeshSettings
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
+from tests.geometry.test_iron import triangles_of_box
 
 SPHERE = {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.0, 0.05]}
 POINTS = np.array([[0.0, 0.0, 0.0], [0.01, 0.02, 0.02], [0.03, 0.0, 0.05], [0.0, -0.03, 0.09]])
@@ -108,6 +109,21 @@ def test_near_field_of_known_polarization(sphere):
             3 * directions * directions[:, 2:] - [0, 0, 1]) / (0.02 + distance) ** 3
         field = iron_bodies._field_of(problem, uniform, np.add(points, [0.0, 0.0, 0.05]))
         assert np.abs(field - exact).max() < tolerance
+
+
+def test_a_body_of_triangles_is_as_a_box(session):
+    """In a uniform field; the same box on two coarse meshes, and another one as the control."""
+    mesh = {"block_size_m": 0.02, "growth": 2.6}
+    uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    size, place = [0.02, 0.03, 0.01], {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
+    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform, session.within(name),
+                          estimate=False).field(POINTS) for name, body in (
+        ("box", {"kind": "box", "size_m": size}),
+        ("stl", {"kind": "stl", "triangles_m": triangles_of_box(size).tolist()}),
+        ("other", {"kind": "box", "size_m": [0.02, 0.03, 0.012]}))]
+    scale = np.abs(found[0]).max()
+    assert np.abs(found[1] - found[0]).max() < 0.03 * scale
+    assert np.abs(found[2] - found[0]).max() > 0.05 * scale
 
 
 def test_external_field_acts_on_the_iron(session, coarse_mesh):
