@@ -299,13 +299,14 @@ def closed_surface(triangles: Floats) -> Floats:
         If the surface is open, or some triangles are turned over.
     """
     size = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    if not (np.linalg.norm(across, axis=1) > 1e-12 * size**2).all():
+        raise ValueError("every triangle must have an area; remove those without")
     same = 1e-6  # distance of corners that are one, relative to the size: STL has seven digits
-    number = np.unique((triangles / max(same * size, 1e-300)).round().reshape(-1, 3), axis=0,
+    number = np.unique((triangles / (same * size)).round().reshape(-1, 3), axis=0,
                        return_inverse=True)[1].reshape(-1, 3)
     edges = np.vstack([number[:, [0, 1]], number[:, [1, 2]], number[:, [2, 0]]])
     found = {tuple(edge) for edge in edges.tolist()}
-    if (edges[:, 0] == edges[:, 1]).any():
-        raise ValueError("no triangle may have corners in one place; remove those of no area")
     if len(found) < len(edges):
         raise ValueError("an edge belongs to several triangles on the same side; the surface must "
                          "go around the body once, with all normals outwards")
@@ -346,7 +347,8 @@ def read_stl(path: Path) -> Floats:
                 len(corners) % 3):
             raise ValueError("it is no STL file; export the body as one")
         found = np.array([[float(part) for part in corner] for corner in corners]).reshape(-1, 3, 3)
-    if not len(found) or not np.isfinite(found).all():
+    most = 1e9  # in any unit a body is smaller
+    if not len(found) or not (np.abs(found) < most).all():
         raise ValueError("it has no triangles, or such without finite corners")
     return found
 

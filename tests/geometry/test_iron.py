@@ -158,7 +158,7 @@ def test_triangles_that_overlap_a_block(short_dipole):
     (lambda raw, text: raw, None), (lambda raw, text: text, None),
     (lambda raw, text: raw[:80] + (11).to_bytes(4, "little") + raw[84:-50],
      "must be a closed surface in an STL file; instead .* the surface must be closed, but 3 edges"),
-    (lambda raw, text: raw[:-50] + raw[-100:-50], "corners in one place|on the same side"),
+    (lambda raw, text: raw[:-50] + raw[-100:-50], "on the same side"),
     (lambda raw, text: raw[:-1], "it is no STL file"),
     (lambda raw, text: text.replace("vertex 50.0", "vertex nan"), "it is no STL file"),
     (lambda raw, text: text.replace("vertex 50.0", "vertex 1e999"), "without finite corners"),

@@ -116,8 +116,8 @@ def test_a_body_of_triangles_is_as_a_box(session):
     mesh = {"block_size_m": 0.02, "growth": 2.6}
     uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
     size, place = [0.02, 0.03, 0.01], {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
-    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform, session.within(name),
-                          estimate=False).field(POINTS) for name, body in (
+    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform,
+                          session.within(name), estimate=False).field(POINTS) for name, body in (
         ("box", {"kind": "box", "size_m": size}),
         ("stl", {"kind": "stl", "triangles_m": triangles_of_box(size).tolist()}),
         ("other", {"kind": "box", "size_m": [0.02, 0.03, 0.012]}))]
