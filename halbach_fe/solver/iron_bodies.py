@@ -19,11 +19,12 @@ is a mean over all of the iron.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
@@ -47,6 +48,9 @@ from halbach_fe.solver.iron_modes import MESH
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
 from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
+
+if TYPE_CHECKING:
+    from halbach_fe.geo.iron_bodies import Sizes
 
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element
@@ -380,16 +384,37 @@ def solve_bodies(
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """A problem to assemble: what it depends on, and how to do it."""
+
+    key: tuple[object, ...]
+    assemble: Callable[[], Problem] = field(compare=False)
+
+
+@lru_cache(maxsize=2)  # that of the field and a coarser one; blocks that are updated change neither
+def _assembled(asked: _Asked) -> Problem:
+    return asked.assemble()
+
+
 def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Problem:
     """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
-    from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 
     _check_memory(magnet, size_of(magnet, coarseness).unknowns)
+    sizes = Sizes.of(magnet.study.mesh, coarseness)
+    key = magnet.study.iron, magnet.array_half_length, sizes, session.getdp
+    return _assembled(_Asked(key, partial(_assemble, magnet, session, sizes)))
+
+
+def _assemble(magnet: Magnet, session: Session, sizes: Sizes) -> Problem:
+    """Assemble the problem for elements of some sizes, as `assemble_bodies` does."""
+    from halbach_fe.geo.iron_bodies import mesh_iron  # imports Gmsh
+
     files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
     make_folder(session.folder)
     try:
-        regions, shell = mesh_iron(magnet.name, magnet.iron, Sizes.of(
-            magnet.study.mesh, coarseness), files.mesh)
+        regions, shell = mesh_iron(magnet.name, magnet.iron, sizes, files.mesh)
         regions.write(files.regions)
     except OSError as error:
         raise OutputError(

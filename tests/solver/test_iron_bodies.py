@@ -20,7 +20,7 @@ from halbach_fe.solver.formulation_choice import (
     finite_element_part,
     solve_nominal,
 )
-from halbach_fe.solver.iron_bodies import COARSER, solve_bodies
+from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.study.reader import parse_study
 from halbach_fe.study.solver import MeshSettings
@@ -136,6 +136,16 @@ def test_external_field_acts_on_the_iron(session, coarse_mesh):
         np.array(background), 1000.0, 0.02, POINTS - [0.0, 0.0, 0.05])
     assert np.abs(change - exact).max() < 5e-3  # as of the sphere above
     assert np.abs(exact - background).max() > 0.05
+
+
+def test_a_mesh_serves_other_blocks(session):
+    """Iron that is assembled once is not meshed again for other blocks, but for other iron."""
+    study = study_with(SPHERE, mesh={"block_size_m": 0.02, "growth": 4.0})
+    first, again, other = (assemble_bodies(build_magnet(one), session, 1.0) for one in (
+        study, study_with(SPHERE, permeability=1.1, mesh=study.mesh.model_dump()),
+        study_with(SPHERE | {"radius_m": 0.019}, mesh=study.mesh.model_dump())))
+    assert again is first
+    assert other is not first
 
 
 def test_the_key_of_finer_iron_is_named():
