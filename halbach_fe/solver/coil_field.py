@@ -62,7 +62,7 @@ def distance(coil: AnyCoil, points: Floats) -> Floats:
 def _from_segment(points: Floats, start: Floats, end: Floats) -> Floats:
     """Return distances (n,) of points (n, 3) from a straight segment."""
     along = end - start
-    share = np.clip((points - start) @ along / max(along @ along, 1e-300), 0.0, 1.0)
+    share = np.clip((points - start) @ along / (float(along @ along) or 1.0), 0.0, 1.0)
     return np.asarray(np.linalg.norm(points - start - share[:, None] * along, axis=1))
 
 
