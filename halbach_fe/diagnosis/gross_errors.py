@@ -50,7 +50,7 @@ from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import COMPONENTS, Component
+from halbach_fe.study.types import COMPONENTS, Axes, Component
 
 MAX_POINTS = 160
 """Number of points of the map that are compared."""
@@ -385,7 +385,27 @@ class _Search:
             for magnet in (source.magnet,) if source.magnet else (None, *self.turned):
                 more = (unit != 1) + (magnet is not source.magnet)
                 for fields in FIELD_AXES_BY_ERROR_COUNT[source.positions].get(left - more, ()):
-                    yield replace(source, fields=fields, flux_density_unit=unit, magnet=magnet)
+                    yield replace(source, fields=fields, flux_density_unit=unit, magnet=magnet,
+                                  components=self.components(fields))
+
+    def components(self, fields: Axes) -> tuple[Component, ...]:
+        """Return the components that are to be observed as well if the columns are of other axes.
+
+        They are those of the columns that were observed, unless the map has what the study observes
+        in its other columns.
+        """
+        old = self.study.instrument.field_axes
+        axes = compose_axes(old, fields)
+        read = {old[number][-1] for number in np.flatnonzero(self.observed)}
+        present = {name for name, column in zip(COMPONENTS, self.values.T, strict=True)
+                   if not np.isnan(column).all()}
+        if self.study.observation.quantity != "flux_density" or all(
+                axes[number][-1] in present for number in np.flatnonzero(self.observed)):
+            return ()
+        return tuple(name for name, axis, observed in zip(
+            COMPONENTS, axes, self.observed.tolist(), strict=True)
+            if axis[-1] in read & present and not observed
+            and name in COMPONENTS[:self.study.dimension])
 
     def elsewhere(self, level: int) -> Iterator[MapConvention]:
         """Yield the best conventions with ``level`` errors and points at other positions.
@@ -534,7 +554,7 @@ class _Search:
         old = self.study.instrument
         shown = to_magnet_axes(compose_axes(old.field_axes, convention.fields), self.values) * (
             old.flux_density_unit_T * convention.flux_density_unit)
-        used = ~np.isnan(shown) & self.observed
+        used = ~np.isnan(shown) & (self.observed | np.isin(COMPONENTS, convention.components))
         if not used.any() or used.sum() < MIN_USED * self.present:
             return None
         whole = max(_size(shown), 1e-300)
@@ -577,7 +597,7 @@ class _Search:
         """
         turned = convention.magnet if convention.magnet in self.turned else None
         return turned, self.nominal(replace(
-            convention, fields=IDENTITY_AXES, flux_density_unit=1.0,
+            convention, fields=IDENTITY_AXES, flux_density_unit=1.0, components=(),
             magnet=None if turned else convention.magnet))
 
     def nominal(self, source: MapConvention) -> _Nominal | None:

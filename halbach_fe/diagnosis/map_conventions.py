@@ -15,7 +15,7 @@ from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.study.array import check_order
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import COMPONENTS, Axes
+from halbach_fe.study.types import COMPONENTS, Axes, Component
 
 LENGTH_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
 """Length units by their size in m."""
@@ -74,6 +74,9 @@ class MapConvention:
         Offset of the points' distances from the axis.
     shift_m : tuple of float
         Displacement of all points.
+    components : tuple of str
+        Components that the map shows and the study does not observe, such as z if it is what a
+        study of y alone calls so.
     """
 
     length_unit: float = 1.0
@@ -84,6 +87,7 @@ class MapConvention:
     radius: float = 1.0
     offset_m: float = 0.0
     shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    components: tuple[Component, ...] = ()
 
     @property
     def errors(self) -> tuple[tuple[str, str], ...]:
@@ -141,7 +145,12 @@ class MapConvention:
             "radius_scale": (1 + old.radius_scale) * self.radius - 1,
             "radius_offset_m": old.radius_offset_m * self.radius + self.offset_m,
             "translation_m": tuple(np.add(old.translation_m, self.shift_m).tolist())}
-        return study.with_(instrument=old.with_(**changes))
+        study = study.with_(instrument=old.with_(**changes))
+        observed = study.observation
+        if not self.components or observed.quantity != "flux_density":
+            return study
+        return study.with_(observation=observed.with_(
+            components=(*observed.components, *self.components)))
 
 
 def array_variants(study: Study) -> tuple[ArrayVariant, ...]:

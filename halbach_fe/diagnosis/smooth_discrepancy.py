@@ -18,6 +18,7 @@ import numpy as np
 from scipy import special
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.surface import is_in_plane
 
 DECAY_RATES = ((0.25, 0.125), (1.0, 0.4), (2.0, 1.0))
 """Candidate decay rates of the logarithm of the amplitudes: per azimuthal order, and per half wave
@@ -59,7 +60,7 @@ def harmonic_fields(
     angle = np.arctan2(points[:, 1], points[:, 0])
     z = points[:, 2] - points[:, 2].mean()
     # longer than the map, on which the terms must not be periodic
-    flat, scale = not np.ptp(z), max(radius.max(), 1e-9)
+    flat, scale = is_in_plane(points), max(radius.max(), 1e-9)
     length = (2 * scale if flat else max(np.ptp(z), 1e-9)) * 1.2
     along, across = np.eye(3)[2], np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     around = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
@@ -121,7 +122,7 @@ def sensor_errors(points: Floats, orders: int = 3, waves: int = 8) -> SmoothTerm
     length = max(np.ptp(z), 1e-9)
     found: list[Floats] = []
     fineness: list[tuple[int, int]] = []
-    for wave in range(waves + 1 if np.ptp(z) else 1):
+    for wave in range(1 if is_in_plane(points) else waves + 1):
         for shift in (0.0, np.pi / 2)[:1 + (wave > 0)]:
             along = np.cos(wave * np.pi * z / length - shift)
             for order in range(orders + 1):

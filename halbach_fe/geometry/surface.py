@@ -27,6 +27,16 @@ a million times its size from the origin. Across this distance the field changes
 the remanence."""
 
 
+def is_in_plane(points: Floats) -> bool:
+    """Tell whether points (n, 3) in m lie in one plane across z, or in one that is slightly tilted.
+
+    A tilt of 0.1 rad changes distances across by 0.5 %, and the
+    field of a long magnet does not depend on z.
+    """
+    tilt_rad = 0.1
+    return bool(np.ptp(points[:, 2]) <= tilt_rad * np.ptp(points[:, :2], axis=0).max())
+
+
 @dataclass(frozen=True)
 class Contact:
     """Where points (n,) lie relative to a body.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, PointsOutsideError
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.inference.block_prior import prior_from_blocks
+from halbach_fe.inference.block_prior import MeasuredPrior, prior_from_blocks
 from halbach_fe.inference.instrument_fit import (
     Beside,
     OpenTerms,
@@ -57,7 +57,9 @@ from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import Rows, predict
+from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
+from halbach_fe.study.uncertain import Uncertain
 
 ROUNDS, AT_REST = 16, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its
@@ -146,140 +148,295 @@ def infer(
     >>> bool(block["posterior_sd"] < block["prior_sd"])
     True
     """
-    of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
-    if prior is not None:
-        prior = distribution_of(magnet, prior, "prior")
-    maps: Sequence[Map] = maps_of(magnet.study, data, validation_map)
-    open_terms = OpenTerms.of(maps)
-    total = np.zeros(len(open_terms))
-    noises: Noises = {}
-    error: Floats | None = None
-    solved: _Solved | None = None
-    place: _Place | None = None
-    share = 1.0
-    at = _Estimate.of(magnet, session) if len(open_terms) else None
-    of_instruments = [one for one in magnet.study.uncertain if one.is_of_instrument]
-    field = field_function(magnet, session.within("instrument")) if of_instruments else None
-    uncertain = any(one.study.noise is not None and any(one.study.noise.position_sd_m or ())
-                    for one in maps)
-    estimated: tuple[MagnetBlock, ...] | None = None
-    magnitudes = Magnitudes()
-    rounds = 0
-    while rounds < ROUNDS:
-        rounds += 1
-        readings = read_campaign(magnet, maps, noises, estimated, magnitudes.directions)
-        if solved is None:
-            check_validation_map(readings, magnet.study)
-        training = readings.training
-        if solved is None or (at is not None
-                              and solved.neglected(at, maps, readings) > NEGLECTED):
-            solved = _Solved(
-                _response(magnet, readings.vectors, session, similar), maps,
-                np.zeros(0) if at is None else readings_of_field(
-                    at.nominal, maps, readings.vectors))
-            vectors = solved.response
-        elif at is not None:
-            vectors = solved.moved(at, maps, readings)
-        model = readings.projected(vectors, session.folder)
-        others = len(model.parameters) - len(magnet.parameter_names)
-        magnet_prior = prior or (with_others(of_blocks.gaussian, magnet, others) if of_blocks
-                                 else study_prior(magnet, others))
-        matrix: Rows = model.matrix
-        whole_prior = magnet_prior
-        if field is not None:
-            matrix = Beside(matrix, amplitude_columns(
-                with_instruments(magnet.study, maps), field if at is None else at.field, maps,
-                readings))
-            whole_prior = joined(whole_prior, np.zeros(len(of_instruments)),
-                                 np.ones(len(of_instruments)))
-        nearby = _neighbour_columns(magnet, maps, readings)
-        if nearby.size:
-            matrix = Beside(matrix, nearby)
-            whole_prior = joined(whole_prior, np.zeros(nearby.shape[1]),
-                                 np.ones(nearby.shape[1]))
-        if at is not None:
-            matrix = Beside(matrix, open_terms.columns(at.field, maps, readings))
-            whole_prior = joined(whole_prior, -total, open_terms.sd)
-        residual = readings.values - model.offset
-        # one noise for all updates: what they find is compared by its probability
-        error = model.error if error is None else error
-        magnitudes = magnitudes.about(readings, vectors, model, whole_prior)
-        noise = magnitudes.with_bend(readings.noise)
-        errors = noise.with_independent_errors(error)
-        update = linear_gaussian.update(
-            matrix, residual[training], errors.subset(training), whole_prior,
-            np.flatnonzero(training))
-        whole = update.distribution
-        values, _, change = np.split(
-            whole.mean, np.cumsum(
-                [len(model.parameters), len(of_instruments) + nearby.shape[1]]))
-        sd = whole.sd_of(np.hstack([np.zeros((len(change), len(whole.mean) - len(change))),
-                                    open_terms.counted]))
-        if at is not None:
-            here = _Place(maps, total, at, change, values - model.nominal,
-                          update.log_evidence + _log_density_at_zero(whole, len(change)))
-            if place is not None and here.log_posterior < place.log_posterior - NO_WORSE and (
-                    share > SMALLEST_SHARE):
-                share /= 2  # the readings are not linear in so large a change
-            else:
-                place, share = here, 1.0
-            total, maps, at = place.moved(open_terms, share)
-            largest = np.max(np.abs(open_terms.counted @ change) / sd)
-            say(f"update {rounds}, of at most {ROUNDS}: the terms of the instruments change by up "
-                f"to {largest:.2g} standard deviations" + (
-                    f", of which {100 * share:.0f} % are taken" if share < 1 else ""))
-        before, magnitudes = magnitudes, magnitudes.updated(readings, vectors, model, whole)
-        if not magnitudes.is_near(before, noise.sd):
-            place = None  # about other directions the evidence is another one
-        at_rest = share == 1.0 and bool((
-            np.abs(open_terms.counted @ change) <= AT_REST * sd).all()) and magnitudes.is_near(
-                before, noise.sd)
-        if at_rest and not uncertain:
-            break
-        if at_rest:  # again, with the noise that positions make in this magnet's gradient
-            uncertain, noises, error, rounds, place = False, {}, None, 0, None
-            estimated = with_magnetizations(magnet, values[:len(magnet.parameter_names)])
-    else:
-        what = "terms of the instruments" if len(open_terms) else "directions of |B|"
+    search = _Search.of(magnet, maps_of(magnet.study, data, validation_map), session, similar,
+                        None if blocks is None else prior_from_blocks(magnet, blocks),
+                        prior if prior is None else distribution_of(magnet, prior, "prior"))
+    at_rest = search.come_to_rest(say)
+    if at_rest and search.has_uncertain_positions:
+        search.estimate_noise_of_positions()
+        at_rest = search.come_to_rest(say)
+    if not at_rest:
+        what = "terms of the instruments" if len(search.terms) else "directions of |B|"
         warnings.warn(
             f"The {what} of study {magnet.name} have not come to rest after {ROUNDS} updates: "
-            f"{'their' if len(open_terms) else 'the'} error bars may be too small.",
+            f"{'their' if len(search.terms) else 'the'} error bars may be too small.",
             HalbachWarning, stacklevel=2)
-    warn_of_bent_readings(readings, magnitudes)
-    if update.discarded_information > LEFT_OUT:
+    last = search.last
+    warn_of_bent_readings(last.readings, last.magnitudes)
+    if last.update.discarded_information > LEFT_OUT:
         warnings.warn(
             f"Study {magnet.name} has so many parameters and readings that some combinations of "
             "readings were discarded, which may change a posterior variance by a fraction of up to "
-            f"{update.discarded_information:.1g}.",
+            f"{last.update.discarded_information:.1g}.",
             HalbachWarning, stacklevel=2)
-    posterior = whole
-    if len(open_terms) or of_instruments or nearby.size:
-        magnet_prior, posterior = of_the_first([whole_prior, whole], len(model.parameters))
     if magnet.is_nonlinear and not linearized_only:
-        _check_linearization(magnet, readings.observation, session, model, posterior.mean,
-                             errors.sd)
-    return InferenceResult(
-        magnet=magnet.with_study(with_instruments(magnet.study, maps)),
-        observation=readings.observation, readings=readings.values, noise=noise,
-        parts=readings.parts, regions=readings.regions, maps=readings.maps, response=model,
-        prior=magnet_prior, posterior=posterior,
-        prediction_prior=_predict(
-            matrix, model.offset + bent(readings, vectors, model, whole_prior), whole_prior),
-        prediction_posterior=_predict(
-            matrix, model.offset + bent(readings, vectors, model, whole), whole),
-        prior_conflict=update.prior_conflict, parameters_learnt=update.parameters_learnt,
-        log_evidence=update.log_evidence,
-        kind="linearized" if magnet.is_nonlinear else "closed form",
-        measured_blocks=blocks.serial if blocks and not prior else None,
-        table_doubts=of_blocks.doubts if of_blocks and not prior else (),
-        left_out=update.discarded_information,
-        terms=InstrumentTerms(open_terms.names, open_terms.counted @ total, sd, open_terms.sd,
-                              at_rest, _poses(open_terms, maps, whole))
-        if len(open_terms) else None,
-        amplitudes=_amplitudes(magnet.study, whole, len(model.parameters)),
-        overlaps=overlaps(matrix, residual, errors, whole_prior, readings),
-        regions_left_out=left_out(matrix, residual, errors, whole_prior, readings),
-        noise_blocks=estimated)
+        _check_linearization(magnet, last.readings.observation, session, last.model,
+                             last.whole.mean[:len(last.model.parameters)], last.errors.sd)
+    return search.result(blocks, at_rest)
+
+
+@dataclass(frozen=True)
+class _Update:
+    """One update of all parameters: those of the blocks, then what is beside them.
+
+    Attributes
+    ----------
+    readings : Readings
+    vectors, model : Response
+        The responses of `Readings.vectors` and of the readings to the parameters of the blocks.
+    matrix : Rows
+        Derivatives (readings, parameters) by all parameters.
+    prior : Gaussian
+    residual : ndarray, shape (readings,), in T
+        Readings less what the model reads of the nominal magnet.
+    errors : NoiseCovariance
+        Noise of the readings, with the solver's error and the bend of |B|.
+    magnitudes : Magnitudes
+        About which readings of |B| are linear.
+    update : LinearPosterior
+    """
+
+    readings: Readings
+    vectors: Response
+    model: Response
+    matrix: Rows
+    prior: Gaussian
+    residual: Floats
+    errors: NoiseCovariance
+    magnitudes: Magnitudes
+    update: linear_gaussian.LinearPosterior
+
+    @property
+    def whole(self) -> Gaussian:
+        """The posterior of all parameters."""
+        return self.update.distribution
+
+    def predicted(self, parameters: Gaussian) -> Prediction:
+        """Return the prediction of all readings from a distribution of all parameters."""
+        mean, sd = predict(self.matrix, parameters)
+        offset = self.model.offset + bent(self.readings, self.vectors, self.model, parameters)
+        return Prediction(offset + mean, sd, lambda rows: self.matrix[rows] @ parameters.root,
+                          parameters.root.shape[1])
+
+
+@dataclass
+class _Search:
+    """Updates, each about what the last one found, until the terms of the instruments are at rest.
+
+    Attributes
+    ----------
+    magnet : Magnet
+    session : Session
+    similar : Magnet or None
+        See `infer`.
+    of_blocks : MeasuredPrior or None
+        Prior from a table of measured blocks.
+    prior : Gaussian or None
+        Prior of the blocks' parameters that replaces it and that of the study.
+    terms : OpenTerms
+        Terms of the instruments that are estimated.
+    amplitudes : tuple of Uncertain
+        What else is uncertain of the instruments.
+    maps : sequence of Map
+        With the instruments as they are estimated.
+    total : ndarray, shape (terms,)
+        Change of the open terms since the study.
+    at : _Estimate or None
+        The magnet as it is estimated; None if all terms are known.
+    nominal_field : callable or None
+        Field of the nominal magnet, if ``amplitudes`` act on it.
+    magnitudes : Magnitudes
+        The field about which readings of |B| are linear.
+    noises : dict
+        Noise of each map, computed once for one magnet.
+    noise_blocks : tuple of MagnetBlock or None
+        In whose gradient uncertain positions make the noise; None for the nominal ones.
+    solved : _Solved or None
+        The last response that was solved for.
+    error : ndarray or None, in T
+        Of the solver in each reading.
+    place : _Place or None
+        What the last update that was not worse has found.
+    share : float
+        Part of the last change of the terms that was taken.
+    last : _Update
+    """
+
+    magnet: Magnet
+    session: Session
+    similar: Magnet | None
+    of_blocks: MeasuredPrior | None
+    prior: Gaussian | None
+    terms: OpenTerms
+    amplitudes: tuple[Uncertain, ...]
+    maps: Sequence[Map]
+    total: Floats
+    at: _Estimate | None
+    nominal_field: Callable[[Floats], Floats] | None
+    magnitudes: Magnitudes = field(default_factory=Magnitudes)
+    noises: Noises = field(default_factory=dict)
+    noise_blocks: tuple[MagnetBlock, ...] | None = None
+    solved: _Solved | None = None
+    error: Floats | None = None
+    place: _Place | None = None
+    share: float = 1.0
+    last: _Update = field(init=False)
+
+    @classmethod
+    def of(
+        cls, magnet: Magnet, maps: Sequence[Map], session: Session, similar: Magnet | None,
+        of_blocks: MeasuredPrior | None, prior: Gaussian | None
+    ) -> _Search:
+        """Return the search before its first update."""
+        terms = OpenTerms.of(maps)
+        amplitudes = tuple(one for one in magnet.study.uncertain if one.is_of_instrument)
+        at = _Estimate.of(magnet, session) if len(terms) else None
+        nominal = field_function(magnet, session.within("instrument")) if amplitudes else None
+        return cls(magnet, session, similar, of_blocks, prior, terms, amplitudes, maps,
+                   np.zeros(len(terms)), at, nominal)
+
+    @property
+    def has_uncertain_positions(self) -> bool:
+        """Whether positions of readings are uncertain, which makes noise in a gradient."""
+        return any(one.study.noise is not None and any(one.study.noise.position_sd_m or ())
+                   for one in self.maps)
+
+    def come_to_rest(self, say: Callable[[str], None]) -> bool:
+        """Update about what the last update found, and tell whether that came to rest."""
+        return any(self._update(number, say) for number in range(1, ROUNDS + 1))
+
+    def estimate_noise_of_positions(self) -> None:
+        """Take the noise that uncertain positions make in the gradient of the estimated magnet."""
+        values = self.last.whole.mean[:len(self.magnet.parameter_names)]
+        self.noise_blocks = with_magnetizations(self.magnet, values)
+        self.noises, self.error, self.place = {}, None, None
+
+    def _update(self, number: int, say: Callable[[str], None]) -> bool:
+        """Make an update, move to what it found, and tell whether that changed next to nothing."""
+        readings = read_campaign(self.magnet, self.maps, self.noises, self.noise_blocks,
+                                 self.magnitudes.directions)
+        if self.solved is None:
+            check_validation_map(readings, self.magnet.study)
+        self.last = last = self._update_of(readings, self._vectors(readings))
+        change = last.whole.mean[len(last.whole.mean) - len(self.terms):]
+        sd = self._sd_of_terms()
+        if self.at is not None:
+            self._move(self.at, change)
+            largest = np.max(np.abs(self.terms.counted @ change) / sd)
+            say(f"update {number}, of at most {ROUNDS}: the terms of the instruments change by up "
+                f"to {largest:.2g} standard deviations" + (
+                    f", of which {100 * self.share:.0f} % are taken" if self.share < 1 else ""))
+        self.magnitudes = last.magnitudes.updated(
+            readings, last.vectors, last.model, last.whole)
+        directed = self.magnitudes.is_near(
+            last.magnitudes, last.magnitudes.with_bend(readings.noise).sd)
+        if not directed:
+            self.place = None  # about other directions the evidence is another one
+        return bool(directed and self.share == 1.0
+                    and (np.abs(self.terms.counted @ change) <= AT_REST * sd).all())
+
+    def _vectors(self, readings: Readings) -> Response:
+        """Return the response of `Readings.vectors`, solved for or moved with the sensors."""
+        if self.solved is not None and (
+                self.at is None
+                or self.solved.neglected(self.at, self.maps, readings) <= NEGLECTED):
+            return self.solved.response if self.at is None else self.solved.moved(
+                self.at, self.maps, readings)
+        self.solved = _Solved(
+            _response(self.magnet, readings.vectors, self.session, self.similar), self.maps,
+            np.zeros(0) if self.at is None else readings_of_field(
+                self.at.nominal, self.maps, readings.vectors))
+        return self.solved.response
+
+    def _update_of(self, readings: Readings, vectors: Response) -> _Update:
+        """Return the update of all parameters by the readings for training."""
+        model = readings.projected(vectors, self.session.folder)
+        matrix: Rows = model.matrix
+        prior = self._prior_of_blocks(len(model.parameters))
+        for columns, mean, sd in self._beside(readings):
+            matrix, prior = Beside(matrix, columns), joined(prior, mean, sd)
+        # one noise for all updates: what they find is compared by its probability
+        self.error = model.error if self.error is None else self.error
+        magnitudes = self.magnitudes.about(readings, vectors, model, prior)
+        errors = magnitudes.with_bend(readings.noise).with_independent_errors(self.error)
+        residual, training = readings.values - model.offset, readings.training
+        return _Update(
+            readings, vectors, model, matrix, prior, residual, errors, magnitudes,
+            linear_gaussian.update(matrix, residual[training], errors.subset(training), prior,
+                                   np.flatnonzero(training)))
+
+    def _prior_of_blocks(self, parameters: int) -> Gaussian:
+        """Return the prior of the ``parameters`` of the blocks."""
+        if self.prior is not None:
+            return self.prior
+        others = parameters - len(self.magnet.parameter_names)
+        return study_prior(self.magnet, others) if self.of_blocks is None else with_others(
+            self.of_blocks.gaussian, self.magnet, others)
+
+    def _beside(self, readings: Readings) -> Iterator[tuple[Floats, Floats, Floats]]:
+        """Yield derivatives, prior mean and prior standard deviations of what is beside blocks."""
+        if self.nominal_field is not None:
+            columns = amplitude_columns(
+                with_instruments(self.magnet.study, self.maps),
+                self.nominal_field if self.at is None else self.at.field, self.maps, readings)
+            yield columns, np.zeros(len(self.amplitudes)), np.ones(len(self.amplitudes))
+        nearby = _neighbour_columns(self.magnet, self.maps, readings)
+        if nearby.size:
+            yield nearby, np.zeros(nearby.shape[1]), np.ones(nearby.shape[1])
+        if self.at is not None:
+            yield (self.terms.columns(self.at.field, self.maps, readings), -self.total,
+                   self.terms.sd)
+
+    def _sd_of_terms(self) -> Floats:
+        """Return the posterior standard deviations of the open terms, as they are counted."""
+        whole = self.last.whole
+        return whole.sd_of(np.hstack([
+            np.zeros((len(self.terms), len(whole.mean) - len(self.terms))), self.terms.counted]))
+
+    def _move(self, at: _Estimate, change: Floats) -> None:
+        """Move terms, maps and magnet to what the last update found, or part of the way there."""
+        whole, model = self.last.whole, self.last.model
+        here = _Place(
+            self.maps, self.total, at, change, whole.mean[:len(model.parameters)] - model.nominal,
+            self.last.update.log_evidence + _log_density_at_zero(whole, len(change)))
+        if self.place is not None and self.share > SMALLEST_SHARE and (
+                here.log_posterior < self.place.log_posterior - NO_WORSE):
+            self.share /= 2  # the readings are not linear in so large a change
+        else:
+            self.place, self.share = here, 1.0
+        self.total, self.maps, self.at = self.place.moved(self.terms, self.share)
+
+    def result(self, blocks: BlockTable | None, at_rest: bool) -> InferenceResult:
+        """Return what the last update found."""
+        magnet, last = self.magnet, self.last
+        of_blocks = self.of_blocks if self.prior is None else None
+        readings, whole = last.readings, last.whole
+        prior, posterior = last.prior, whole
+        if len(whole.mean) > len(last.model.parameters):
+            prior, posterior = of_the_first([prior, whole], len(last.model.parameters))
+        return InferenceResult(
+            magnet=magnet.with_study(with_instruments(magnet.study, self.maps)),
+            observation=readings.observation, readings=readings.values,
+            noise=last.magnitudes.with_bend(readings.noise), parts=readings.parts,
+            regions=readings.regions, maps=readings.maps, response=last.model,
+            prior=prior, posterior=posterior, prediction_prior=last.predicted(last.prior),
+            prediction_posterior=last.predicted(whole),
+            prior_conflict=last.update.prior_conflict,
+            parameters_learnt=last.update.parameters_learnt,
+            log_evidence=last.update.log_evidence,
+            kind="linearized" if magnet.is_nonlinear else "closed form",
+            measured_blocks=blocks.serial if blocks and of_blocks else None,
+            table_doubts=of_blocks.doubts if of_blocks else (),
+            left_out=last.update.discarded_information,
+            terms=InstrumentTerms(
+                self.terms.names, self.terms.counted @ self.total, self._sd_of_terms(),
+                self.terms.sd, at_rest, _poses(self.terms, self.maps, whole))
+            if len(self.terms) else None,
+            amplitudes=_amplitudes(magnet.study, whole, len(last.model.parameters)),
+            overlaps=overlaps(last.matrix, last.residual, last.errors, last.prior, readings),
+            regions_left_out=left_out(last.matrix, last.residual, last.errors, last.prior,
+                                      readings),
+            noise_blocks=self.noise_blocks)
 
 
 def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
@@ -496,13 +653,6 @@ def observation_of(
             noise = noise.with_(position_sd_m=None) if noise.regions else None
         quick.append(replace(one, study=one.study.with_(noise=noise)))
     return read_campaign(magnet, quick).observation
-
-
-def _predict(matrix: Rows, offset: Floats, parameters: Gaussian) -> Prediction:
-    """Return the prediction of all readings from a distribution of all parameters."""
-    mean, sd = predict(matrix, parameters)
-    return Prediction(offset + mean, sd, lambda rows: matrix[rows] @ parameters.root,
-                      parameters.root.shape[1])
 
 
 def _check_linearization(

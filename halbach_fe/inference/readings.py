@@ -17,6 +17,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.surface import is_in_plane
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
 from halbach_fe.measurement.campaign import SAME_PLACE_M, SAME_READING, SHARED, Map, repeated
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
@@ -169,13 +170,9 @@ def read_campaign(
 
 
 def _check_plane(points: Floats, where: str) -> None:
-    """Raise a MeasurementError if the points (n, 3) in m of a 2D study are at several heights.
-
-    Those of a tilted mapper are, by a small part of its size: what a tilt of 0.1 rad changes of the
-    places across is 0.5 % of it, and the field of a long magnet does not depend on z.
-    """
-    heights, tilted = points[:, 2], 0.1
-    if np.ptp(heights) > tilted * np.ptp(points[:, :2], axis=0).max():
+    """Raise a MeasurementError if the points (n, 3) in m of a 2D study are at several heights."""
+    heights = points[:, 2]
+    if not is_in_plane(points):
         raise MeasurementError(must_be(
             "points", where, "in one plane for a 2D study",
             f"z from {heights.min():g} to {heights.max():g} m",

@@ -28,7 +28,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -410,18 +410,23 @@ def _run_variants(
     return [np.concatenate(results[a:b]) for a, b in pairwise(limits)]
 
 
-def render(template: str, *, magnet: Magnet, **data: object) -> str:
-    """Return the generated part of a problem as GetDP text, from a template in pro/."""
-    source = resources.files(pro).joinpath(template).read_text("utf-8")
-    environment = jinja2.Environment(
+@cache
+def _templates() -> jinja2.Environment:
+    """Return the templates of pro/, which are compiled once in a process."""
+    return jinja2.Environment(
         variable_start_string="<<", variable_end_string=">>", block_start_string="<%",
         block_end_string="%>", comment_start_string="<#", comment_end_string="#>",
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined,
-        autoescape=False, keep_trailing_newline=True)  # GetDP text, not HTML
-    return environment.from_string(source).render(
+        autoescape=False, keep_trailing_newline=True,  # GetDP text, not HTML
+        loader=jinja2.FunctionLoader(lambda name: resources.files(pro).joinpath(
+            name).read_text("utf-8")))
+
+
+def render(template: str, *, magnet: Magnet, **data: object) -> str:
+    """Return the generated part of a problem as GetDP text, from a template in pro/."""
+    return _templates().get_template(template).render(
         study=magnet.study, version=version("halbach-fe"), mu_0=MU_0, blocks=magnet.blocks,
-        iron_permeability=magnet.iron_permeability,
-        **data)
+        iron_permeability=magnet.iron_permeability, **data)
 
 
 def _source_tasks(case: _Case, vacuum: bool, parts: int) -> list[Task]:

@@ -80,6 +80,21 @@ def test_a_map_that_is_written_wrongly(case, right):
         np.testing.assert_allclose(read["B_T"], right["B_T"], atol=1e-12)
 
 
+@pytest.mark.parametrize("shown", "yz")
+def test_the_only_column_is_of_another_component(right, shown):
+    """A study that observes y alone, and a map whose column By has that component."""
+    study = STUDY.with_(observation=STUDY.observation.with_(components=("y",)))
+    data = right.copy(deep=True)
+    data["B_T"].values[:] = np.nan
+    data["B_T"].values[:, 1] = right["B_T"].values[:, "xyz".index(shown)]
+    found = find_gross_errors(study, data)
+    assert [error.names for error in found] == [("swapped_axes",)] * (shown != "y")
+    for error in found:
+        read = in_si_and_magnet_axes(error.apply(study).instrument, data)["B_T"].values
+        np.testing.assert_array_equal(read[:, 2], right["B_T"].values[:, 2])
+        assert error.apply(study).observation.components == ("y", "z")
+
+
 @pytest.mark.parametrize("case", ["reversed_z", "right", "displaced", "without a table"])
 def test_an_error_that_only_measured_blocks_show(case, generator):
     """Of Bx and By alone the two ends of this magnet are alike, but for its blocks. A map that is

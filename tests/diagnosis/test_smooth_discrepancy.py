@@ -8,7 +8,7 @@ import pytest
 
 from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import field_family, fit_family, instrument_families
-from halbach_fe.diagnosis.smooth_discrepancy import harmonic_fields
+from halbach_fe.diagnosis.smooth_discrepancy import harmonic_fields, sensor_errors
 from tests.conftest import circle
 
 STEP = 1e-5
@@ -33,6 +33,15 @@ def test_harmonic_fields_have_no_source_in_the_bore():
     # differences of STEP are off by rounding, 1e-16 / STEP, and by its square
     assert np.abs(np.trace(gradient, axis1=2, axis2=3)).max() < 1e-5 * size
     assert np.abs(gradient - np.swapaxes(gradient, 2, 3)).max() < 1e-5 * size
+
+
+def test_a_plane_that_is_slightly_tilted_is_a_plane():
+    plane = circle(0.03, 16, 0.0)
+    tilted = plane + 1e-3 * plane[:, :1] * [0, 0, 1]
+    for terms in (harmonic_fields, sensor_errors):
+        there, level = terms(tilted).fields, terms(plane).fields
+        assert there.shape == level.shape
+        assert np.abs(there - level).max() < 2e-3 * np.abs(level).max()  # twice the tilt
 
 
 def factors(field):

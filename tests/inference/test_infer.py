@@ -15,7 +15,6 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.readings import _check_plane
 from halbach_fe.inference.result import TOO_NEAR
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
@@ -311,9 +310,12 @@ def test_maps_that_do_not_fit_the_study(short_dipole, dipole, session):
         infer(build_magnet(dipole(noise=NOISE)), sloped, session)
     # but a tilted mapper stays in the plane, as far as the field of a long magnet shows it
     tilted = np.array([[0.01, 0, 1e-4], [-0.01, 0, -1e-4], [0, 0.01, 0]])
-    _check_plane(tilted, "map")
+    array, across = dipole(noise=NOISE), np.ones((3, 3)) * [1, 1, 0]
+    upright = infer(build_magnet(array), field_map(tilted * [1, 1, 0], across), session)
+    update = infer(build_magnet(array), field_map(tilted, across), session)
+    np.testing.assert_allclose(update.posterior.mean, upright.posterior.mean, rtol=1e-9, atol=1e-12)
     with pytest.raises(MeasurementError, match="one plane for a 2D study"):
-        _check_plane(tilted * [1, 1, 20], "map")
+        infer(build_magnet(array), field_map(tilted * [1, 1, 20], across), session)
     with pytest.raises(StudyError, match="how noisy"):
         infer(build_magnet(short_dipole()), field_map(np.zeros((1, 3)), np.ones((1, 3))), session)
 
