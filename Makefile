@@ -16,6 +16,8 @@
 # make study-mri-large     an MRI magnet of 4 032 cubes in three layers
 # make study-mandhala      two rings of square bars
 # make study-hybrid-quadrupole  steel poles and free blocks, in cross-section
+# make study-mri-plates     eight cubes between two steel plates
+# make study-hybrid-undulator  saturating poles between magnets, in 3D
 # make study-sensitivity   where the field is sensitive to the blocks, and where to measure it
 # make benchmark-scaling   time and memory by blocks, readings, unknowns of the mesh and workers
 # Both set up everything they need first (tools/setup.sh).
@@ -23,7 +25,7 @@
 # Without compiled files beside the sources every process of the tests would compile all again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-cubes study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole test test-quick fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
+.PHONY: docs demo verify-diagnosis study-faser study-faser-diagnosis study-linear-3d verify-calibration study-nonlinear-2d study-sensitivity study-quadrupole study-cubes study-mri study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole study-mri-plates study-hybrid-undulator test test-quick fuzz benchmark benchmark-scaling lint wheel-check setup setup-test clean
 
 demo: setup
 	.venv/bin/python studies/faser/diagnose.py -o results/demo --quick
@@ -61,7 +63,7 @@ study-quadrupole study-cubes: study-%: setup
 
 # What the language of magnets can describe; the campaigns are simulated on the spot, with nothing
 # hidden, so that the diagnosis should find nothing.
-study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole: study-%: setup-test
+study-emphatic study-mri4all study-mri-large study-mandhala study-hybrid-quadrupole study-mri-plates study-hybrid-undulator: study-%: setup-test
 	.venv/bin/halbach-fe solve studies/$*/study.toml -o results/$*/field
 	.venv/bin/halbach-fe verify studies/$*/study.toml -o results/$*/verified
 	test -e results/$*/campaign/map.csv || .venv/bin/halbach-fe simulate-measurement \

@@ -44,8 +44,8 @@ CONTENTS = {
         "diagnose", "forces", "corner", "tolerance", "shim"))),
     "Gallery": ("gallery", *(f"gallery/{study}" for study in (
         "paper", "faser", "linear-3d", "nonlinear-2d", "quadrupole", "cubes", "mri", "mandhala",
-        "mri4all", "mri-large", "emphatic", "hybrid-quadrupole", "sensitivity", "calibration",
-        "diagnosis"))),
+        "mri4all", "mri-large", "emphatic", "hybrid-quadrupole", "mri-plates",
+        "hybrid-undulator", "sensitivity", "calibration", "diagnosis"))),
     "How to": ("how-to/describe-your-magnet", "how-to/own-geometry", "how-to/own-steel",
                "how-to/own-effect", "how-to/own-map", "how-to/next-magnet", "how-to/many-cores",
                "how-to/cluster"),

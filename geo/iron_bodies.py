@@ -13,11 +13,13 @@ from pathlib import Path
 import gmsh
 import numpy as np
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions
 from halbach_fe.geometry.iron import IronSolid
+from halbach_fe.study.solver import MeshSettings
 
 
 @dataclass(frozen=True)
@@ -46,15 +48,18 @@ class Sizes:
     growth: float
 
     @classmethod
-    def of(cls, size: float, coarseness: float = 1.0) -> Sizes:
-        """Return those for elements of a size in m; a larger ``coarseness`` is for error bars."""
-        return cls(coarseness * size, 1.2 * coarseness, 0.25 * coarseness, 0.4,
-                   0.35 * coarseness**0.6)
+    def of(cls, mesh: MeshSettings, coarseness: float = 1.0) -> Sizes:
+        """Return those of a study; a larger ``coarseness`` is for error bars."""
+        usual = 0.4  # growth - 1 for which the numbers below are
+        relative = coarseness * (mesh.growth - 1) / usual
+        return cls(coarseness * mesh.block_size_m, 1.2 * relative, 0.25 * relative, 0.4,
+                   0.35 * relative**0.6)
 
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""
         volume, surface, _ = body.measures
-        round_body = np.inf if body.outline else self.curvature * body.outer_radius
+        round_body = np.inf if body.outline or body.triangles is not None else (
+            self.curvature * body.outer_radius)
         return min(self.iron, self.thickness * volume / surface, round_body)
 
     def count(self, bodies: Sequence[IronSolid]) -> tuple[int, int]:
@@ -183,7 +188,33 @@ def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes
 def _is_sharp(curve: tuple[int, int]) -> bool:
     """Tell whether a curve is an edge between two faces, and no seam of a round one."""
     faces, _ = gmsh.model.getAdjacencies(*curve)
-    return len(faces) > 1 and gmsh.model.occ.getMass(*curve) > 0
+    if not (len(faces) > 1 and gmsh.model.occ.getMass(*curve) > 0):
+        return False
+    smooth = 0.94  # cosine of 20 degrees: triangles of a round body meet at less
+    normals = [gmsh.model.getNormal(face, [0.0, 0.0]) for face in faces
+               if gmsh.model.getType(2, face) == "Plane"]
+    return len(normals) < 2 or abs(np.dot(normals[0], normals[1])) < smooth
+
+
+def _within(triangles: Floats) -> int:
+    """Add the volume in a closed surface of triangles (n, 3, 3) in m to the model."""
+    occ = gmsh.model.occ
+    same = 1e-6 * np.ptp(triangles.reshape(-1, 3), axis=0).max()  # as `closed_surface` has it
+    _, first, number = np.unique((triangles / same).round().reshape(-1, 3), axis=0,
+                                 return_index=True, return_inverse=True)
+    points = [occ.addPoint(*place) for place in triangles.reshape(-1, 3)[first]]
+    lines: dict[tuple[int, int], int] = {}
+    faces = []
+    for corners in number.reshape(-1, 3).tolist():
+        loop = []
+        for start, end in pairwise([*corners, corners[0]]):
+            if (end, start) in lines:
+                loop.append(-lines[end, start])
+            else:
+                lines[start, end] = occ.addLine(points[start], points[end])
+                loop.append(lines[start, end])
+        faces.append(occ.addPlaneSurface([occ.addCurveLoop(loop)]))
+    return int(occ.addVolume([occ.addSurfaceLoop(faces)]))
 
 
 def _volume(body: IronSolid) -> tuple[int, int]:
@@ -191,6 +222,8 @@ def _volume(body: IronSolid) -> tuple[int, int]:
     occ = gmsh.model.occ
     if body.sphere:
         volume = 3, occ.addSphere(0.0, 0.0, 0.0, body.outer_radius)
+    elif body.triangles is not None:
+        volume = 3, _within(body.triangles)
     elif body.outline is not None:
         starts = [occ.addPoint(*edge.start, body.z_min) for edge in body.outline]
         lines = [occ.addLine(start, end) for start, end in pairwise([*starts, starts[0]])]

@@ -90,7 +90,7 @@ QUICK = {
     "report": "figures geometry inference_answer no_bore point_maps study_pages",
     "response": "block_variation deviation_field",
     "solver/moments": "cells irreversible tree",
-    "solver": "exact_block_field getdp prism_kernel runs",
+    "solver": "coil_field exact_block_field getdp prism_kernel runs",
     "stats": "d_optimal linear_gaussian noise small_samples stated_probabilities",
     "study": "array free_blocks free_blocks_file grades halbach_order materials sentences study",
     "synthetic": "placed_blocks stated_instrument",

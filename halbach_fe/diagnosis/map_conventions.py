@@ -8,6 +8,7 @@ from functools import partial
 from itertools import permutations, product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
@@ -217,11 +218,15 @@ def _rotated_magnet(study: Study, angle_deg: float) -> Study:
     dipoles = tuple(
         dipole.with_(position_m=around(dipole.position_m), moment_A_m2=around(dipole.moment_A_m2))
         for dipole in external.dipoles)
+    coils = tuple(coil.with_(centre_m=around(coil.centre_m), rotation_deg=tuple(np.degrees(
+        Rotation.from_matrix(turn @ rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
+                             ).as_rotvec()).tolist())) for coil in external.coils)
     return _with_array(
         study, exceptions=exceptions,
         first_block_angle_deg=_wrapped(array.first_block_angle_deg + angle_deg),
         first_magnetization_angle_deg=_wrapped(array.first_magnetization_angle_deg + angle_deg),
-    ).with_(external=external.with_(background_T=around(external.background_T), dipoles=dipoles))
+    ).with_(external=external.with_(
+        background_T=around(external.background_T), dipoles=dipoles, coils=coils))
 
 
 def _with_array(study: Study, **keys: object) -> Study:

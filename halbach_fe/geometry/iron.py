@@ -1,4 +1,4 @@
-"""The bodies of iron that a study describes: tubes, prisms, boxes and spheres, in any place."""
+"""The bodies of iron that a study describes: tubes, prisms, spheres and any other, anywhere."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from halbach_fe.geometry.surface import (
     Contact,
     contact_of_prism,
     contact_of_sphere,
+    contact_of_triangles,
     contact_of_tube,
 )
-from halbach_fe.study.iron import Iron, IronBody, IronCurve, IronMaterial, IronRing
+from halbach_fe.study.iron import Iron, IronBody, IronCurve, IronMaterial, IronRing, closed_surface
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import curve_from
 
@@ -44,6 +45,8 @@ class IronSolid:
         vector that turns the magnet's axes into them.
     sphere : bool
         Whether it is a sphere of ``outer_radius``.
+    triangles : ndarray, shape (n, 3, 3), in m, optional
+        Of the surface of a body of any shape, with their normals outwards.
     """
 
     inner_radius: float
@@ -55,17 +58,18 @@ class IronSolid:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sphere: bool = False
+    triangles: Floats | None = field(default=None, compare=False)
 
     @property
     def in_place(self) -> bool:
-        """Whether its own axes are those of the magnet."""
-        return not any(self.origin_m) and not any(self.turn_rad)
+        """Whether it is a tube, prism or sphere whose own axes are those of the magnet."""
+        return self.triangles is None and not any(self.origin_m) and not any(self.turn_rad)
 
     @property
     def is_coaxial(self) -> bool:
         """Whether it is a tube or disc about the z axis of the magnet."""
-        return self.outline is None and not self.sphere and not any(self.turn_rad) and not any(
-            self.origin_m[:2])
+        return self.outline is None and not self.sphere and self.triangles is None and not any(
+            (*self.turn_rad, *self.origin_m[:2]))
 
     @property
     def name(self) -> str:
@@ -74,7 +78,10 @@ class IronSolid:
 
     @property
     def surface(self) -> tuple[Floats, Floats, Floats]:
-        """Coordinates x, y and z of a grid of points on its surface, each (m, n) in m."""
+        """Coordinates x, y and z of a grid of points on its surface, each (m, n) in m.
+
+        Those of triangles (n, 3) are their corners.
+        """
         angle = np.linspace(0, 2 * np.pi, 97)
         if self.sphere:
             polar = np.linspace(0, np.pi, 25)[:, None]
@@ -85,7 +92,9 @@ class IronSolid:
                                self.inner_radius, self.inner_radius])[:, None],
                      np.array([low, low, high, high, low])[:, None])
         x, y, z = (rings[0] * np.cos(angle), rings[0] * np.sin(angle), rings[1] + 0 * angle)
-        if self.outline is not None:
+        if self.triangles is not None:
+            x, y, z = np.moveaxis(self.triangles, 2, 0)
+        elif self.outline is not None:
             corners = np.array([edge.start for edge in (*self.outline, self.outline[0])])
             middle = corners.mean(axis=0)
             x, y = (np.array([middle[i] + 0 * corners[:, i], corners[:, i], corners[:, i],
@@ -102,6 +111,12 @@ class IronSolid:
         """Volume in m^3, surface in m^2, and length of the sharp edges in m."""
         if self.sphere:
             return 4 / 3 * np.pi * self.outer_radius**3, 4 * np.pi * self.outer_radius**2, 0.0
+        if self.triangles is not None:
+            a, b, c = np.moveaxis(self.triangles, 1, 0)
+            areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+            box = np.ptp(self.triangles.reshape(-1, 3), axis=0)  # its edges stand for all of them
+            return float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6, float(areas.sum()), float(
+                4 * box.sum())
         if self.outline is None:
             rim = 2 * np.pi * (self.inner_radius + self.outer_radius)
             area, corners = np.pi * (self.outer_radius**2 - self.inner_radius**2), 0
@@ -140,6 +155,8 @@ class IronSolid:
         """Return the contact of points in the body's own axes."""
         if self.sphere:
             return contact_of_sphere(self.outer_radius, points)
+        if self.triangles is not None:
+            return contact_of_triangles(self.triangles, points)
         if self.outline is not None:
             return contact_of_prism(self.outline, self.z_min, self.z_max, points)
         return contact_of_tube(self.inner_radius, self.outer_radius, self.z_min, self.z_max,
@@ -160,13 +177,15 @@ def iron_solids(
         return (IronSolid(ring.inner_radius_m, ring.outer_radius_m, *limits(ring.length_m),
                           law=law_of(ring)),)
     solids: list[IronSolid] = []
-    for body in iron.bodies if iron else ():
+    for body in iron.each if iron else ():
         found: list[IronSolid] = []
         if body.kind == "tube":
             found = [IronSolid(body.inner_radius_m, body.outer_radius_m,
                                *limits(body.length_m, body.z_m))]
         elif body.kind == "sphere":
             found = [IronSolid(0.0, body.radius_m, -body.radius_m, body.radius_m, sphere=True)]
+        elif body.kind == "stl":
+            found = [_of_triangles(closed_surface(np.array(body.triangles_m)))]
         elif body.kind == "box":
             x, y, z = np.array(body.size_m) / 2
             found = [_prism(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), (-z, z))]
@@ -187,13 +206,20 @@ def _prism(corners: Floats, ends: tuple[float, float]) -> IronSolid:
     return IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
 
 
+def _of_triangles(triangles: Floats) -> IronSolid:
+    """Return a body with a surface of triangles (n, 3, 3) in m."""
+    z = triangles[..., 2]
+    return IronSolid(0.0, float(np.hypot(*triangles[..., :2].reshape(-1, 2).T).max()),
+                     float(z.min()), float(z.max()), triangles=triangles)
+
+
 def _placed(solid: IronSolid, body: IronBody, law: float | Curve) -> IronSolid:
     """Return a body of iron in its place; a coaxial tube is described in the magnet's own axes."""
     x, y, z = body.centre_m
     turn = tuple(np.radians(body.rotation_deg).tolist())
     if solid.sphere:
         turn = (0.0, 0.0, 0.0)
-    elif solid.outline is None and not (x or y or any(turn)):
+    elif solid.outline is None and solid.triangles is None and not (x or y or any(turn)):
         return replace(solid, z_min=solid.z_min + z, z_max=solid.z_max + z, law=law)
     return replace(solid, law=law, origin_m=(x, y, z), turn_rad=turn)
 

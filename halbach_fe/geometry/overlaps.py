@@ -94,7 +94,10 @@ def block_in_iron(
     for number, body in enumerate(iron):
         if body.sphere and (first := _in_sphere(blocks, body, tolerance)) is not None:
             return first[0], number, first[1]
-    numbers = [number for number, body in enumerate(iron) if not body.sphere]
+        if body.triangles is not None and (first := _in_triangles(blocks, body, tolerance)):
+            return first[0], number, first[1]
+    numbers = [number for number, body in enumerate(iron)
+               if not body.sphere and body.triangles is None]
     iron = [iron[number] for number in numbers]
     if not iron:
         return None
@@ -118,6 +121,35 @@ def _in_sphere(
         size = min(ball.outer_radius, (block.z_max - block.z_min) / 2)
         if ball.outer_radius - distance > tolerance * size:
             return number, ball.outer_radius - distance
+    return None
+
+
+def _in_triangles(
+    blocks: Sequence[MagnetBlock], body: IronSolid, tolerance: float
+) -> tuple[int, float] | None:
+    """Return the first block that a body of triangles penetrates, and how far in m.
+
+    It is tried at points of the triangles, a sixteenth of the larger block side apart.
+    """
+    corners = np.stack(body.surface, axis=2)
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    for number, block in enumerate(blocks):
+        outline = np.array([edge.start for edge in block.outline])
+        extent = max(*np.ptp(outline, axis=0), block.z_max - block.z_min)
+        middle = block.middle + block.displacement_m
+        if (np.maximum(low - middle, middle - high) > 2 * extent).any():  # far away
+            continue
+        parts = int(np.clip(16 * sides / extent, 1, 64))
+        share = np.array([(i, j, parts - i - j) for i in range(parts + 1)
+                          for j in range(parts + 1 - i)]) / parts
+        points = np.einsum("sk,nki->nsi", share, corners).reshape(-1, 3)
+        depth = -distance_from_prism(
+            block.outline, block.z_min, block.z_max, block.to_frame(points)).min()
+        if depth > max(tolerance, ALLOWED_PENETRATION) * extent:
+            return number, float(depth)
+        if body.contains(middle[None])[0]:
+            return number, extent
     return None
 
 

@@ -572,11 +572,16 @@ def _arrow_traces(
     return [shafts, heads]
 
 
-def _iron_trace(body: IronSolid, height: float) -> go.Surface:
+def _iron_trace(body: IronSolid, height: float) -> go.Surface | go.Mesh3d:
     """Return the surface of a body of iron; ``height`` in m is drawn if it is infinitely long."""
     if np.isinf(body.z_max):
         body = replace(body, z_min=-height / 2, z_max=height / 2)
     x, y, z = body.surface
+    if body.triangles is not None:
+        first = 3 * np.arange(len(x))
+        return go.Mesh3d(x=x.ravel(), y=y.ravel(), z=z.ravel(), i=first, j=first + 1, k=first + 2,
+                         opacity=0.25, color=IRON, name="iron", legendgroup="iron",
+                         showlegend=True, hoverinfo="name")
     return go.Surface(
         x=x, y=y, z=z, opacity=0.25, showscale=False, colorscale=[[0, IRON], [1, IRON]],
         name="iron", legendgroup="iron", showlegend=True, hoverinfo="name")

@@ -22,7 +22,7 @@ On straight edges the integrals are elementary; on arcs they are evaluated by Ga
 quadrature on panels that are no longer than their distance from the point, to an error of 1e-15 of
 the field. `halbach_fe.solver.prism_kernel` has them in compiled form.
 
-Fields of external sources (background, neighbouring magnets, magnetized objects) are added in
+Fields of external sources (background, neighbouring magnets, objects, coils) are added in
 vacuum: the magnet's permeability and iron do not react to them, but for iron of any shape, see
 `halbach_fe.solver.separate_blocks`.
 """
@@ -40,6 +40,7 @@ from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Outline, ring_radii
+from halbach_fe.solver.coil_field import coil_field
 from halbach_fe.study.magnet import Neighbour, check_apart
 from halbach_fe.study.materials import MU_0
 
@@ -386,7 +387,7 @@ def external_field(magnet: Magnet, points: Floats) -> Floats:
     Raises
     ------
     StudyError
-        If a point is at a dipole.
+        If a point is at a dipole or in a coil.
     """
     external = magnet.external
     check_apart(external, points, magnet.name)
@@ -395,6 +396,8 @@ def external_field(magnet: Magnet, points: Floats) -> Floats:
         field += neighbour_field(magnet, neighbour, points)
     for dipole in external.dipoles:
         field += dipole_field(np.array(dipole.position_m), np.array(dipole.moment_A_m2), points)
+    for coil in external.coils:
+        field += coil_field(coil, points, magnet.name)
     return field
 
 

@@ -19,11 +19,12 @@ is a mean over all of the iron.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
@@ -47,6 +48,9 @@ from halbach_fe.solver.iron_modes import MESH
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
 from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
+
+if TYPE_CHECKING:
+    from halbach_fe.geo.iron_bodies import Sizes
 
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element
@@ -167,7 +171,7 @@ class Problem:
         excess, slope = self.law(field)
         differential = (excess[..., None, None] * np.eye(3)
                         + (slope[..., None] * field)[..., None] * field[..., None, :])
-        return Tangent.of(self, self.stiffness_of_vacuum + self.matrix(differential))
+        return Tangent.of(self, self.stiffness_of_vacuum + self.matrix(differential), self.coarse)
 
     def matrix(self, differential: Floats) -> sparse.csr_array:
         """Return the integrals (n, n) of (tensor (e, 15, 3, 3) grad u) . grad v."""
@@ -189,39 +193,46 @@ class Problem:
 
         It is free by a constant in every connected body, which the reaction does not depend on.
         """
-        own = self.matrix(np.broadcast_to(np.eye(3), (*self.weights.shape, 3, 3)))
-        outside = np.ones(own.shape[0])
-        outside[self.nodes] = 0
-        label = connected_components(own, directed=False)[1]
-        fixed = np.unique(label, return_index=True)[1]
-        size = own.diagonal()
-        extra = np.where(outside == 1, 1.0, 0.0)
-        extra[fixed] += size[fixed]  # the solution is 0 there, as the rows add up to 0
-        tangent = Tangent.of(self, sparse.csr_array(own + sparse.diags_array(extra)))
         right = -self.integrate(values.reshape(*self.weights.shape, 3, -1))
-        return tangent.solve(right, 1e-10)
+        inside, tangent = self._iron
+        found = np.zeros_like(right)
+        found[inside] = tangent.solve(right[inside], 1e-10)
+        return found
+
+    @cached_property
+    def _iron(self) -> tuple[Ints, Tangent]:
+        """The unknowns in the iron, and the problem of Poisson in it alone."""
+        inside = np.unique(self.nodes)
+        own = self.matrix(np.broadcast_to(np.eye(3), (*self.weights.shape, 3, 3)))
+        own = own[inside][:, inside]
+        fixed = np.unique(connected_components(own, directed=False)[1], return_index=True)[1]
+        extra = np.zeros(len(inside))
+        extra[fixed] = own.diagonal()[fixed]  # the solution is 0 there, as the rows add up to 0
+        up = self.coarse[inside]
+        up = up[:, np.unique(up.nonzero()[1])]
+        return inside, Tangent.of(self, own + sparse.diags_array(extra), up)
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """The derivative of the residual at a state, and its preconditioner."""
+    """The derivative of the residual at a state, and its preconditioner on two levels."""
 
     problem: Problem
     matrix: sparse.csr_array
+    up: sparse.csr_array
     coarse: sparse_linalg.SuperLU
 
     @classmethod
-    def of(cls, problem: Problem, matrix: sparse.csr_array) -> Tangent:
-        """Return the tangent of a matrix (n, n)."""
+    def of(cls, problem: Problem, matrix: sparse.csr_array, up: sparse.csr_array) -> Tangent:
+        """Return the tangent of a matrix (n, n), with ``up`` (n, corners) as `Problem.coarse`."""
         matrix = sparse.csr_array(matrix)
-        up = problem.coarse
-        return cls(problem, matrix, factorize(up.T @ (matrix @ up)))
+        return cls(problem, matrix, up, factorize(up.T @ (matrix @ up)))
 
     def precondition(self, residual: Floats) -> Floats:
         """Return approximate solutions (n, c) by a sweep, the coarse level and a sweep back."""
         from halbach_fe.solver.tetrahedra import sweep  # imports numba
 
-        a, up = self.matrix, self.problem.coarse
+        a, up = self.matrix, self.up
         found = np.zeros_like(residual)
         sweep(a.indptr, a.indices, a.data, residual, found, False)
         rest = np.ascontiguousarray(up.T @ (residual - a @ found))
@@ -373,16 +384,37 @@ def solve_bodies(
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """A problem to assemble: what it depends on, and how to do it."""
+
+    key: tuple[object, ...]
+    assemble: Callable[[], Problem] = field(compare=False)
+
+
+@lru_cache(maxsize=2)  # that of the field and a coarser one; blocks that are updated change neither
+def _assembled(asked: _Asked) -> Problem:
+    return asked.assemble()
+
+
 def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Problem:
     """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
-    from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 
     _check_memory(magnet, size_of(magnet, coarseness).unknowns)
+    sizes = Sizes.of(magnet.study.mesh, coarseness)
+    key = magnet.study.iron, magnet.array_half_length, sizes, session.getdp
+    return _assembled(_Asked(key, partial(_assemble, magnet, session, sizes)))
+
+
+def _assemble(magnet: Magnet, session: Session, sizes: Sizes) -> Problem:
+    """Assemble the problem for elements of some sizes, as `assemble_bodies` does."""
+    from halbach_fe.geo.iron_bodies import mesh_iron  # imports Gmsh
+
     files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
     make_folder(session.folder)
     try:
-        regions, shell = mesh_iron(magnet.name, magnet.iron, Sizes.of(
-            magnet.study.mesh.block_size_m, coarseness), files.mesh)
+        regions, shell = mesh_iron(magnet.name, magnet.iron, sizes, files.mesh)
         regions.write(files.regions)
     except OSError as error:
         raise OutputError(
@@ -427,7 +459,7 @@ def size_of(magnet: Magnet, coarseness: float) -> RunSize:
     """Estimate the size of the run for a magnet's iron, without meshing it."""
     from halbach_fe.geo.iron_bodies import Sizes
 
-    elements, unknowns = Sizes.of(magnet.study.mesh.block_size_m, coarseness).count(magnet.iron)
+    elements, unknowns = Sizes.of(magnet.study.mesh, coarseness).count(magnet.iron)
     return RunSize("scalar_potential", elements, unknowns, 1)
 
 
@@ -442,10 +474,11 @@ def _check_memory(magnet: Magnet, unknowns: int) -> None:
     needed, available = bytes_each * unknowns / 2**30, available_memory()
     if available is not None and needed > available:
         raise StudyError(must_be(
-            "`mesh.block_size_m`", f"study {magnet.name}",
+            "`mesh.growth`", f"study {magnet.name}",
             f"so large that the mesh of the iron fits into the {available:.2g} GiB of memory that "
-            "are left", f"{magnet.study.mesh.block_size_m:g}, for some {unknowns:.2g} unknowns "
-            f"and {needed:.2g} GiB", "Enlarge it, or leave out thin bodies of iron."))
+            f"are left", f"{magnet.study.mesh.growth:g}, for some {unknowns:.2g} unknowns and "
+            f"{needed:.2g} GiB", "Enlarge it and mesh.block_size_m, or leave out thin bodies of "
+            "iron."))
 
 
 def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,

@@ -194,7 +194,7 @@ def sizes_in_iron(magnet: Magnet) -> list[float]:
     """Return the sizes in m of the elements in bodies of iron of any shape."""
     from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 
-    sizes = Sizes.of(magnet.study.mesh.block_size_m)
+    sizes = Sizes.of(magnet.study.mesh)
     return [sizes.of_body(body) for body in magnet.iron]
 
 
@@ -222,7 +222,7 @@ def separate_columns(
 
     The permeability of the blocks and the iron each answer to the block's own field; what one of
     them answers to the other is neglected, because single blocks describe deviations of a few per
-    cent from the nominal magnet.
+    cent from the nominal magnet. Iron of any shape answers on the coarser mesh of its error bar.
 
     Returns
     -------
@@ -240,6 +240,8 @@ def separate_columns(
     # `IronReaction.tangent`
     tangent_angles = 64
     if iron is not None:
+        if not magnet.iron_is_axisymmetric:
+            iron = iron.coarse or iron
         nodes = iron.nodes(tangent_angles)
         of_iron = np.array([
             np.moveaxis(iron.tangent(np.moveaxis(unit, 2, 0), points), 0, 2)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.study import materials
 from halbach_fe.study.types import (
+    COMPONENTS,
     MAX_LENGTH_M,
+    Component,
     Coordinate,
     Gap,
     Length,
     Line,
     Places,
+    Point,
     Rotation,
     StudyModel,
     crossing,
@@ -140,10 +146,15 @@ class PlacedIron(StudyModel):
     ``centre_m`` is where the origin of the body's own axes lies in the magnet, and the rotation
     vector ``rotation_deg`` turns the magnet's axes into them. Without them, the axes are those of
     the magnet. Either ``relative_permeability`` or ``curve`` replaces the material of all bodies.
+    The body stands ``repeats`` times, each ``step_m`` beside the last one, and all of them once
+    more as mirror images for each axis in ``mirrored``, in the plane across it through the origin.
     """
 
     centre_m: Places = (0.0, 0.0, 0.0)
     rotation_deg: Rotation = (0.0, 0.0, 0.0)
+    repeats: Annotated[int, Field(ge=1, le=512)] = 1
+    step_m: Places = (0.0, 0.0, 0.0)
+    mirrored: Annotated[tuple[Component, ...], Field(max_length=3)] = ()
     relative_permeability: RelativePermeability | None = None
     curve: IronCurve | None = None
 
@@ -152,6 +163,41 @@ class PlacedIron(StudyModel):
         if self.relative_permeability is not None and self.curve is not None:
             raise ValueError("give at most one of relative_permeability and curve")
         return self
+
+    @model_validator(mode="after")
+    def _of_distinct_images(self) -> Self:
+        images = self.images
+        if any(one in images[:number] for number, one in enumerate(images)):
+            raise ValueError("repeats and mirrored must make bodies in different places; give "
+                             "step_m, and leave out of mirrored what leads to the same place")
+        return self
+
+    @property
+    def images(self) -> tuple[Self, ...]:
+        """The bodies that repeats and mirrored make, each of them alone."""
+        found = [self.model_copy(update={
+            "repeats": 1, "step_m": (0.0, 0.0, 0.0), "mirrored": (),
+            "centre_m": tuple(a + number * b for a, b in zip(
+                self.centre_m, self.step_m, strict=True))}) for number in range(self.repeats)]
+        for axis in self.mirrored:
+            found += [one.mirror_image(COMPONENTS.index(axis)) for one in found]
+        return tuple(found)
+
+    def mirror_image(self, axis: int) -> Self:
+        """Return the body mirrored in the plane across an axis, 0 for x, through the origin."""
+        sign = np.where(np.arange(3) == axis, -1.0, 1.0) + 0.0
+        update: dict[str, object] = {
+            "centre_m": tuple((sign * self.centre_m + 0.0).tolist()),
+            "rotation_deg": tuple((-sign * self.rotation_deg + 0.0).tolist())}
+        if axis == 2 and hasattr(self, "z_m"):
+            update["z_m"] = 0.0 - self.z_m
+        if hasattr(self, "triangles_m"):
+            update["triangles_m"] = tuple(
+                tuple(map(tuple, corners)) for corners in
+                (sign * self.triangles_m)[:, ::-1].tolist()) if self.triangles_m else ()
+        if axis < 2 and hasattr(self, "outline_m"):
+            update["outline_m"] = tuple(map(tuple, (sign[:2] * self.outline_m).tolist()))
+        return self.model_copy(update=update)
 
     @property
     def own_material(self) -> IronMaterial | None:
@@ -221,7 +267,94 @@ class IronSphere(PlacedIron):
     radius_m: Length
 
 
-IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere, Field(discriminator="kind")]
+class IronMesh(PlacedIron):
+    """A body of any shape, by the triangles of its surface: a ``file`` of the kind STL.
+
+    Its coordinates are those of the file times ``unit_m``, along the body's own axes, and its path
+    is relative to the study's folder. The triangles must close the surface. When a study is read,
+    ``triangles_m`` in m replace the file's name; the field takes the body as it is, with flat
+    faces.
+    """
+
+    kind: Literal["stl"]
+    file: Annotated[Line, Field(min_length=1, max_length=4000)] | None = None
+    unit_m: Annotated[float, Field(ge=1e-6, le=1.0)] = 1e-3
+    triangles_m: Annotated[tuple[tuple[Point, Point, Point], ...], Field(max_length=5000)] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronMesh:
+        if (self.file is None) == (not self.triangles_m):
+            raise ValueError("give either a file or triangles_m")
+        if self.triangles_m:
+            closed_surface(np.array(self.triangles_m))
+        return self
+
+
+def closed_surface(triangles: Floats) -> Floats:
+    """Return the triangles (n, 3, 3) of a closed surface, with their normals outwards.
+
+    Raises
+    ------
+    ValueError
+        If the surface is open, or some triangles are turned over.
+    """
+    size = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    if not (np.linalg.norm(across, axis=1) > 1e-12 * size**2).all():
+        raise ValueError("every triangle must have an area; remove those without")
+    same = 1e-6  # distance of corners that are one, relative to the size: STL has seven digits
+    number = np.unique((triangles / (same * size)).round().reshape(-1, 3), axis=0,
+                       return_inverse=True)[1].reshape(-1, 3)
+    edges = np.vstack([number[:, [0, 1]], number[:, [1, 2]], number[:, [2, 0]]])
+    found = {tuple(edge) for edge in edges.tolist()}
+    if len(found) < len(edges):
+        raise ValueError("an edge belongs to several triangles on the same side; the surface must "
+                         "go around the body once, with all normals outwards")
+    lone = [edge for edge in found if edge[::-1] not in found]
+    if lone:
+        x, y, z = triangles.reshape(-1, 3)[np.argmax(number.ravel() == lone[0][0])]
+        raise ValueError(f"the surface must be closed, but {len(lone)} edges belong to a single "
+                         f"triangle, one of them at ({x:g}, {y:g}, {z:g}) m; repair the surface, "
+                         "and export it as a solid")
+    volume = np.einsum("ni,ni->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2]))
+    return triangles if volume > 0 else triangles[:, ::-1]
+
+
+def read_stl(path: Path) -> Floats:
+    """Read the triangles (n, 3, 3) of an STL file, binary or text, in its own unit.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file.
+    OSError
+        If it cannot be read.
+    """
+    most_bytes = 5_000_000
+    with path.open("rb") as file:
+        raw = file.read(most_bytes + 1)
+    if len(raw) > most_bytes:
+        raise ValueError("it is too large; export it with fewer triangles")
+    count = int.from_bytes(raw[80:84], "little")
+    if len(raw) >= 84 and len(raw) == 84 + 50 * count:
+        rows = np.frombuffer(raw, np.dtype([("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")]),
+                             count, 84)
+        found = rows["c"].astype(float)
+    else:
+        number = rb"\s+([-+0-9.eE]{1,40})"
+        corners = re.findall(rb"vertex" + 3 * number + rb"(?=\s)", raw)
+        if not raw.lstrip().startswith(b"solid") or len(corners) != raw.count(b"vertex") or (
+                len(corners) % 3):
+            raise ValueError("it is no STL file; export the body as one")
+        found = np.array([[float(part) for part in corner] for corner in corners]).reshape(-1, 3, 3)
+    most = 1e9  # in any unit a body is smaller
+    if not len(found) or not (np.abs(found) < most).all():
+        raise ValueError("it has no triangles, or such without finite corners")
+    return found
+
+
+IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere | IronMesh,
+                     Field(discriminator="kind")]
 
 
 class Iron(StudyModel):
@@ -242,3 +375,8 @@ class Iron(StudyModel):
             raise ValueError("give exactly one of relative_permeability and curve, for all bodies "
                              "or for each")
         return self
+
+    @property
+    def each(self) -> tuple[IronBody, ...]:
+        """The bodies one by one, with those that repeats and mirrored make."""
+        return tuple(one for body in self.bodies for one in body.images)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,10 +14,14 @@ from halbach_fe.study.types import (
     Angle,
     Coordinate,
     FluxDensityVector,
+    Gap,
+    Length,
     Moment,
+    Places,
     Point,
     ReferenceTemperature,
     RemanenceCoefficient,
+    Rotation,
     StudyModel,
     Temperature,
 )
@@ -46,6 +50,75 @@ class PointDipole(StudyModel):
     moment_A_m2: tuple[Moment, Moment, Moment]
 
 
+class Coil(StudyModel):
+    """A coil of ``turns`` turns, through which ``current_A`` flows counter-clockwise about its z.
+
+    ``centre_m`` is where the origin of its own axes lies, and the rotation vector ``rotation_deg``
+    turns the magnet's axes into them.
+    """
+
+    current_A: Annotated[float, Field(ge=-1e7, le=1e7)]
+    turns: Annotated[int, Field(ge=1, le=10**6)] = 1
+    centre_m: Places = (0.0, 0.0, 0.0)
+    rotation_deg: Rotation = (0.0, 0.0, 0.0)
+
+
+class WoundCoil(Coil):
+    """A coil wound in a rectangular section, ``section_m``: across the turns, and along its z.
+
+    The current is uniform in the section; a side of 0 makes a sheet, and two of them a thin wire.
+    """
+
+    section_m: tuple[Gap, Gap] = (0.0, 0.0)
+
+
+class RoundCoil(WoundCoil):
+    """A loop or, if its section is long, a solenoid, of the mean radius ``radius_m``."""
+
+    kind: Literal["round"]
+    radius_m: Length
+
+    @model_validator(mode="after")
+    def _wound(self) -> RoundCoil:
+        if self.section_m[0] >= 2 * self.radius_m:
+            raise ValueError(f"section_m[0] ({self.section_m[0]}) must be less than twice radius_m")
+        return self
+
+
+class Racetrack(WoundCoil):
+    """A rectangle with round corners, of ``size_m`` along its own x and y, in the section's middle.
+
+    ``corner_radius_m`` is there too. The field takes each corner as 12 chords around the same area.
+    """
+
+    kind: Literal["racetrack"]
+    size_m: tuple[Length, Length]
+    corner_radius_m: Gap = 0.0
+
+    @model_validator(mode="after")
+    def _closed(self) -> Racetrack:
+        if 2 * self.corner_radius_m > min(self.size_m):
+            raise ValueError(f"corner_radius_m ({self.corner_radius_m}) must be at most half of "
+                             "both sides of size_m")
+        if self.section_m[0] > 2 * self.corner_radius_m:
+            raise ValueError(f"corner_radius_m ({self.corner_radius_m}) must be at least half of "
+                             "section_m[0]: turns are bent around the inner ones")
+        return self
+
+
+class PolygonCoil(Coil):
+    """A closed polygon of thin wire with the corners ``points_m`` along its own axes.
+
+    The current flows in their order.
+    """
+
+    kind: Literal["polygon"]
+    points_m: Annotated[tuple[Point, ...], Field(min_length=3, max_length=10_000)]
+
+
+AnyCoil = Annotated[RoundCoil | Racetrack | PolygonCoil, Field(discriminator="kind")]
+
+
 class External(StudyModel):
     """Fields of sources outside the magnet, added to its field.
 
@@ -56,6 +129,7 @@ class External(StudyModel):
     background_T: FluxDensityVector = (0.0, 0.0, 0.0)
     neighbours: tuple[Neighbour, ...] = ()
     dipoles: tuple[PointDipole, ...] = ()
+    coils: Annotated[tuple[AnyCoil, ...], Field(max_length=1000)] = ()
 
 
 def check_apart(external: External, points: Floats, study: str) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 import tomllib
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
-from halbach_fe.study.iron import Iron, IronCurve, TableCurve
+from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl
 from halbach_fe.study.model import Study, iron_of
 
 
@@ -153,26 +155,43 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
     found = iron.with_(curve=_read_curve(iron.curve, key, folder, where))
     if isinstance(found, Iron):
         found = found.with_(bodies=tuple(
-            body.with_(curve=_read_curve(body.curve, f"{key}.bodies[{number}]", folder, where))
+            _with_triangles(body, f"{key}.bodies[{number}]", folder, where).with_(
+                curve=_read_curve(body.curve, f"{key}.bodies[{number}]", folder, where))
             for number, body in enumerate(found.bodies)))
     return study if found == iron else study.with_(**{key: found})
+
+
+def _with_triangles(body: IronBody, key: str, folder: Path, where: str) -> IronBody:
+    """Return a body of iron with the triangles of its file, if it has one."""
+    if body.kind != "stl" or body.file is None:
+        return body
+    with _reading(folder / body.file, f"{key}.file", where, "a closed surface in an STL file"
+                  ) as path:
+        triangles = closed_surface(body.unit_m * read_stl(path)).tolist()
+        return body.with_(file=None, triangles_m=triangles)
+
+
+@contextmanager
+def _reading(path: Path, key: str, where: str, what: str) -> Iterator[Path]:
+    """Tell in one sentence why a file that the study names cannot be used."""
+    try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ValueError("it must be a file")  # reading a device might never end
+        yield path
+    except OSError as error:
+        raise StudyError(must_be(f"`{key}`", where, "a readable file",
+                                 f"{str(path)!r} ({error.strerror})",
+                                 "Give its path from the study's folder.")) from None
+    except ValueError as error:
+        wrong = sentences.reason(error) if isinstance(error, ValidationError) else error
+        raise StudyError(must_be(f"`{key}`", where, what,
+                                 f"{str(path)!r}, which cannot be used: {wrong}")) from None
 
 
 def _read_curve(curve: IronCurve | None, key: str, folder: Path, where: str) -> IronCurve | None:
     """Return a curve with the numbers of its file, if it has one."""
     if curve is None or curve.kind != "table" or not curve.file:
         return curve
-    path = folder / curve.file
-    try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise ValueError("it must be a file")  # reading a device might never end
+    with _reading(folder / curve.file, f"{key}.curve.file", where, "a table of H(B)") as path:
         field, flux_density = materials.read_table(path)
         return TableCurve(kind="table", H_A_per_m=field, B_T=flux_density)
-    except OSError as error:
-        raise StudyError(must_be(f"`{key}.curve.file`", where, "a readable file",
-                                 f"{str(path)!r} ({error.strerror})",
-                                 "Give its path from the study's folder.")) from None
-    except ValueError as error:
-        wrong = sentences.reason(error) if isinstance(error, ValidationError) else error
-        raise StudyError(must_be(f"`{key}.curve.file`", where, "a table of H(B)",
-                                 f"{str(path)!r}, which cannot be used: {wrong}")) from None

@@ -19,7 +19,8 @@ class MeshSettings(StudyModel):
     in iron that is not rotationally symmetric. ``bore_size_m`` holds in the bore (default: the
     same). Outside the magnet, elements grow towards the boundary: across the plane by ``growth`` -
     1 per unit of distance, along z by the factor ``growth`` from layer to layer. In 3D the
-    cross-section is extruded along z, in ``layers_per_ring`` layers per ring.
+    cross-section is extruded along z, in ``layers_per_ring`` layers per ring. In iron of any shape
+    the elements of thin and round bodies are larger too, in proportion to ``growth`` - 1.
 
     ``cells_per_side`` divides separate blocks for the method of moments: the number of cells along
     the sides of a cube (default: 2).

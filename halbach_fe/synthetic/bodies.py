@@ -256,6 +256,10 @@ def magnet_of(study: Study) -> TrueMagnet:
         bodies += free_bodies(array, dimension)
     nominal = TrueMagnet(dimension, bodies)
     external = study.external
+    if external.coils:
+        raise StudyError(must_be("`external.coils`", f"study {study.name}",
+                                 "left out to simulate a campaign", "given",
+                                 "The field of the magnet can be computed with them."))
     return replace(
         nominal, bodies=mounted(bodies, array.exceptions),
         iron=iron_of_study(study, nominal.half_length), background=external.background_T,

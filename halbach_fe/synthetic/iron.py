@@ -176,7 +176,12 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
     if iron is None:
         return None
     bodies: list[Tube | Pole | Ball] = []
-    for body in iron.bodies:
+    for body in iron.each:
+        if body.kind == "stl":
+            raise StudyError(must_be(
+                "`iron.bodies`", f"study {study.name}", "of boxes, prisms, tubes and spheres to "
+                "simulate a campaign", "a body of an STL file",
+                "The field of the magnet can be computed with it."))
         own = body.own_material
         placed: dict[str, Any] = {
             "origin": body.centre_m, "law": None if own is None else law_of(own),

@@ -256,7 +256,7 @@ def quick(getdp):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("halbach_fe.response.resource_estimate.machine_speed", lambda: speed)
         patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
-        patch.setattr(Sizes, "of", lambda size, coarseness=1.0: fine(size, 3.0 * coarseness))
+        patch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 3.0 * coarseness))
         yield
 
 

@@ -32,7 +32,7 @@ def test_every_example_has_a_name():
 def test_every_example_is_a_magnet(name):
     magnet = gallery.magnet_of(FRAGMENTS[name], PAGE)
     assert len(magnet.blocks) > 1
-    if name == "material":  # a ring like the first one
+    if name in ("material", "coils"):  # a ring like the first one
         return
     assert f"](../_static/magnets/{name}.png)" in PAGE
     picture = ROOT / "docs" / "_static" / "magnets" / f"{name}.png"

@@ -49,6 +49,7 @@ B_T = [0.1, 0.25, 1.0, 1.3, 1.5]
 background_T = [0, 0, 5e-5]
 neighbours = [{ z_m = 2.0, turn_deg = 90 }]
 dipoles = [{ position_m = [1, 1, 0], moment_A_m2 = [0, 0, 10] }]
+coils = [{ kind = "round", radius_m = 0.5, section_m = [0.02, 0.1], current_A = 3.0, turns = 100 }]
 
 [instrument]
 length_unit_m = 0.001

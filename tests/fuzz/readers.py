@@ -107,6 +107,17 @@ mesh = { block_size_m = 0.02 }
 observation = { quantity = "flux_density", positions = { kind = "points", points_m = [[0, 0, 0]] } }
 """
 
+STL = b"solid a\n" + b"".join(
+    b"facet normal 0 0 0\nouter loop\n" + b"".join(
+        b"vertex %g %g %g\n" % corner for corner in corners) + b"endloop\nendfacet\n"
+    for corners in (((0, 0, 0), (0, 50, 0), (50, 0, 0)), ((0, 0, 0), (50, 0, 0), (0, 0, 50)),
+                    ((0, 0, 0), (0, 0, 50), (0, 50, 0)), ((50, 0, 0), (0, 50, 0), (0, 0, 50)))
+) + b"endsolid a\n"
+WITH_STL = WITH_STEEL.replace("with-steel", "with-stl").replace("dimension = 2", "").replace(
+    "remanence_T", "ring_length_m = 0.1, remanence_T").replace(
+    WITH_STEEL[WITH_STEEL.index("iron_ring"):WITH_STEEL.index("mesh =")],
+    'iron = { relative_permeability = 9.0, bodies = [{ kind = "stl", file = "body.stl" }] }\n')
+
 MAP_CSV = b"""# instrument: probe 7
 x_m,y_m,z_m,Bx_T,By_T,Bz_T,sigma_T,time_s,scan
 0.0,0.0,0.0,0.5,-0.01,,1e-4,0,first
@@ -322,6 +333,12 @@ def with_table(path: Path) -> Study:
     return _with_table(study, path.parent, "study file study.toml")
 
 
+def with_stl(path: Path) -> Study:
+    """The study beside a body of iron in an STL file."""
+    study = parse_study(tomllib.loads(WITH_STL))
+    return _with_table(study, path.parent, "study file study.toml")
+
+
 def changed_study(path: Path) -> tuple[str, Study]:
     study = read_study(path)
     after = study.with_(array__inner_radius_m=study.array.inner_radius_m * 0.9,
@@ -488,7 +505,8 @@ def check_order(names: tuple[str, ...]) -> None:
 
 
 NAMES = (
-    "study", "changed study", "steel", "free blocks (CSV)", "free blocks (HDF5)", "map (CSV)",
+    "study", "changed study", "steel", "body of iron", "free blocks (CSV)",
+    "free blocks (HDF5)", "map (CSV)",
     "map (HDF5)", "map (VTU)", "block table", "order of assembly",
     "import: columns", "import: opera", "import: comsol",
     "import: openpmd", "import as columns", "import as opera", "import as comsol",
@@ -523,6 +541,8 @@ def readers() -> tuple[Reader, ...]:
         Reader("changed study", "study.toml", (*studies, RICH, FREE), changed_study, StudyError,
                check_changed, TOML, document),
         table,
+        Reader("body of iron", "body.stl", (STL,), with_stl, StudyError, check_study,
+               (b"vertex", b"facet normal")),
         Reader("free blocks (CSV)", "free.csv", (FREE_CSV,), free_blocks_of_file, StudyError,
                check_free_blocks, tuple(name.encode() for name in FREE_COLUMNS)),
         Reader("free blocks (HDF5)", "free.h5", (free_hdf5(),), free_blocks_of_file, StudyError,

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tomlkit
 
 from halbach_fe.core.errors import StudyError
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
-from tests.conftest import DIPOLE
+from halbach_fe.study.reader import read_study
+from tests.conftest import DIPOLE, changed
 
 SIZE = DIPOLE["array"]["outer_radius_m"]
 WEDGE = [[0.2, -0.01], [0.23, -0.02], [0.25, 0.0], [0.23, 0.02], [0.2, 0.01]]
@@ -75,6 +78,117 @@ def test_copies(dipole, generator):
     assert np.array_equal([body.contains(points) for body in reverse.iron], inside)
     assert not magnet.iron_is_axisymmetric
     assert magnet.radius == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("body", [
+    tube(0.02, 0.05, z_m=0.01), prism(copies=2, z_m=0.02, length_m=0.1), BOX,
+    {"kind": "sphere", "radius_m": 0.05}], ids=lambda body: body["kind"])
+def test_repeated_and_mirrored(short_dipole, generator, body):
+    """Eight bodies: two, and their images across z, and the images of all across y."""
+    placed = body | {"centre_m": [0.1, 0.4, 0.5], "rotation_deg": [20.0, -40.0, 5.0]}
+    step = [0.0, 0.3, 0.4]
+    plain = magnet_of(short_dipole, placed).iron
+    images = magnet_of(short_dipole, placed | {
+        "repeats": 2, "step_m": step, "mirrored": ["z", "y"]}).iron
+    assert len(images) == 8 * len(plain)
+    points = placed["centre_m"] + generator.uniform(-0.3, 0.3, (2_000, 3))
+    inside = np.any([each.contains(points) for each in plain], axis=0)
+    assert inside.any()
+    for number in range(8):
+        sign = [1.0, -1.0 if number & 4 else 1.0, -1.0 if number & 2 else 1.0]
+        seen = (points + np.multiply(number & 1, step)) * sign
+        some = images[number * len(plain):(number + 1) * len(plain)]
+        np.testing.assert_array_equal(
+            np.any([each.contains(seen) for each in some], axis=0), inside)
+    for wrong in ({"repeats": 2}, {"mirrored": ["y", "y"]}):
+        with pytest.raises(StudyError, match="bodies in different places"):
+            magnet_of(short_dipole, placed | wrong)
+    with pytest.raises(StudyError, match="bodies in different places"):
+        magnet_of(short_dipole, BOX | {"mirrored": ["x"]})  # its middle is at x = 0
+
+
+def triangles_of_box(size):
+    """The 12 triangles of a box (12, 3, 3) about the origin, with normals outwards."""
+    found = []
+    for axis in range(3):
+        u, v, n = np.roll(np.eye(3), axis, axis=0)
+        for sign in (1, -1):
+            corners = [n * sign + a * u + b * v * sign for a, b in (
+                (-1, -1), (1, -1), (1, 1), (-1, 1))]
+            found += [corners[:3], [corners[0], *corners[2:]]]
+    return np.array(found) * np.array(size) / 2
+
+
+def test_triangles_are_as_a_box(short_dipole, generator):
+    """A body of triangles contains and touches the same points as the box that they close."""
+    place = {"centre_m": [0.1, 0.4, 0.5], "rotation_deg": [20.0, -40.0, 5.0], "mirrored": ["z"]}
+    size = [0.1, 0.2, 0.04]
+    box = magnet_of(short_dipole, {"kind": "box", "size_m": size} | place).iron
+    triangles = triangles_of_box(size)
+    for given in (triangles, triangles[:, ::-1]):  # normals inwards are turned over
+        stl = magnet_of(short_dipole, {
+            "kind": "stl", "triangles_m": given.tolist()} | place).iron
+        for ours, theirs in zip(stl, box, strict=True):
+            assert ours.measures == pytest.approx(theirs.measures)
+            own = np.vstack([generator.uniform(-0.12, 0.12, (500, 3)), [
+                [0.05, 0.03, 0.01], [0.05, 0.1, 0.01], [0.05, 0.1, 0.02], [0.0, 0.0, 0.02],
+                [0.05 + 1e-6, 0.0, 0.0], [0.05, 0.11, 0.0]]])  # faces, edge, corner, and off them
+            points = own @ rotation_matrix(theirs.turn_rad).T + theirs.origin_m
+            found, expected = ours.contact(points), theirs.contact(points)
+            for key in ("inside", "on_face", "on_edge"):
+                np.testing.assert_array_equal(getattr(found, key), getattr(expected, key))
+            assert found.inside.any()
+            assert (found.on_face.sum(), found.on_edge.sum()) == (2, 2)
+            assert not ours.contains(points + found.outward)[found.on_face].any()
+
+
+def test_triangles_that_overlap_a_block(short_dipole):
+    """The blocks begin at a radius of 0.1 m: a bar through one is found, a bar in the bore not."""
+    for size, fits in (([0.15, 0.02, 0.02], True), ([0.5, 0.01, 0.01], False),
+                       ([0.01, 0.5, 0.5], False)):
+        body = {"kind": "stl", "triangles_m": triangles_of_box(size).tolist()}
+        if fits:
+            assert magnet_of(short_dipole, body).iron
+            continue
+        with pytest.raises(StudyError, match="and body 1 of iron overlap"):
+            magnet_of(short_dipole, body)
+
+
+@pytest.mark.parametrize(("change", "sentence"), [
+    (lambda raw, text: raw, None), (lambda raw, text: text, None),
+    (lambda raw, text: raw[:80] + (11).to_bytes(4, "little") + raw[84:-50],
+     "must be a closed surface in an STL file; instead .* the surface must be closed, but 3 edges"),
+    (lambda raw, text: raw[:-50] + raw[-100:-50], "on the same side"),
+    (lambda raw, text: raw[:-1], "it is no STL file"),
+    (lambda raw, text: text.replace("vertex 50.0", "vertex nan"), "it is no STL file"),
+    (lambda raw, text: text.replace("vertex 50.0", "vertex 1e999"), "without finite corners"),
+    (lambda raw, text: b"solid\nendsolid\n", "it has no triangles"),
+    (lambda raw, text: None, "must be a readable file")])
+def test_stl_files(tmp_path, change, sentence):
+    """Binary or text, in mm; one that is open, damaged or missing is refused."""
+    triangles = 1e3 * triangles_of_box([0.1, 0.2, 0.04])
+    raw = b" " * 80 + len(triangles).to_bytes(4, "little") + b"".join(
+        np.vstack([np.zeros((1, 3)), each]).astype("<f4").tobytes() + b"\0\0"
+        for each in triangles)
+    text = "solid box\n" + "".join(
+        "facet normal 0 0 0\nouter loop\n" + "".join(
+            "vertex {} {} {}\n".format(*corner) for corner in each.tolist())
+        + "endloop\nendfacet\n" for each in triangles) + "endsolid box\n"
+    content = change(raw, text)
+    if content is not None:
+        (tmp_path / "body.stl").write_bytes(
+            content if isinstance(content, bytes) else content.encode())
+    study = tmp_path / "study.toml"
+    body = {"kind": "stl", "file": "body.stl", "centre_m": [0.0, 0.0, 0.4]}
+    study.write_text(tomlkit.dumps(changed(
+        DIPOLE, dimension=3, array__ring_length_m=0.08,
+        iron={"relative_permeability": 10.0, "bodies": [body]})))
+    if sentence is None:
+        (body,) = build_magnet(read_study(study)).iron
+        assert body.measures[0] == pytest.approx(0.1 * 0.2 * 0.04)
+        return
+    with pytest.raises(StudyError, match=sentence):
+        read_study(study)
 
 
 def test_several_bodies(short_dipole):

@@ -20,11 +20,13 @@ from halbach_fe.solver.formulation_choice import (
     finite_element_part,
     solve_nominal,
 )
-from halbach_fe.solver.iron_bodies import COARSER, solve_bodies
+from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.study.reader import parse_study
+from halbach_fe.study.solver import MeshSettings
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
+from tests.geometry.test_iron import triangles_of_box
 
 SPHERE = {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.0, 0.05]}
 POINTS = np.array([[0.0, 0.0, 0.0], [0.01, 0.02, 0.02], [0.03, 0.0, 0.05], [0.0, -0.03, 0.09]])
@@ -68,7 +70,7 @@ def sphere(request, tmp_path_factory):
 def coarse_mesh(monkeypatch):
     """Larger elements of iron: errors and bars are larger, and the test is fast."""
     fine = Sizes.of
-    monkeypatch.setattr(Sizes, "of", lambda size, coarseness=1.0: fine(size, 2.0 * coarseness))
+    monkeypatch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 2.0 * coarseness))
 
 
 def test_sphere_in_a_uniform_field(sphere):
@@ -109,6 +111,21 @@ def test_near_field_of_known_polarization(sphere):
         assert np.abs(field - exact).max() < tolerance
 
 
+def test_a_body_of_triangles_is_as_a_box(session):
+    """In a uniform field; the same box on two coarse meshes, and another one as the control."""
+    mesh = {"block_size_m": 0.02, "growth": 2.6}
+    uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    size, place = [0.02, 0.03, 0.01], {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
+    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform,
+                          session.within(name), estimate=False).field(POINTS) for name, body in (
+        ("box", {"kind": "box", "size_m": size}),
+        ("stl", {"kind": "stl", "triangles_m": triangles_of_box(size).tolist()}),
+        ("other", {"kind": "box", "size_m": [0.02, 0.03, 0.012]}))]
+    scale = np.abs(found[0]).max()
+    assert np.abs(found[1] - found[0]).max() < 0.03 * scale
+    assert np.abs(found[2] - found[0]).max() > 0.05 * scale
+
+
 def test_external_field_acts_on_the_iron(session, coarse_mesh):
     """The sphere's dipole is added to the background; the field of the block is negligible."""
     background = [0.0, 0.0, 0.5]
@@ -119,6 +136,16 @@ def test_external_field_acts_on_the_iron(session, coarse_mesh):
         np.array(background), 1000.0, 0.02, POINTS - [0.0, 0.0, 0.05])
     assert np.abs(change - exact).max() < 5e-3  # as of the sphere above
     assert np.abs(exact - background).max() > 0.05
+
+
+def test_a_mesh_serves_other_blocks(session):
+    """Iron that is assembled once is not meshed again for other blocks, but for other iron."""
+    study = study_with(SPHERE, mesh={"block_size_m": 0.02, "growth": 4.0})
+    first, again, other = (assemble_bodies(build_magnet(one), session, 1.0) for one in (
+        study, study_with(SPHERE, permeability=1.1, mesh=study.mesh.model_dump()),
+        study_with(SPHERE | {"radius_m": 0.019}, mesh=study.mesh.model_dump())))
+    assert again is first
+    assert other is not first
 
 
 def test_the_key_of_finer_iron_is_named():
@@ -181,7 +208,8 @@ def test_size_is_foretold(sphere):
     """Within a factor of 1.5, of the mesh and of the coarser one: 1.25 was measured."""
     _, found = sphere
     for coarseness, solved in ((1.0, found), (COARSER, found.coarse)):
-        _, unknowns = Sizes.of(0.02, coarseness).count(solved.problem.bodies)
+        sizes = Sizes.of(MeshSettings(block_size_m=0.02), coarseness)
+        _, unknowns = sizes.count(solved.problem.bodies)
         assert unknowns / len(solved.total) == pytest.approx(1.0, abs=0.5)
 
 

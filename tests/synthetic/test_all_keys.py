@@ -253,7 +253,11 @@ def solids(body, dimension=3, **material):
     return magnet_of(study).iron, build_magnet(study).iron
 
 
-@pytest.mark.parametrize("key", PlacedIron.model_fields)
+IMAGES = "repeats", "step_m", "mirrored"
+"""Keys that make more bodies; `tests.geometry.test_iron` has their places."""
+
+
+@pytest.mark.parametrize("key", [key for key in PlacedIron.model_fields if key not in IMAGES])
 @pytest.mark.parametrize("base", [
     POLE, TUBE, {"kind": "box", "size_m": [0.02, 0.1, 0.05]}, {"kind": "sphere", "radius_m": 0.03}],
     ids=lambda body: body["kind"])
@@ -318,6 +322,15 @@ def test_external_sources_of_the_study():
         less = {name: value for name, value in external.items() if name != key}
         other = study_of(RING | {"rings": 1}, external=less)
         assert np.abs(true_field(magnet_of(other), POINTS) - theirs).max() > 1e-7
+
+
+def test_repeated_and_mirrored_iron(generator):
+    """The truth has the bodies of the model."""
+    ours, theirs = solids({"kind": "sphere", "radius_m": 0.03, "centre_m": [0.2, 0.1, 0.1],
+                           "repeats": 2, "step_m": [0.0, 0.1, 0.0], "mirrored": ["x"]})
+    assert [(each.origin, each.radius) for each in ours.bodies] == [
+        (each.origin_m, each.outer_radius) for each in theirs]
+    assert len(theirs) == 4
 
 
 # --- random magnets ----------------------------------------------------------------------------
