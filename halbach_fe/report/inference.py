@@ -257,29 +257,33 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
     across = np.linalg.norm(change - along[:, None] * axes, axis=1)
     prior_sd = result.by_block(result.prior.sd)[there]
     distance = np.linalg.norm(change / np.where(prior_sd > 0, prior_sd, np.inf), axis=1)
-    rows = []
-    for one in np.argsort(-distance, kind="stable")[:ranked].tolist():
-        row = np.zeros((1, len(result.posterior.mean)))
-        result.by_block(row[0])[there[one]] = axes[one]
-        sd, of = result.posterior.sd_of(row)[0], 100 / size[there[one]]
-        turn = np.degrees(np.arctan2(across[one], size[there[one]] + along[one]))
-        rows.append({
-            "block": place_of(result.magnet.blocks[there[one]]),
-            "along the easy axis": f"{with_error(of * along[one], of * sd)}\u00a0%",
-            **_by_readings(result, row[0], of),
-            "turned by": f"{decimals(float(turn), 2)}°",
-            "standard deviations of its prior": decimals(float(distance[one]), 2)})
-    return rows
+    chosen = np.argsort(-distance, kind="stable")[:ranked]
+    directions = np.zeros((len(chosen), len(result.posterior.mean)))
+    for row, one in zip(directions, chosen, strict=True):
+        result.by_block(row)[there[one]] = axes[one]
+    of, sds = 100 / size[there[chosen]], result.posterior.sd_of(directions)
+    alone = _by_readings(result, directions, of)
+    turns = np.degrees(np.arctan2(across, size[there] + along))[chosen].tolist()
+    return [{
+        "block": place_of(result.magnet.blocks[there[one]]),
+        "along the easy axis": f"{with_error(of[row] * along[one], of[row] * sds[row])}\u00a0%",
+        **({ALONE: alone[row]} if alone else {}),
+        "turned by": f"{decimals(turns[row], 2)}°",
+        "standard deviations of its prior": decimals(float(distance[one]), 2)}
+        for row, one in enumerate(chosen.tolist())]
 
 
-def _by_readings(result: InferenceResult, axis: Floats, of: float) -> dict[str, str]:
-    """Return the cell of what readings alone say along a unit vector, in per cent by ``of``."""
-    if len(axis) > MOST_PARAMETERS or not result.prior.sd_of(axis[None])[0]:
-        return {}
-    mean, sd = by_readings_alone(result.prior, result.posterior, axis)
-    mean += float(axis @ (result.prior.mean - result.response.nominal))
-    told = of * sd < 100  # not even a whole block otherwise
-    return {ALONE: f"{with_error(of * mean, of * sd)}\u00a0%" if told else NOTHING}
+def _by_readings(result: InferenceResult, directions: Floats, of: Floats) -> list[str]:
+    """Return what readings alone say along unit vectors (k, m), in per cent by ``of`` (k,).
+
+    It is empty for a magnet of more than `MOST_PARAMETERS`.
+    """
+    if directions.shape[1] > MOST_PARAMETERS:
+        return []
+    mean, sd = by_readings_alone(result.prior, result.posterior, directions)
+    mean = of * (mean + directions @ (result.prior.mean - result.response.nominal))
+    return [f"{with_error(value, bar)}\u00a0%" if bar < 100 else NOTHING  # not even a whole block
+            for value, bar in zip(mean.tolist(), (of * sd).tolist(), strict=True)]
 
 
 @page_of.register

@@ -259,20 +259,32 @@ def rotation_roots(vectors: Floats, sd: float) -> Floats:
     return np.asarray(sd * changes[:, :, :vectors.shape[1]].swapaxes(1, 2))
 
 
-def by_readings_alone(prior: Gaussian, posterior: Gaussian, direction: Floats) -> tuple[
-        float, float]:
-    """Return the change from the prior mean along a unit vector (m,), and its standard deviation,
-    that an update would find if nothing had been known before along it.
+def by_readings_alone(
+    prior: Gaussian, posterior: Gaussian, directions: Floats
+) -> tuple[Floats, Floats]:
+    """Return the changes (k,) from the prior mean along unit vectors (k, m), and their standard
+    deviations, that an update would find if nothing had been known before along one of them.
 
     A wide prior along ``u`` takes ``q q^T / (u.q)`` from the inverse covariance of the posterior,
     with ``q`` the product of the inverse covariance of the prior and ``u`` (Sherman and Morrison).
-    The standard deviation is huge where the readings say nothing.
+    The standard deviation is huge where the readings say nothing. What the prior has as exact stays
+    so; it is infinite if that is a part of ``u``.
     """
-    known = np.linalg.solve(prior.covariance, direction)
+    ridge = 1e-12  # of variances, which makes exact combinations of parameters definite
+    sd = prior.sd
+    scale = np.where(sd > 0, sd, 1.0)
+    covariance = prior.covariance / np.outer(scale, scale)
+    scaled = directions.T / scale[:, None]
+    known = np.linalg.solve(covariance + ridge * np.eye(len(sd)), scaled)
+    is_exact = np.abs(covariance @ known - scaled).max(axis=0) > 1e-6 * np.abs(scaled).max(axis=0)
+    known /= scale[:, None]
     spread = posterior.covariance @ known
+    along, own = np.sum(directions.T * known, axis=0), np.sum(directions.T * spread, axis=0)
     # below rounding the readings leave the prior as it was
-    told = max(float(direction @ known - known @ spread), 1e-12 * float(direction @ known))
-    pull = float(direction @ spread) / told
+    told = np.maximum(along - np.sum(known * spread, axis=0), 1e-12 * along)
     change = posterior.mean - prior.mean
-    return (float(direction @ change + pull * (known @ change)),
-            float(np.sqrt(posterior.sd_of(direction[None])[0] ** 2 + pull * (direction @ spread))))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pull = own / told
+        return (np.where(is_exact, 0.0, directions @ change + pull * (change @ known)),
+                np.where(is_exact, np.inf,
+                         np.sqrt(posterior.sd_of(directions) ** 2 + pull * own)))

@@ -62,7 +62,8 @@ def test_what_readings_alone_say_of_a_direction(generator, n, m):
     """
     matrix, readings, noise, prior = problem(generator, n, m)
     direction, other = np.linalg.qr(generator.standard_normal((m, 2)))[0].T
-    mean, sd = by_readings_alone(prior, posterior(matrix, readings, noise, prior), direction)
+    mean, sd = (value[0] for value in by_readings_alone(
+        prior, posterior(matrix, readings, noise, prior), direction[None]))
 
     def wide(along):
         found = posterior(matrix, readings, noise, Gaussian(
@@ -74,11 +75,25 @@ def test_what_readings_alone_say_of_a_direction(generator, n, m):
         assert abs(wide(control)[1] / sd - 1) > 1e-3
 
 
+def test_what_is_exact_stays_so_beside_the_readings_alone():
+    """As a missing block beside others; a direction that is exact in part is told of nothing."""
+    prior = Gaussian(np.zeros(3), np.diag([1e4, 0.5, 0.0]))  # of parameters in different units
+    matrix, noise = np.array([[1e-4, 1.0, 1.0], [0.0, 1.0, 2.0]]), independent_noise(np.ones(2))
+    found = posterior(matrix, np.ones(2), noise, prior)
+    smaller = Gaussian(np.zeros(2), np.diag([1e4, 0.5]))
+    expected = by_readings_alone(smaller, posterior(matrix[:, :2], np.ones(2), noise, smaller),
+                                 np.eye(2))
+    mean, sd = by_readings_alone(prior, found, np.array([[1, 0, 0], [0, 1, 0], [0.6, 0, 0.8]]))
+    np.testing.assert_allclose((mean[:2], sd[:2]), expected, rtol=1e-6)
+    assert sd[2] == np.inf
+
+
 def test_readings_that_say_nothing_leave_a_direction_open():
     prior = Gaussian(np.zeros(2), np.eye(2))
     found = posterior(np.array([[1.0, 0.0]]), np.ones(1), independent_noise(np.ones(1)), prior)
-    assert by_readings_alone(prior, found, np.array([1.0, 0.0])) == pytest.approx((1.0, 1.0))
-    assert by_readings_alone(prior, found, np.array([0.0, 1.0]))[1] > 1e5
+    mean, sd = by_readings_alone(prior, found, np.eye(2))
+    assert (mean[0], sd[0]) == pytest.approx((1.0, 1.0))
+    assert sd[1] > 1e5
 
 
 def test_against_brute_force_sampling(generator):
