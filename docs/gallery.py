@@ -144,8 +144,9 @@ def side_view(axis: Axes, magnet: Magnet) -> None:
     """Draw the rings, or free blocks, and the iron by z and distance from the axis, in mm."""
     for body in magnet.iron:
         if body.sphere or not body.in_place:
-            x, y, z = body.surface
-            (low, high), (start, end) = ((part.min(), part.max()) for part in (np.hypot(x, y), z))
+            across = np.column_stack([part.ravel() for part in body.surface[:2]])
+            low, high = radii(across[ConvexHull(across).vertices])
+            start, end = body.surface[2].min(), body.surface[2].max()
         else:
             low, high, start, end = body.inner_radius, body.outer_radius, body.z_min, body.z_max
         axis.add_patch(Rectangle((MM * start, MM * low), MM * (end - start), MM * (high - low),
@@ -153,8 +154,8 @@ def side_view(axis: Axes, magnet: Magnet) -> None:
     sections = list(magnet.ring_sections[:magnet.array.rings])
     for block in magnet.blocks:
         if block.ring > magnet.array.rings:  # a free block
-            z, radius = shadow(block, (2, 0))[:, 0], np.hypot(*shadow(block, (0, 1)).T)
-            sections.append(((z.min(), z.max()), (radius.min(), radius.max())))
+            z = shadow(block, (2, 0))[:, 0]
+            sections.append(((z.min(), z.max()), radii(shadow(block, (0, 1)))))
     for (start, end), (low, high) in sections:
         axis.add_patch(Rectangle((MM * start, MM * low), MM * (end - start), MM * (high - low),
                                  facecolor="#e8e8e8", edgecolor="#555555", lw=0.6))
@@ -162,6 +163,13 @@ def side_view(axis: Axes, magnet: Magnet) -> None:
     axis.set(xlim=(-limit, limit), xlabel="z in mm", ylabel="distance from the axis in mm")
     axis.set_ylim(-0.02 * MM * magnet.radius, 1.06 * MM * magnet.radius)
     axis.autoscale(axis="x")
+
+
+def radii(polygon: np.ndarray) -> tuple[float, float]:
+    """Return the least and largest distance in m of a polygon (n, 2) from the origin outside it."""
+    after, along = np.roll(polygon, -1, axis=0), np.linspace(0, 1, 33)[:, None, None]
+    distances = np.linalg.norm(polygon + along * (after - polygon), axis=2)
+    return float(distances.min()), float(distances.max())
 
 
 def shadow(block: MagnetBlock, axes: tuple[int, int]) -> np.ndarray:
