@@ -174,14 +174,14 @@ def test_scattered_sources_do_not_take_a_strong_effect_with_them(terms_alone, na
             return Explanation(tuple(effects), tuple(terms), {0: 0.0, 1: 800.0, 5: 1000.0}[
                 len(effects)], 1.5)
 
-        def extended(self, effects):
+        def extension(self, effects):
             there = 0 in effects
             return Explanation((0,) * there, (term,), 900.0 if there else terms_alone, 1.1)
 
         def with_more_effects(self, start):
             return start
 
-        def necessary(self, effects):
+        def irreplaceable_effects(self, effects):
             return []
 
     # terms beside the effect add 100; without it 400 are lost, or only 50
