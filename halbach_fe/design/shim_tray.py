@@ -285,16 +285,18 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
     study = f"study {magnet.name}"
     outer = np.hypot(choices.places[:, 0], choices.places[:, 1])
     if (outer > magnet.radius).any():
+        first = int(np.argmax(outer > magnet.radius))
         raise StudyError(must_be(
-            f"place {int(np.argmax(outer > magnet.radius)) + 1} of `shim_tray`", study,
+            f"place {first + 1} of `shim_tray`", study,
             f"within the magnet, whose radius is {1e3 * magnet.radius:.4g} mm",
-            f"{1e3 * outer.max():.4g} mm from the axis", "Is it in metres?"))
+            f"{1e3 * outer[first]:.4g} mm from the axis", "Is it in metres?"))
     along, reach = np.abs(choices.places[:, 2]), magnet.field_reach
     if (along > reach).any():
+        first = int(np.argmax(along > reach))
         raise StudyError(must_be(
-            f"place {int(np.argmax(along > reach)) + 1} of `shim_tray`", study,
+            f"place {first + 1} of `shim_tray`", study,
             f"within {reach:.3g} m of the middle along z, where there is some field",
-            f"{along.max():.4g} m", "Is it in metres?"))
+            f"{along[first]:.4g} m", "Is it in metres?"))
     sizes = np.array([each.size_m for each in choices.tray.magnets]).max(axis=0).tolist()
     largest = choices.tray.magnets[0].with_(size_m=tuple(sizes))
     blocks = [_block(largest, place, float(phi), number + 1) for number, (place, phi) in enumerate(

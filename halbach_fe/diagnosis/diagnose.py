@@ -287,7 +287,8 @@ class _Diagnosing:
                       MAX_ROUNDS)
         answer = self._choose_answer(rounds)
         if self._has_other_outliers():
-            return _Diagnosing(replace(self.task, blocks=self.blocks), self.left).diagnosis()
+            return _Diagnosing(replace(
+                self.task, blocks=self.blocks, solver=self.solver), self.left).diagnosis()
         return self._result(rounds, answer)
 
     def _is_last(self, number: int) -> bool:

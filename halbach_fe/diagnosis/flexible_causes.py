@@ -94,6 +94,8 @@ def harmonic_fields(
     add(0 * radius, 0 * radius, np.ones_like(radius), 0, 0)
     for wave in range(1, (in_plane if flat else waves) + 1):
         k = wave * np.pi / length
+        if k * scale > 300:  # of a thin slab: it falls off within a hundredth of the radius
+            break
         for order in range(orders + 1):
             bessel, slope = special.iv(order, k * radius), special.ivp(order, k * radius)
             over = np.where(radius > 0, bessel / np.maximum(radius, 1e-12),

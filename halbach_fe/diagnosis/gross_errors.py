@@ -388,17 +388,15 @@ class _Search:
         in its other columns.
         """
         old = self.study.instrument.field_axes
-        axes = compose_axes(old, fields)
-        read = {old[number][-1] for number in np.flatnonzero(self.observed)}
-        present = {name for name, column in zip(COMPONENTS, self.values.T, strict=True)
-                   if not np.isnan(column).all()}
-        if self.study.observation.quantity != "flux_density" or all(
-                axes[number][-1] in present for number in np.flatnonzero(self.observed)):
+        observed = {*_observed(self.study)}
+        present = [(was[-1], now[-1]) for was, now, column in zip(
+            old, compose_axes(old, fields), self.values.T, strict=True)
+            if not np.isnan(column).all()]
+        if self.study.observation.quantity != "flux_density" or observed <= {
+                now for _, now in present}:
             return ()
-        return tuple(name for name, axis, observed in zip(
-            COMPONENTS, axes, self.observed.tolist(), strict=True)
-            if axis[-1] in read & present and not observed
-            and name in COMPONENTS[:self.study.dimension])
+        return tuple(now for was, now in present if was in observed and now not in observed
+                     and now in COMPONENTS[:self.study.dimension])
 
     def elsewhere(self, level: int) -> Iterator[MapConvention]:
         """Yield the best conventions with ``level`` errors and points at other positions.

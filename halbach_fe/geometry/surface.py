@@ -27,14 +27,26 @@ a million times its size from the origin. Across this distance the field changes
 the remanence."""
 
 
-def is_in_plane(points: Floats) -> bool:
+def is_in_plane(points: Floats, thickness: float = 1e-3) -> bool:
     """Tell whether points (n, 3) in m lie in one plane across z, or in one that is slightly tilted.
 
-    A tilt of 0.1 rad changes distances across by 0.5 %, and the
-    field of a long magnet does not depend on z.
+    ``thickness`` is the largest distance from that plane, relative to the size of the points: by
+    default what stages keep.
     """
-    tilt_rad = 0.1
-    return bool(np.ptp(points[:, 2]) <= tilt_rad * np.ptp(points[:, :2], axis=0).max())
+    largest_tilt_rad = 0.1  # which changes distances across by 0.5 %
+    away = points - points.mean(axis=0)
+    size = np.ptp(points[:, :2], axis=0).max()
+    slope = np.linalg.lstsq(away[:, :2], away[:, 2], rcond=None)[0]
+    return bool(np.ptp(points[:, 2]) <= largest_tilt_rad * size
+                and np.abs(away[:, 2] - away[:, :2] @ slope).max() <= thickness * size)
+
+
+def is_cross_section(points: Floats) -> bool:
+    """Tell whether points (n, 3) in m can be those of a cross-section, also by tilted mappers.
+
+    The field of a long magnet does not depend on z.
+    """
+    return is_in_plane(points, 0.1)
 
 
 @dataclass(frozen=True)
@@ -136,7 +148,7 @@ def contact_of_triangles(triangles: Floats, points: Floats) -> Contact:
     size = float((high - low).max())
     found = Contact.nowhere(len(points))
     near = np.flatnonzero(_in_box(points, low, high, ON_SURFACE * size))
-    at_once = 1 + 2_000_000 // len(triangles)  # points, for some 100 MB
+    at_once = 1 + 600_000 // len(triangles)  # points, for some 100 MB
     for some in np.split(near, np.arange(at_once, len(near), at_once)):
         _touch_triangles(found, triangles, points, some, ON_SURFACE * size)
     return found

@@ -184,7 +184,13 @@ class OpenKey:
             If the key is not one number.
         """
         found: object = study
+        before = ""
         for name in self.key.split("."):
+            if found is None:
+                raise StudyError(must_be(
+                    f"`{self.key}`", f"study {study.name}", "a number that is given, to be fitted",
+                    f"no `{before}` in the study"))
+            before = name
             known = getattr(type(found), "model_fields", {})
             if name not in known:
                 near = difflib.get_close_matches(name, known, 1, 0.5)

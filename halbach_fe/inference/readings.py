@@ -17,7 +17,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.surface import is_in_plane
+from halbach_fe.geometry.surface import is_cross_section
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
 from halbach_fe.measurement.campaign import SAME_PLACE_M, SAME_READING, SHARED, Map, repeated
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
@@ -172,7 +172,7 @@ def read_campaign(
 def _check_plane(points: Floats, where: str) -> None:
     """Raise a MeasurementError if the points (n, 3) in m of a 2D study are at several heights."""
     heights = points[:, 2]
-    if not is_in_plane(points):
+    if not is_cross_section(points):
         raise MeasurementError(must_be(
             "points", where, "in one plane for a 2D study",
             f"z from {heights.min():g} to {heights.max():g} m",

@@ -701,6 +701,6 @@ def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
         raise MeasurementError(said)
     # without times, few digits make some readings of a place alike
     finest_T = 1e-8  # no probe of magnets reads finer steps twice
-    read = np.nan_to_num(data["B_T"].values[copies])
+    read = np.nan_to_num(data[TOTAL_COLUMN if is_total_field(data) else "B_T"].values[copies])
     if "time_s" in data or (np.abs(read / finest_T - np.rint(read / finest_T)) > 1e-3).any():
         warnings.warn(f"{said} Until then these count twice.", HalbachWarning, stacklevel=2)

@@ -306,7 +306,7 @@ def page(result: InferenceResult) -> Page:
     return Page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [
-             Section(order := [*filter(None, [row_order_note(result.study)])]),
+            Section(order := [*filter(None, [row_order_note(result.study)])]),
             Section([*doubtful, Table(block_table(result)), Text(SHRUNK, "small")],
                     "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),

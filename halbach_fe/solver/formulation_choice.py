@@ -22,7 +22,7 @@ from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.surface import is_in_plane
+from halbach_fe.geometry.surface import is_cross_section
 from halbach_fe.geometry.symmetry import no_symmetry, symmetry_of
 from halbach_fe.solver.azimuthal_modes import few_modes_suffice, is_axisymmetric, solve_modes
 from halbach_fe.solver.exact_block_field import external_field, field_of
@@ -485,7 +485,7 @@ def check_plane(magnet: Magnet, points: Floats, key: str) -> None:
     ------
     StudyError
     """
-    if magnet.dimension == 2 and len(points) and not is_in_plane(points):
+    if magnet.dimension == 2 and len(points) and not is_cross_section(points):
         raise StudyError(
             f"Input `{key}` of study {magnet.name} must lie in one plane, since it "
             f"is 2D; instead z goes from {points[:, 2].min():g} to {points[:, 2].max():g} m. Use "

@@ -49,6 +49,18 @@ def test_a_plane_that_is_slightly_tilted_is_a_plane():
         assert np.abs(there - level).max() < 2e-3 * np.abs(level).max()  # twice the tilt
 
 
+def test_a_slab_is_no_plane():
+    """Along which a sensor may drift; thin ones have finite fields."""
+    slab = np.vstack([circle(0.05, 16, z) for z in (-0.005, 0.0, 0.005)])
+    drift = np.zeros(slab.shape)
+    drift[:, 0] = slab[:, 2]
+    columns = sensor_errors(slab).fields.reshape(-1, drift.size).T
+    left = drift.ravel() - columns @ np.linalg.lstsq(columns, drift.ravel(), rcond=None)[0]
+    assert np.linalg.norm(left) < 0.01 * np.linalg.norm(drift)
+    for thin in (1.0, 0.1, 0.01):
+        assert np.isfinite(harmonic_fields(slab * [1, 1, thin]).fields).all()
+
+
 def factors(field):
     """Log Bayes factors of both kinds for a field in T, with noise."""
     noise = np.random.default_rng(3).standard_normal(field.size)

@@ -204,8 +204,9 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
     kinds = {"length": declared.length_unit, "field": declared.field_unit,
              "angle": declared.angle_unit}
     for kind, said in kinds.items():
-        own = {one for name, one in unit.items() if KIND.get(name) == kind}
-        if said and "" not in own and own != {said}:
+        own = {units.unit_symbol(one) or one for name, one in unit.items()
+               if KIND.get(name) == kind}
+        if said and "" not in own and own != {units.unit_symbol(said) or said}:
             raise MeasurementError(must_be(
                 f"--{kind}-unit", where, "of a column that does not state its unit itself",
                 f"'{said}', which no column needs", "Leave it out."))
