@@ -129,7 +129,8 @@ def _in_triangles(
 ) -> tuple[int, float] | None:
     """Return the first block that a body of triangles penetrates, and how far in m.
 
-    It is tried at points of the triangles, a sixteenth of the larger block side apart.
+    It is tried at points of the triangles, a sixteenth of the larger block side apart or of large
+    triangles farther, and at points of the block that lie a little below its surface.
     """
     corners = np.stack(body.surface, axis=2)
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
@@ -146,11 +147,22 @@ def _in_triangles(
         points = np.einsum("sk,nki->nsi", share, corners).reshape(-1, 3)
         depth = -distance_from_prism(
             block.outline, block.z_min, block.z_max, block.to_frame(points)).min()
-        if depth > max(tolerance, ALLOWED_PENETRATION) * extent:
+        allowed = max(tolerance, ALLOWED_PENETRATION)
+        if depth > allowed * extent:
             return number, float(depth)
-        if body.contains(middle[None])[0]:
+        if body.contains(_points_below_surface(block, 2 * allowed * extent)).any():
             return number, extent
     return None
+
+
+def _points_below_surface(block: MagnetBlock, depth: float) -> Floats:
+    """Return points (n, 3) in m along the edges of a block and in its middle, ``depth`` m deep."""
+    edges = np.vstack([edge.at(np.linspace(0, 1, 5))[0] for edge in block.outline])
+    points = np.vstack([np.column_stack([edges, np.full(len(edges), z)]) for z in (
+        block.z_min, (block.z_min + block.z_max) / 2, block.z_max)])
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    shrunk = 1 - 2 * depth / np.ptp(points, axis=0).min()
+    return block.from_frame(np.vstack([middle + shrunk * (points - middle), middle]))
 
 
 @dataclass(frozen=True)

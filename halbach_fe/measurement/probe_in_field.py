@@ -482,15 +482,17 @@ class State:
         it is not the field that tells of a parameter, but what is not known of the field.
         """
         draws = 8  # they know each information to some 30 %
+        nothing = np.zeros(len(self.at.amplitudes))
+        known = self.model.by_parameter(replace(self.at, amplitudes=nothing), self.rows)
         generator = np.random.default_rng(0)  # results are the same every time
         found = np.zeros(2 * (len(self.at.instrument),))
         for _ in range(draws):
             prior = np.sqrt(self.width2) * generator.standard_normal(len(self.at.amplitudes))
             read = self.free.by_amplitude @ prior + self.at.sigma * generator.standard_normal(
                 len(self.left))
-            design = self.model.by_parameter(replace(
-                self.at, amplitudes=prior - self.free.amplitudes(read)), self.rows).reshape(
-                    -1, len(found))
+            design = (self.model.by_parameter(replace(
+                self.at, amplitudes=prior - self.free.amplitudes(read)), self.rows)
+                - known).reshape(-1, len(found))  # offsets and drifts need no field
             found += design.T @ self.free.left(design) / draws
         return found
 

@@ -128,7 +128,7 @@ class FieldOnLines:
         Mean and root of J of the block or iron in which a point is; 0 in air.
     in_block : ndarray of str, shape (lines, count)
         Name of that block, ``iron 1`` in the first body of iron, empty in air.
-    spacing : float, in T m
+    spacing : ndarray, shape (lines,), in T m
         Error that the spacing of the points makes of a first integral.
     """
 
@@ -139,7 +139,7 @@ class FieldOnLines:
     strength_error: Floats
     polarization: Floats
     in_block: NDArray[np.str_]
-    spacing: float
+    spacing: Floats
 
     @cached_property
     def sd(self) -> Floats:
@@ -161,12 +161,12 @@ class FieldOnLines:
         mean, root, error = (self._integrated(values, order)[:, -1]
                              for values in (self.mean, self.root, self.error))
         spacing = self.spacing * self.lines.length ** (order - 1)
-        return mean, np.hypot(np.linalg.norm(root, axis=-1), error + spacing)
+        return mean, np.hypot(np.linalg.norm(root, axis=-1), error + spacing[:, None])
 
     @property
     def relative_spacing(self) -> float:
-        """`spacing`, relative to the integral of |B|."""
-        return float(self.spacing / self._integrated(
+        """The largest `spacing`, relative to the largest integral of |B|."""
+        return float(self.spacing.max() / self._integrated(
             np.linalg.norm(self.mean, axis=2))[:, -1].max())
 
     def _integrated(self, values: Floats, order: int = 1) -> Floats:
@@ -182,7 +182,8 @@ class FieldOnLines:
         step = self.lines.length / (self.lines.count - 1)
         across = self._integrated(self.mean) @ self.lines.axes[:2].T
         roots = np.einsum("lncq,ac->lnaq", self._integrated(self.root), self.lines.axes[:2])
-        spacing = (2 * np.linalg.norm(across, axis=2) + self.spacing) * self.spacing
+        off = self.spacing[:, None]
+        spacing = (2 * np.linalg.norm(across, axis=2) + off) * off
         density = np.concatenate([(across**2).sum(axis=2)[..., None],
                                   2 * np.einsum("lna,lnaq->lnq", across, roots),
                                   spacing[..., None]], axis=2)
@@ -258,23 +259,25 @@ def field_on_lines(
                         names[number].reshape(shape[:2]), _spacing_error(magnet, lines))
 
 
-def _spacing_error(magnet: Magnet, lines: Lines) -> float:
-    """Return in T m what the spacing of the points makes of the first integral of a line.
+def _spacing_error(magnet: Magnet, lines: Lines) -> Floats:
+    """Return in T m what the spacing of the points makes of the first integral of lines (lines,).
 
-    It is that of the first line and of the nominal blocks' own field, at more points.
+    It is that of the nominal blocks' own field, at more points.
     """
-    finer = 10  # 201 points across a gap of some mm are enough, and 3 become 21
-    dense = replace(lines, across=(lines.across[0][:1], lines.across[1][:1]),
-                    count=finer * (lines.count - 1) + 1)
-    flux = field_of(magnet.blocks, dense.points[0])
-    number = _blocks_of(magnet, dense.points[0])
-    for block in set(number[(number >= 0) & (number < len(magnet.blocks))]):
-        one = magnet.blocks[block]
-        flux[number == block] += one.remanence * np.array(one.easy_axis)
-    flux = np.nan_to_num(flux, posinf=0.0, neginf=0.0)  # on edges
+    fewest = 200  # steps, which are enough across a gap of some mm
+    finer = int(np.clip(np.ceil(fewest / (lines.count - 1)), 2, 10))
+    dense = replace(lines, count=finer * (lines.count - 1) + 1)
     step = dense.length / (dense.count - 1)
-    change = simpson(flux, dx=step, axis=0) - simpson(flux[::finer], dx=finer * step, axis=0)
-    return float(np.abs(change).max())
+    found = []
+    for points in dense.points:
+        flux, number = field_of(magnet.blocks, points), _blocks_of(magnet, points)
+        for block in set(number[(number >= 0) & (number < len(magnet.blocks))]):
+            one = magnet.blocks[block]
+            flux[number == block] += one.remanence * np.array(one.easy_axis)
+        flux = np.nan_to_num(flux, posinf=0.0, neginf=0.0)  # on edges
+        change = simpson(flux, dx=step, axis=0) - simpson(flux[::finer], dx=finer * step, axis=0)
+        found.append(np.abs(change).max())
+    return np.array(found)
 
 
 def _blocks_of(magnet: Magnet, points: Floats) -> NDArray[np.intp]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import tomlkit
@@ -152,6 +154,19 @@ def test_triangles_that_overlap_a_block(short_dipole):
             continue
         with pytest.raises(StudyError, match="and body 1 of iron overlap"):
             magnet_of(short_dipole, body)
+
+
+def test_a_large_plate_of_triangles_over_small_blocks(short_dipole, generator):
+    """Its triangles are larger than the blocks, into whose corners alone it reaches."""
+    for at in generator.uniform(-0.3, 0.3, (8, 2)).tolist():
+        for depth in (2e-3, -2e-3):
+            plate = {"kind": "stl", "triangles_m": triangles_of_box([1.0, 1.0, 0.01]).tolist(),
+                     "centre_m": [0.0, 0.0, 0.003 + 0.005 - depth]}
+            cube = {"name": ["one"], "shape": ["cuboid"], "x_m": [at[0]], "y_m": [at[1]],
+                    "z_m": [0.0], "size_x_m": [0.006], "size_y_m": [0.006], "size_z_m": [0.006],
+                    "remanence_T": [1.2]}
+            with nullcontext() if depth < 0 else pytest.raises(StudyError, match="overlap"):
+                magnet_of(short_dipole, plate, array={"free_blocks": cube})
 
 
 @pytest.mark.parametrize(("change", "sentence"), [

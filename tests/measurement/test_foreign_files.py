@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,16 @@ def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(MeasurementError, match=asked):
         import_map(path, DeclaredFormat())
+
+
+def test_rows_that_begin_as_a_grid_of_astra_are_rows(tmp_path):
+    """The first cell of each is the number of cells after it."""
+    path = tmp_path / "file.txt"
+    path.write_text("".join(f"5 0 {z} 10 11 12\n" for z in range(1, 6)))
+    columns = ("x[mm]", "y[mm]", "z[mm]", "Bx[mT]", "By[mT]", "Bz[mT]")
+    for stated in ({"columns": columns}, {}):
+        with nullcontext() if stated else pytest.raises(MeasurementError, match="which columns"):
+            assert import_map(path, DeclaredFormat(**stated)).data.sizes["point"] == 5
 
 
 @pytest.mark.parametrize("last", ["999,0,0", "9.99,1,0", "0,0,0.099"])

@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 
 import numpy as np
 
@@ -78,7 +79,8 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If there are no numbers, or lines of different length.
     """
     lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
-    _refuse_grid_above(lines[:3], where)
+    if not declared.columns:
+        _refuse_grid_above(lines[:4], where)
     return read_lines([one for one in lines if one[1]], declared, where)
 
 
@@ -148,11 +150,20 @@ def _refuse_grid_above(first: Sequence[Line], where: str) -> None:
             "content", where, "rows with positions", "a map of OPAL, whose grid stands above them",
             "Add --skip-lines 4, --columns Bx[T],By[T],Bz[T] with its unit, and --positions TABLE: "
             "x, y and z of every row, in the order that its first line states."))
-    if len(axes) == 3 and all(len(axis) > 2 and axis[0] == str(len(axis) - 1) for axis in axes):
+    if len(axes) == 4 and len(axes[3]) != len(axes[0]) and all(
+            len(axis) > 2 and axis[0] == str(len(axis) - 1) and _rises(axis[1:])
+            for axis in axes[:3]):
         raise MeasurementError(must_be(
             "content", where, "rows with positions", "a map of ASTRA, of one component on the grid "
             "of its first three lines", "Write a table with a row x, y, z, Bx, By, Bz for every "
             "point from its three files; each of their lines runs along x."))
+
+
+def _rises(cells: Sequence[str]) -> bool:
+    """Tell whether cells are numbers, each larger than the one before."""
+    with suppress(ValueError):
+        return all(float(one) < float(after) for one, after in pairwise(cells))
+    return False
 
 
 def _are_alike(line: str, other: str) -> bool:
