@@ -7,6 +7,7 @@ any of it, and `write_study` writes it down.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import refuse_unknown, typed
-from halbach_fe.core.errors import OutputError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, OutputError, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
@@ -27,6 +28,7 @@ from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
 from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
+from halbach_fe.study.magnet import External
 from halbach_fe.study.model import Study
 from halbach_fe.study.template import (
     OUTER_RADIUS,
@@ -313,7 +315,8 @@ def _turned(turn: Rotation) -> dict[str, float]:
 def to_magpylib(magnet: Magnet) -> Any:
     """Return a magnet's blocks as a ``magpylib.Collection``.
 
-    Its polarizations are the remanences: magpylib's own field has no permeability and no iron.
+    Its polarizations are the remanences: magpylib's own field has no permeability, no iron and no
+    external sources.
 
     Parameters
     ----------
@@ -339,6 +342,9 @@ def to_magpylib(magnet: Magnet) -> Any:
     magpylib = import_extra("magpylib")
     if magnet.dimension == 2:
         raise StudyError(must_be("magnet", "to_magpylib", "of finite length", "a cross-section"))
+    if magnet.external != External():
+        warnings.warn(f"The external sources of study {magnet.name} are not in the collection: add "
+                      "them to it.", HalbachWarning, stacklevel=2)
     table = FreeBlocks.model_validate(blocks_table(magnet))
     return magpylib.Collection([_source(magpylib, table, number) for number in range(len(table))],
                                style_label=magnet.name)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import rotation_matrix
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.study.array import check_order
 from halbach_fe.study.model import Study
@@ -162,8 +163,9 @@ def array_variants(study: Study) -> tuple[ArrayVariant, ...]:
         return ()
     pitch = 360.0 / array.blocks_per_ring
     found: list[ArrayVariant] = []
+    is_round = study.iron is None or build_magnet(study).iron_is_axisymmetric
     for blocks in range(1 - array.blocks_per_ring // 2, array.blocks_per_ring // 2 + 1):
-        if blocks:
+        if blocks and is_round:  # other iron would have to turn, too
             angle = blocks * pitch
             found.append(ArrayVariant(
                 "rotated_by_one_block", f"the map turned by {_count(blocks, 'block')}",

@@ -133,7 +133,7 @@ def _in_triangles(
     triangles farther, and at points of the block that lie a little below its surface.
     """
     corners = np.stack(body.surface, axis=2)
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     for number, block in enumerate(blocks):
         outline = np.array([edge.start for edge in block.outline])
@@ -141,12 +141,14 @@ def _in_triangles(
         middle = block.middle + block.displacement_m
         if (np.maximum(low - middle, middle - high) > 2 * extent).any():  # far away
             continue
-        parts = int(np.clip(16 * sides / extent, 1, 64))
+        near = ((corners.min(axis=1) < middle + extent)
+                & (corners.max(axis=1) > middle - extent)).all(axis=1)
+        parts = int(np.clip(16 * sides[near].max(initial=0.0) / extent, 1, 64))
         share = np.array([(i, j, parts - i - j) for i in range(parts + 1)
                           for j in range(parts + 1 - i)]) / parts
-        points = np.einsum("sk,nki->nsi", share, corners).reshape(-1, 3)
+        points = np.einsum("sk,nki->nsi", share, corners[near]).reshape(-1, 3)
         depth = -distance_from_prism(
-            block.outline, block.z_min, block.z_max, block.to_frame(points)).min()
+            block.outline, block.z_min, block.z_max, block.to_frame(points)).min(initial=np.inf)
         allowed = max(tolerance, ALLOWED_PENETRATION)
         if depth > allowed * extent:
             return number, float(depth)

@@ -255,13 +255,11 @@ def row_order_note(study: Study) -> str:
     """Say that a lag or a memory of the instrument follows from the order of rows; else nothing."""
     instruments = [study.instrument, *(one.instrument for one in study.maps if one.instrument)]
     named = [what for what, there in (
-        ("lag behind the stage (lag_m)", any(one.lag_m for one in instruments)),
-        ("keep a part of the reading before (memory)", any(one.memory for one in instruments)))
-        if there]
-    return (f"That readings {' and '.join(named)} is taken from the order of the rows, as that in "
-            "which they were read; a column time_s tells that of a memory, not of a lag. If the "
-            "rows were sorted or joined later, it means nothing: give them as they were read."
-            if named else "")
+        ("a lag behind the stage (lag_m)", any(one.lag_m for one in instruments)),
+        ("a memory of the reading before", any(one.memory for one in instruments))) if there]
+    return (f"The study has {' and '.join(named)}. It counts on rows in the order in which they "
+            "were read: a table that was sorted or joined makes it wrong. A column time_s states "
+            "the order for a memory, not for a lag." if named else "")
 
 
 def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:

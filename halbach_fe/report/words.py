@@ -10,6 +10,7 @@ from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import Study, iron_of
 
@@ -196,6 +197,11 @@ def layout(magnet: Magnet) -> str:
     return " and ".join(texts)
 
 
+def _middle_mm(body: IronSolid) -> list[float]:
+    """Return the middle of the box around a body in mm, to a micrometre."""
+    return [round(500 * float(part.min() + part.max()), 3) + 0.0 for part in body.surface]
+
+
 def iron_description(magnet: Magnet) -> str:
     """Return the bodies of iron and their material in words."""
     iron = iron_of(magnet.study)
@@ -206,7 +212,7 @@ def iron_description(magnet: Magnet) -> str:
         if body.sphere or not body.in_place:
             size = "x".join(f"{1e3 * float(np.ptp(part)):.4g}" for part in body.surface)
             bodies.append(f"{'sphere' if body.sphere else 'body'} within {size} mm about "
-                          f"({', '.join(f'{1e3 * part:g}' for part in body.origin_m)}) mm")
+                          f"({', '.join(f'{part:g}' for part in _middle_mm(body))}) mm")
             continue
         kind = "tube" if body.outline is None else "prism"
         length = "" if np.isinf(body.z_max) else (

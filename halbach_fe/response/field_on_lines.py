@@ -4,8 +4,8 @@ The first integral of B along a line is ``int B ds`` in T m, the second ``int in
 T m^2. A kick map has the second-order kicks of an undulator, whose first integrals vanish: with the
 potential ``Phi = int |int B_across ds'|^2 ds`` in T^2 m^3 they are ``-1/2 grad Phi / (B rho)^2``
 (P. Elleaume, EPAC 1992, p. 661).
-The integrals are Simpson's. What the spacing of the points makes of the field of the nominal blocks
-is in their bars: lines through faces of blocks, where B jumps, need more points.
+The integrals are Simpson's. What the spacing of the points makes of them is in their
+bars: lines through faces of blocks, where B jumps, need more points.
 
 Inside a block B is mu_0 H, that of all charges, plus the polarization of the block, ``B_r + chi
 mu_0 H``. With permeability 1 all of it is a closed form. Inside iron mu_0 H is the gradient of the
@@ -254,29 +254,39 @@ def field_on_lines(
     shape = lines.points.shape
     names = np.array([*(block.name for block in magnet.blocks),
                       *(f"iron {body}" for body in range(1, len(magnet.iron) + 1)), ""])
-    return FieldOnLines(lines, mean.reshape(shape), root.reshape(*shape, -1), error.reshape(shape),
+    mean = mean.reshape(shape)
+    return FieldOnLines(lines, mean, root.reshape(*shape, -1), error.reshape(shape),
                         weak.reshape(shape), polarization.reshape(*shape, -1),
-                        names[number].reshape(shape[:2]), _spacing_error(magnet, lines))
+                        names[number].reshape(shape[:2]), _spacing_error(magnet, lines, mean))
 
 
-def _spacing_error(magnet: Magnet, lines: Lines) -> Floats:
+def _spacing_error(magnet: Magnet, lines: Lines, mean: Floats) -> Floats:
     """Return in T m what the spacing of the points makes of the first integral of lines (lines,).
 
-    It is that of the nominal blocks' own field, at more points.
+    The field of blocks and external sources is integrated over more points. What permeability and
+    iron add to it in ``mean`` (lines, count, 3) is known at these points alone, of which every
+    second one is left out.
     """
     fewest = 200  # steps, which are enough across a gap of some mm
     finer = int(np.clip(np.ceil(fewest / (lines.count - 1)), 2, 10))
     dense = replace(lines, count=finer * (lines.count - 1) + 1)
     step = dense.length / (dense.count - 1)
+
+    def change(values: Floats, every: int, step: float) -> float:
+        return float(np.abs(simpson(values, dx=step, axis=0)
+                            - simpson(values[::every], dx=every * step, axis=0)).max())
+
     found = []
-    for points in dense.points:
-        flux, number = field_of(magnet.blocks, points), _blocks_of(magnet, points)
+    for points, own in zip(dense.points, mean, strict=True):
+        flux = field_of(magnet.blocks, points) + external_field(magnet, points)
+        number = _blocks_of(magnet, points)
         for block in set(number[(number >= 0) & (number < len(magnet.blocks))]):
             one = magnet.blocks[block]
             flux[number == block] += one.remanence * np.array(one.easy_axis)
         flux = np.nan_to_num(flux, posinf=0.0, neginf=0.0)  # on edges
-        change = simpson(flux, dx=step, axis=0) - simpson(flux[::finer], dx=finer * step, axis=0)
-        found.append(np.abs(change).max())
+        added = (own - flux[::finer])[:lines.count - 1 + lines.count % 2]
+        found.append(change(flux, finer, step) + (0.0 if magnet.is_vacuum else change(
+            added, 2, finer * step)))
     return np.array(found)
 
 
@@ -463,7 +473,11 @@ def _reaction(
 
     def sources(places: Floats) -> Floats:
         iron = solved.iron.field(places) if solved.iron is not None else 0.0
-        return field_of(magnet.blocks, places) + iron
+        return known(places) + iron
+
+    def known(places: Floats) -> Floats:
+        blocks = field_of(magnet.blocks, places)
+        return blocks + external_field(magnet, places) if external_acts(magnet) else blocks
 
     field, error = np.zeros_like(points), np.zeros_like(points)
     free = place < 0 if solved.blocks else np.ones(len(points), bool)
@@ -471,6 +485,6 @@ def _reaction(
     for block in set(place[~free]):
         here = place == block
         strength, bar = field_within(solved.blocks[0], block, present[block], points[here], sources)
-        field[here] = strength - field_of(magnet.blocks, points[here])
+        field[here] = strength - known(points[here])
         error[here] = bar + (solved.iron.error(points[here]) if solved.iron is not None else 0.0)
     return field, error

@@ -27,6 +27,7 @@ from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.magnet import External
 
 LIMIT_T = 5e-4
 """Flux density above which people with pacemakers must not be (IEC 60601-2-33): 5 gauss."""
@@ -197,7 +198,8 @@ def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) ->
     vacuum = field_in_vacuum(blocks)
     if magnet.is_vacuum:
         return vacuum
-    coarse = magnet if magnet.has_losses else magnet.with_(mesh__cells_per_side=1)
+    alone = magnet.with_(external=External())
+    coarse = alone if magnet.has_losses else alone.with_(mesh__cells_per_side=1)
     reaction = solve_separate(coarse, session.within("stray"), estimate=False)
     return lambda points: vacuum(points) + reaction.field(points)
 

@@ -209,11 +209,14 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
 
     It serves points that move little by little. The blocks are solved for once where that does not
     depend on the points, and the field of many blocks is summed by expansions. That of a
-    cross-section does not depend on z.
+    cross-section does not depend on z, but for that of external sources.
     """
     def solved(points: Floats) -> Floats:
-        plane = points * [1.0, 1.0, 0.0] if magnet.dimension == 2 else points
-        return solve_nominal(magnet, plane, session)
+        if magnet.dimension == 3:
+            return solve_nominal(magnet, points, session)
+        plane = points * [1.0, 1.0, 0.0]
+        found = solve_nominal(magnet, plane, session)
+        return found + external_field(magnet, points) - external_field(magnet, plane)
 
     auto = magnet.study.solver.route == "auto" and not magnet.has_losses
     if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) is not Route.MOMENTS or (

@@ -83,6 +83,9 @@ def test_a_prism_that_is_not_convex_is_refused():
         "outline_m": [((0, 0), (0.02, 0), (0.002, 0.002), (0, 0.02))], "remanence_T": [1.3]})
     with pytest.raises(StudyError, match="convex"):
         hf.to_magpylib(magnet)
+    ring = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
+    with pytest.warns(hf.HalbachWarning, match="external sources .* are not in the collection"):
+        hf.to_magpylib(ring.with_(external={"background_T": (0.0, 0.01, 0.0)}))
     with pytest.raises(StudyError, match="uniformly"):
         hf.to_magpylib(hf.halbach_ring(
             inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03).with_(

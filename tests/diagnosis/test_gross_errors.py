@@ -7,6 +7,7 @@ import pytest
 
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.gross_errors import find_gross_errors
+from halbach_fe.diagnosis.map_conventions import array_variants
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
@@ -107,6 +108,16 @@ def test_an_error_that_only_measured_blocks_show(case, generator):
     table = None if case == "without a table" else table_of(STUDY, built, generator)
     found = [error.names for error in find_gross_errors(STUDY, data, table)]
     assert found == ([("reversed_z",)] if case == "reversed_z" else [])
+
+
+def test_a_magnet_beside_a_box_of_iron_is_not_turned():
+    """The iron would have to turn with it; a tube looks the same from all sides."""
+    box = {"kind": "box", "size_m": [0.1, 0.02, 0.1], "centre_m": [0.0, 0.5, 0.0]}
+    tube = {"kind": "tube", "inner_radius_m": 1.0, "outer_radius_m": 1.1}
+    for body, turned in ((box, False), (tube, True)):
+        study = STUDY.with_(iron={"relative_permeability": 100.0, "bodies": [body]})
+        names = {one.name for one in array_variants(study)}
+        assert ("rotated_by_one_block" in names) == turned
 
 
 @pytest.mark.parametrize(("case", "keys"), {

@@ -53,10 +53,10 @@ def test_a_lag_is_named(session, generator):
     update = infer(build_magnet(found.study), data, session)
     assert update.prior_conflict < update.conflict_limit
     for page in (page_of_diagnosis(found), page_of_update(update)):  # the order is no time
-        assert "is taken from the order of the rows" in page.remarks[-1]
+        assert "counts on rows in the order in which they were read" in page.remarks[-1]
         assert page.summary["row_order"] == page.remarks[-1]
     assert not row_order_note(found.before.study)
-    assert "(lag_m) and keep" in row_order_note(STUDY.with_(
+    assert "(lag_m) and a memory" in row_order_note(STUDY.with_(
         instrument={"lag_m": LAG_M, "memory": 0.01}))
     # control: without it the update does not agree
     assert found.before.prior_conflict > found.before.conflict_limit

@@ -89,7 +89,8 @@ def test_rows_that_begin_as_a_grid_of_astra_are_rows(tmp_path):
     path.write_text("".join(f"5 0 {z} 10 11 12\n" for z in range(1, 6)))
     columns = ("x[mm]", "y[mm]", "z[mm]", "Bx[mT]", "By[mT]", "Bz[mT]")
     for stated in ({"columns": columns}, {}):
-        with nullcontext() if stated else pytest.raises(MeasurementError, match="which columns"):
+        with nullcontext() if stated else pytest.raises(
+                MeasurementError, match="what its 6 columns are"):
             assert import_map(path, DeclaredFormat(**stated)).data.sizes["point"] == 5
 
 

@@ -300,6 +300,23 @@ def test_points_that_are_too_far_apart_are_in_the_bars():
     assert solved(through, inside=True).relative_spacing > 0.01
 
 
+def test_bars_of_a_line_are_its_own_and_of_all_sources():
+    """The second line is near to a block, and a coil is a source as the blocks are."""
+    coil = {"kind": "round", "radius_m": 0.02, "current_A": 1e4, "centre_m": [0.0, -0.1, 0.0]}
+    magnet = magnet_of(external={"coils": [coil]})
+    known = Gaussian(magnet.nominal_magnetization, np.zeros((6, 1)))
+
+    def integrals(count):
+        lines = Lines(np.array([0.001, 0.0, -0.2]), np.array([0.001, 0.0, 0.2]),
+                      (np.zeros(1), np.array([-0.095, 0.0, 0.018])), count)
+        return field_on_lines(magnet, lines, known, Session.temporary()).integrals(1)
+
+    (mean, sd), (right, _) = integrals(9), integrals(801)
+    off = np.abs(mean - right)
+    assert (off <= 1.5 * sd).all()
+    assert (sd.max(axis=1) < 5 * off.max(axis=1)).all()
+
+
 def test_axes_of_lines():
     for end, expected in (((0, 0, 1), np.eye(3)), ((1, 0, 0), [[0, 1, 0], [0, 0, 1], [1, 0, 0]])):
         lines = Lines(np.zeros(3), np.array(end, float), (np.zeros(1), np.zeros(1)), 3)

@@ -110,6 +110,15 @@ def test_points_in_the_winding_are_refused(keys, inside):
     coil_field(coil(**keys), np.multiply([inside], [1.0, 1.1, 1.1]), "a")
 
 
+def test_a_coil_beside_a_cross_section_is_none():
+    """The field of the magnet does not depend on z, but that of the coil does."""
+    magnet = build_magnet(parse_study(changed(DIPOLE, external={"coils": [
+        {"kind": "round", "current_A": 1e5, "radius_m": 0.1}]})))
+    points = np.array([[0.0, 0.01, 0.0], [0.0, 0.01, 0.2]])
+    own = magnet.field_T(points) - external_field(magnet, points)
+    np.testing.assert_allclose(own[0], own[1], atol=1e-12)
+
+
 def test_other_refusals():
     with pytest.raises(StudyError, match="corner_radius_m"):
         parse_study(changed(DIPOLE, external={"coils": [
