@@ -8,12 +8,12 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from halbach_fe.core.errors import StudyError, must_be
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 MU_0 = 4e-7 * math.pi
 """Vacuum permeability in T m/A. The value before 2019; it differs from the measured value by
@@ -131,6 +131,8 @@ def csv_text(columns: Mapping[str, NDArray[Any] | Sequence[object]]) -> str:
     Bx,0.1
     By,1e-09
     """
+    import numpy as np  # which --help does not need
+
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

@@ -234,7 +234,7 @@ def test_what_is_given_to_another_command(campaign, tmp_path, capsys):
     for said, command in (
             ("a table of measured moments", ["new", tmp_path / "n.toml", "--free-blocks",
                                                  blocks]),
-            ("Add --across-m U V", ["field", study, "--from-m", 0, 0, -0.1, "--to-m", 0, 0, 0.1,
+            ("add --across-m U V", ["field", study, "--from-m", 0, 0, -0.1, "--to-m", 0, 0, 0.1,
                                        "--lines", 3, "-o", tmp_path / "f"]),
             ("takes one map", ["explain", tmp_path / "maps.toml", measured, "-o",
                                   tmp_path / "e"])):

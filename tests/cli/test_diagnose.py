@@ -356,7 +356,8 @@ def test_the_documentation_says_what_is_in_the_file():
         prediction_posterior=SimpleNamespace(mean=np.ones(1)),
         observation=SimpleNamespace(labels=("Bx",)))
     nothing = SimpleNamespace(
-        before=update, after=update, gross_errors=(), poses=(), outliers=(), identified=(),
+        study=study, before=update, after=update, gross_errors=(), poses=(), outliers=(),
+        identified=(),
         position_noise=(), solver_error=None, unknown=None, suspected=(), found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, answer=1, converged=True, positions=(),
