@@ -148,9 +148,11 @@ def infer(
     >>> bool(block["posterior_sd"] < block["prior_sd"])
     True
     """
+    of_blocks = None if blocks is None else prior_from_blocks(magnet, blocks)
+    if prior is not None:
+        prior = distribution_of(magnet, prior, "prior")
     search = _Search.of(magnet, maps_of(magnet.study, data, validation_map), session, similar,
-                        None if blocks is None else prior_from_blocks(magnet, blocks),
-                        prior if prior is None else distribution_of(magnet, prior, "prior"))
+                        of_blocks, prior)
     at_rest = search.come_to_rest(say)
     if at_rest and search.has_uncertain_positions:
         search.estimate_noise_of_positions()

@@ -77,9 +77,9 @@ def test_there_is_no_other_text():
     """Whoever adds a field of text to the study decides here where it may go."""
     assert set(text_fields(Study.model_json_schema())) == {
         "Study.name", "Study.description", "NoiseRegion.name", "Prior.types", "SteelCurve.name",
-        "TableCurve.file", "Array.material", "Ring.material", "FreeBlocks.file", "MapSettings.name",
-        "MapSettings.file", "MapSettings.probe", "MapSettings.stage", "ShimMagnet.name",
-        "ShimMagnet.material", "Uncertain.name", "Uncertain.change"}
+        "TableCurve.file", "IronMesh.file", "Array.material", "Ring.material", "FreeBlocks.file",
+        "MapSettings.name", "MapSettings.file", "MapSettings.probe", "MapSettings.stage",
+        "ShimMagnet.name", "ShimMagnet.material", "Uncertain.name", "Uncertain.change"}
 
 
 def hostile_studies():
