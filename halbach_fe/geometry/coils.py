@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.study.magnet import AnyCoil, PolygonCoil, Racetrack
 
@@ -66,13 +66,22 @@ def turn_corners(coil: Racetrack, across: float, chords: int) -> Floats:
     return np.column_stack([turn, np.zeros(len(turn))])
 
 
+def in_winding(coil: AnyCoil, points: Floats) -> Ints:
+    """Return which points (n, 3) in m of the magnet lie in a winding, and not at its surface."""
+    if coil.kind == "polygon" or not all(coil.section_m):
+        return np.zeros(0, int)
+    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
+    return np.flatnonzero(distance(coil, (points - coil.centre_m) @ axes) < -closest(coil))
+
+
 def points_in_winding(coil: AnyCoil) -> Floats:
     """Return points (n, 3) in m of the magnet all along a winding: in its middle and its edges."""
     if coil.kind == "polygon":
         turns = [closed_polygon(coil)]
     else:
         turns = []
-        just_inside = np.array([-0.49, 0.0, 0.49])
+        # bodies in a thick winding hold points in it themselves, those that a sheet cuts do not
+        just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 25)
         for across in np.unique(just_inside * coil.section_m[0]):
             if coil.kind == "round":
                 angle = np.linspace(0.0, 2 * np.pi, 97)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import magpylib
 import numpy as np
 import pytest
@@ -168,6 +170,29 @@ def test_points_in_the_winding_are_refused(keys, inside):
     with pytest.raises(StudyError, match="clear of readings, blocks and iron"):
         coil_field(coil(**keys), np.array([inside]), "a")
     coil_field(coil(**keys), np.multiply([inside], [1.0, 1.1, 1.1]), "a")
+
+
+def test_blocks_and_iron_in_windings_are_refused():
+    """The blocks of the array begin at a radius of 0.1 m; a core may touch its winding."""
+    core = {"kind": "box", "size_m": [0.04, 0.04, 0.04], "centre_m": [0.0, 0.0, 0.5]}
+    plain = changed(DIPOLE, dimension=3, array__ring_length_m=0.08, iron={
+        "relative_permeability": 9.0, "bodies": [core]})
+    around = {"kind": "racetrack", "current_A": 1.0, "centre_m": [0.0, 0.0, 0.5],
+              "size_m": [0.05, 0.05], "corner_radius_m": 0.005, "section_m": [0.01, 0.02]}
+    for one, where in (
+            (around, None), (around | {"centre_m": [0.001, 0.0, 0.5]}, "body 1 of iron"),
+            ({"kind": "round", "current_A": 1.0, "radius_m": 0.11}, "block r01s"),
+            ({"kind": "round", "current_A": 1.0, "radius_m": 0.05}, None),
+            ({"kind": "round", "current_A": 1.0, "radius_m": 0.01, "section_m": [0.0, 1.3]},
+             "body 1 of iron"),
+            ({"kind": "polygon", "current_A": 1.0, "points_m": [
+                [0.0, 0.0, 0.5], [0.3, 0.0, 0.5], [0.0, 0.3, 0.5]]}, "body 1 of iron"),
+            ({"kind": "round", "current_A": 1.0, "radius_m": 0.3, "section_m": [0.5, 2.0]},
+             "block r01s")):
+        study = parse_study(plain | {"external": {"coils": [one]}})
+        with nullcontext() if where is None else pytest.raises(
+                StudyError, match=rf"coils\[0\].* clear of blocks and iron; .* in {where}"):
+            build_magnet(study)
 
 
 def test_other_refusals():
