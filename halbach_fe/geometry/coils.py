@@ -81,7 +81,7 @@ def points_in_winding(coil: AnyCoil) -> Floats:
     else:
         turns = []
         # bodies in a thick winding hold points in it themselves, those that a sheet cuts do not
-        just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 25)
+        just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 97)
         for across in np.unique(just_inside * coil.section_m[0]):
             if coil.kind == "round":
                 angle = np.linspace(0.0, 2 * np.pi, 97)

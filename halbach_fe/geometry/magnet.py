@@ -346,7 +346,10 @@ class Magnet(ShownInNotebook):
     def with_study(self, study: Study) -> Magnet:
         """Return the magnet of another study; blocks are built again only if they may differ."""
         same = all(getattr(study, key) == getattr(self.study, key) for key in MAGNET_KEYS)
-        return Magnet(study, self.blocks) if same else build_magnet(study)
+        if not same:
+            return build_magnet(study)
+        _check_external(study)
+        return Magnet(study, self.blocks)
 
 
 @typed
@@ -391,12 +394,17 @@ def build_magnet(study: Study) -> Magnet:
     if study.iron_ring is not None:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
+    _check_external(study)
+    return magnet
+
+
+def _check_external(study: Study) -> None:
+    """Refuse neighbouring magnets and coils in the place of the magnet."""
     if study.external.neighbours:
         _check_neighbours(study.dimension, study.array, study.iron_ring, study.iron,
                           study.external.neighbours)
     if study.external.coils and study.dimension == 3:
         _check_coils(study.array, study.iron_ring, study.iron, study.external.coils)
-    return magnet
 
 
 def neighbour_blocks(

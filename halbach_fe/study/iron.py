@@ -327,9 +327,9 @@ def closed_surface(triangles: Floats) -> Floats:
                          "and export it as a solid")
     pairs = sparse.coo_array((np.ones(len(edges)), edges.T))
     shell = connected_components(pairs, directed=False)[1][number[:, 0]]
-    volumes = np.bincount(shell, np.einsum(
+    volumes = np.asarray(np.bincount(shell, np.einsum(
         "ni,ni->n", triangles[:, 0] - triangles[0, 0],
-        np.cross(triangles[:, 1] - triangles[0, 0], triangles[:, 2] - triangles[0, 0])))
+        np.cross(triangles[:, 1] - triangles[0, 0], triangles[:, 2] - triangles[0, 0]))), float)
     outer = int(np.abs(volumes).argmax())
     if volumes[outer] < 0:
         triangles, volumes = triangles[:, ::-1], -volumes
