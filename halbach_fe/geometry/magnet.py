@@ -20,13 +20,14 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
+from halbach_fe.geometry.coils import in_winding, points_in_winding
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import points_on
 from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
 from halbach_fe.geometry.surface import Surroundings, surroundings
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
-from halbach_fe.study.magnet import External, Neighbour
+from halbach_fe.study.magnet import AnyCoil, External, Neighbour
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS
@@ -345,7 +346,10 @@ class Magnet(ShownInNotebook):
     def with_study(self, study: Study) -> Magnet:
         """Return the magnet of another study; blocks are built again only if they may differ."""
         same = all(getattr(study, key) == getattr(self.study, key) for key in MAGNET_KEYS)
-        return Magnet(study, self.blocks) if same else build_magnet(study)
+        if not same:
+            return build_magnet(study)
+        _check_external(study)
+        return Magnet(study, self.blocks)
 
 
 @typed
@@ -390,10 +394,17 @@ def build_magnet(study: Study) -> Magnet:
     if study.iron_ring is not None:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
+    _check_external(study)
+    return magnet
+
+
+def _check_external(study: Study) -> None:
+    """Refuse neighbouring magnets and coils in the place of the magnet."""
     if study.external.neighbours:
         _check_neighbours(study.dimension, study.array, study.iron_ring, study.iron,
                           study.external.neighbours)
-    return magnet
+    if study.external.coils and study.dimension == 3:
+        _check_coils(study.array, study.iron_ring, study.iron, study.external.coils)
 
 
 def neighbour_blocks(
@@ -429,6 +440,53 @@ def _check_neighbours(
                 f"one at z_m = {one.z_m:g} whose block {own[found[0]].name} is where blocks or "
                 "iron are already", "Move it along z by more than the length of the magnet."))
         taken += blocks
+
+
+@lru_cache(maxsize=128)
+def _check_coils(array: Array, iron_ring: IronRing | None, iron: Iron | None,
+                 coils: tuple[AnyCoil, ...]) -> None:
+    """Refuse blocks and iron of a 3D study in windings; they may touch.
+
+    Points of bodies are tested, and points of windings, so that thin ones are found too.
+
+    Raises
+    ------
+    StudyError
+    """
+    blocks = tuple(block for block in blocks_of_array(array, 3) if block.remanence)
+    reach = max(abs(end) for block in blocks for end in (block.z_min, block.z_max))
+    solids = iron_solids(3, iron_ring, iron, reach)
+    bodies = [(f"block {block.name}", block, _points_of(block)) for block in blocks] + [
+        (f"body {number + 1} of iron", solid, np.stack(solid.surface, axis=-1).reshape(-1, 3))
+        for number, solid in enumerate(solids)]
+    owner = np.repeat(np.arange(len(bodies)), [len(points) for _, _, points in bodies])
+    everywhere = np.vstack([points for _, _, points in bodies])
+    windings = [points_in_winding(coil) for coil in coils]
+    tree, coil_of = KDTree(np.vstack(windings)), np.repeat(
+        np.arange(len(coils)), [len(points) for points in windings])
+    found = [(number, int(owner[inside[0]])) for number, coil in enumerate(coils)
+             if len(inside := in_winding(coil, everywhere))]
+    for number, (_, body, points) in enumerate(bodies) if not found else ():
+        middle = points.mean(axis=0)
+        size = 1.1 * np.linalg.norm(points - middle, axis=1).max()  # arcs reach beyond points
+        near = np.array(tree.query_ball_point(middle, size), int)
+        inside = near[body.contact(np.asarray(tree.data)[near]).inside] if len(near) else near
+        if len(inside):
+            found = [(int(coil_of[inside[0]]), number)]
+            break
+    if found:
+        coil, number = found[0]
+        raise StudyError(must_be(
+            f"`external.coils[{coil}]`", "study", "clear of blocks and iron",
+            f"a winding in {bodies[number][0]}", "Move the coil, or what is in its winding."))
+
+
+def _points_of(block: MagnetBlock) -> Floats:
+    """Return points (n, 3) in m on the edges of a finite block, and in its middle."""
+    outline = np.vstack([edge.at(np.array([0.0, 0.5]))[0] for edge in block.outline])
+    outline = np.vstack([outline, outline.mean(axis=0)])
+    return block.from_frame(np.vstack([np.column_stack([outline, np.full(len(outline), z)])
+                                       for z in np.linspace(block.z_min, block.z_max, 3)]))
 
 
 @lru_cache(maxsize=128)  # a diagnosis builds the same magnets hundreds of times

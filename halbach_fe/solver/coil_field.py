@@ -3,14 +3,17 @@
 A round coil is the sum over radii, by Gauss-Legendre quadrature, of thin solenoids (N. Derby, S.
 Olbert, Am. J. Phys. 78 (2010) 229, with Carlson's integrals) or, without a length, of loops (J. D.
 Jackson, Classical Electrodynamics, 3rd ed., section 5.5). Other coils are filaments of straight
-segments (J. D. Hanson, S. P. Hirshman, Phys. Plasmas 9 (2002) 4410). At a distance of half the
-larger side of a section, the sum over it was measured to be 2e-8 of the largest field off with 8
-radii, and 3e-4 with 4 x 4 filaments and the chords of corners.
+segments (J. D. Hanson, S. P. Hirshman, Phys. Plasmas 9 (2002) 4410). For points nearer than half a
+side of the section the winding is halved across that side, again and again, until 8 radii, or 4 x 4
+filaments, serve for each part; corners near a point have more chords than 12.
+
+Against many more loops the field of a round coil was measured to be 1e-6 of the largest one off at
+1 mm from a winding of 20 mm, and that of racetracks, with round corners of 100 mm, 5e-4 from 0.1 to
+20 mm. Beside the thin wire of such a corner it is 1e-3 at 1 mm, and 4e-3 at 0.1 mm. `closest` says
+where windings begin.
 """
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 from scipy import special
@@ -18,7 +21,8 @@ from scipy import special
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.study.magnet import AnyCoil, PolygonCoil, Racetrack, RoundCoil
+from halbach_fe.geometry.coils import closed_polygon, closest, distance, turn_corners
+from halbach_fe.study.magnet import AnyCoil, Racetrack, RoundCoil
 from halbach_fe.study.materials import MU_0
 
 
@@ -28,42 +32,24 @@ def coil_field(coil: AnyCoil, points: Floats, name: str) -> Floats:
     Raises
     ------
     StudyError
-        If a point lies in the winding.
+        If a point lies in the winding, or nearer to it than `closest`.
     """
     axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
     own = (points - coil.centre_m) @ axes
-    closest_m = 1e-6  # nearer than any probe can be
-    inside = np.flatnonzero(distance(coil, own) < closest_m)
-    if len(inside):
-        x, y, z = points[inside[0]]
+    near = np.flatnonzero(distance(coil, own) < closest(coil))
+    if len(near):
+        x, y, z = points[near[0]]
         raise StudyError(must_be(
             "`external.coils`", f"study {name}", "clear of readings, blocks and iron",
-            f"a coil ({coil.kind}) whose winding holds the point ({x:g}, {y:g}, {z:g}) m",
-            "Move the coil, or what is in its winding."))
+            f"a coil ({coil.kind}) whose winding holds, or all but touches, the point ({x:g}, "
+            f"{y:g}, {z:g}) m", "Move the coil, or what is in its winding; they must stay "
+            f"{1e3 * closest(coil):.2g} mm apart."))
     current = MU_0 * coil.current_A * coil.turns
-    found = _round(coil, own) if coil.kind == "round" else _straight(_filaments(coil), own)
-    return np.asarray(current * found @ axes.T)
-
-
-def distance(coil: AnyCoil, points: Floats) -> Floats:
-    """Return distances (n,) in m of points (n, 3) in its own axes from a coil; 0 in its winding."""
     if coil.kind == "polygon":
-        return np.min([_from_segment(points, *ends) for ends in pairwise(_closed(coil))], axis=0)
-    if coil.kind == "round":
-        across = np.hypot(*points[:, :2].T) - coil.radius_m
+        found = _straight(np.ones(1), closed_polygon(coil)[None], own)
     else:
-        beyond = np.abs(points[:, :2]) - np.array(coil.size_m) / 2 + coil.corner_radius_m
-        across = np.hypot(*np.maximum(beyond, 0.0).T) + np.minimum(
-            beyond.max(axis=1), 0.0) - coil.corner_radius_m
-    apart = np.abs(np.column_stack([across, points[:, 2]])) - np.array(coil.section_m) / 2
-    return np.asarray(np.hypot(*np.maximum(apart, 0.0).T))
-
-
-def _from_segment(points: Floats, start: Floats, end: Floats) -> Floats:
-    """Return distances (n,) of points (n, 3) from a straight segment."""
-    along = end - start
-    share = np.clip((points - start) @ along / (float(along @ along) or 1.0), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(points - start - share[:, None] * along, axis=1))
+        found = _round(coil, own) if coil.kind == "round" else _racetrack(coil, own)
+    return np.asarray(current * found @ axes.T)
 
 
 def _gauss(side: float, count: int) -> tuple[Floats, Floats]:
@@ -76,6 +62,20 @@ def _gauss(side: float, count: int) -> tuple[Floats, Floats]:
 
 def _round(coil: RoundCoil, points: Floats) -> Floats:
     """Return B (n, 3) of a round coil of mu_0 N I = 1 at points in its own axes."""
+    near = distance(coil, points) < coil.section_m[0] / 2
+    found = np.zeros((len(points), 3))
+    found[~near] = _thin_solenoids(coil, points[~near])
+    if near.any():
+        width, length = coil.section_m
+        for offset in (-width / 4, width / 4):
+            half = coil.model_copy(update={
+                "section_m": (width / 2, length), "radius_m": coil.radius_m + offset})
+            found[near] += _round(half, points[near]) / 2
+    return found
+
+
+def _thin_solenoids(coil: RoundCoil, points: Floats) -> Floats:
+    """Return B (n, 3) of a round coil as the sum over 8 radii."""
     rho, z = np.hypot(*points[:, :2].T), points[:, 2]
     half = coil.section_m[1] / 2
     along_rho, along_z = np.zeros(len(points)), np.zeros(len(points))
@@ -119,43 +119,67 @@ def _sheet(radius: float, half: float, rho: Floats, z: Floats) -> tuple[Floats, 
     return along_rho, along_z
 
 
-def _closed(coil: PolygonCoil) -> Floats:
-    """Return the corners (m + 1, 3) in m of a polygon, the first one again at the end."""
-    return np.array([*coil.points_m, coil.points_m[0]])
-
-
-def _filaments(coil: Racetrack | PolygonCoil) -> list[tuple[float, Floats]]:
-    """Return closed filaments: their shares of the current, and corners (m, 3) in m."""
-    if coil.kind == "polygon":
-        return [(1.0, _closed(coil))]
-    chords = 12
-    step = np.pi / 2 / chords
-    # radius of the inner corners of the chords, relative to that of the arc, for the same area
-    wider = (np.sqrt(1 + (chords - 2) * chords * step / np.sin(step)) - 1) / (chords - 2)
-    radii = np.array([1.0, *(wider,) * (chords - 1), 1.0])
-    middle = np.array(coil.size_m) / 2 - coil.corner_radius_m
-    found = []
-    for across, share in zip(*_gauss(coil.section_m[0], 4), strict=True):
-        corners = [np.array(sign) * middle + (coil.corner_radius_m + across) * radii[:, None]
-                   * np.column_stack([np.cos(angle), np.sin(angle)])
-                   for number, sign in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)])
-                   for angle in [np.pi / 2 * number + step * np.arange(chords + 1)]]
-        turn = np.vstack([*corners, corners[0][:1]])
-        for height, part in zip(*_gauss(coil.section_m[1], 4), strict=True):
-            found.append((share * part, np.column_stack([turn, np.full(len(turn), height)])))
+def _racetrack(coil: Racetrack, points: Floats, chords: int = 12) -> Floats:
+    """Return B (n, 3) of a racetrack of mu_0 N I = 1 at points in its own axes."""
+    radius = coil.corner_radius_m + coil.section_m[0] / 2
+    chord = np.pi / 2 / chords * radius
+    # Chords serve at twice their length, or where the point is 100 times as far from them as the
+    # arc, chord^2 / (8 radius).
+    needed = np.array([*np.array(coil.section_m) / 2,
+                       min(2 * chord, 12.5 * chord**2 / (radius or 1.0))])
+    side = int(needed.argmax())
+    near = distance(coil, points) < needed[side]
+    found = np.zeros((len(points), 3))
+    found[~near] = _straight(*_filaments(coil, chords), points[~near])
+    if near.any() and side == 2:
+        found[near] = _racetrack(coil, points[near], 2 * chords)
+    elif near.any():
+        for sign in (-1, 1):
+            half, place = _half(coil, side, sign)
+            found[near] += _racetrack(half, points[near] - place, chords) / 2
     return found
 
 
-def _straight(filaments: list[tuple[float, Floats]], points: Floats) -> Floats:
-    """Return B (n, 3) of filaments of mu_0 I = 1 at points (n, 3) in m in their axes."""
+def _half(coil: Racetrack, side: int, sign: int) -> tuple[Racetrack, Floats]:
+    """Return the half of a racetrack on one side of its section's middle, and its place (3,)."""
+    section = np.array(coil.section_m)
+    section[side] /= 2
+    offset = sign * section[side] / 2
+    changes: dict[str, object] = {"section_m": tuple(section.tolist())}
+    if side == 0:
+        changes |= {"corner_radius_m": coil.corner_radius_m + offset,
+                    "size_m": tuple(size + 2 * offset for size in coil.size_m)}
+    return coil.model_copy(update=changes), np.array([0.0, 0.0, side * offset])
+
+
+def _filaments(coil: Racetrack, chords: int) -> tuple[Floats, Floats]:
+    """Return closed filaments: their shares (k,) of the current, and corners (k, m, 3) in m."""
+    shares, found = [], []
+    for across, share in zip(*_gauss(coil.section_m[0], 4), strict=True):
+        turn = turn_corners(coil, across, chords)
+        for height, part in zip(*_gauss(coil.section_m[1], 4), strict=True):
+            shares.append(share * part)
+            found.append(turn + np.array([0.0, 0.0, height]))
+    return np.array(shares), np.array(found)
+
+
+def _straight(shares: Floats, corners: Floats, points: Floats) -> Floats:
+    """Return B (n, 3) of filaments of mu_0 I = 1, shares (k,) and corners (k, m, 3) in m."""
+    starts, along = corners[:, :-1].reshape(-1, 3), np.diff(corners, axis=1).reshape(-1, 3)
+    lengths = np.linalg.norm(along, axis=1)
+    share = np.repeat(shares, corners.shape[1] - 1)[lengths > 0]
+    starts, along, lengths = (part[lengths > 0] for part in (starts, along, lengths))
     found = np.zeros((len(points), 3))
-    for share, corners in filaments:
-        for start, end in pairwise(corners):
-            length = float(np.linalg.norm(end - start))
-            if not length:
-                continue
-            first, last = points - start, points - end
-            near, far = np.linalg.norm(first, axis=1), np.linalg.norm(last, axis=1)
-            factor = share * 2 * (near + far) / (near * far * ((near + far) ** 2 - length**2))
-            found += factor[:, None] * np.cross(end - start, first)
+    at_once = max(1, 100_000 // len(starts))  # so that arrays stay in the cache
+    for first in range(0, len(points), at_once):
+        some = slice(first, first + at_once)
+        x, y, z = (points[some, None, i] - starts[:, i] for i in range(3))
+        u, v, w = along.T
+        near = np.sqrt(x**2 + y**2 + z**2)
+        far = np.sqrt((x - u)**2 + (y - v)**2 + (z - w)**2)
+        total = near + far
+        factor = share * 2 * total / (near * far * (total**2 - lengths**2))
+        found[some] = np.column_stack([
+            np.einsum("nm,nm->n", factor, part)
+            for part in (v * z - w * y, w * x - u * z, u * y - v * x)])
     return found / (4 * np.pi)

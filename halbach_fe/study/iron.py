@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
+import scipy.sparse as sparse
 from pydantic import Field, model_validator
+from scipy.sparse.csgraph import connected_components
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.study import materials
 from halbach_fe.study.types import (
     COMPONENTS,
@@ -166,8 +168,13 @@ class PlacedIron(StudyModel):
 
     @model_validator(mode="after")
     def _of_distinct_images(self) -> Self:
+        if any(self.step_m) and self.repeats == 1:
+            raise ValueError("step_m needs repeats, the number of bodies that stand in the row")
         images = self.images
-        if any(one in images[:number] for number, one in enumerate(images)):
+        # shapes are compared by what mirrors change of them; all else is common to the images
+        if len({repr([getattr(one, key, None) for key in (
+                "centre_m", "rotation_deg", "z_m", "outline_m", "triangles_m")])
+                for one in images}) < len(images):
             raise ValueError("repeats and mirrored must make bodies in different places; give "
                              "step_m, and leave out of mirrored what leads to the same place")
         return self
@@ -285,6 +292,8 @@ class IronMesh(PlacedIron):
     def _consistent(self) -> IronMesh:
         if (self.file is None) == (not self.triangles_m):
             raise ValueError("give either a file or triangles_m")
+        if self.triangles_m and self.unit_m != type(self).model_fields["unit_m"].default:
+            raise ValueError("unit_m is that of a file; triangles_m are in m, so leave unit_m out")
         if self.triangles_m:
             closed_surface(np.array(self.triangles_m))
         return self
@@ -296,7 +305,7 @@ def closed_surface(triangles: Floats) -> Floats:
     Raises
     ------
     ValueError
-        If the surface is open, or some triangles are turned over.
+        If the surface is open, some triangles are turned over, or it is that of several bodies.
     """
     size = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -316,8 +325,42 @@ def closed_surface(triangles: Floats) -> Floats:
         raise ValueError(f"the surface must be closed, but {len(lone)} edges belong to a single "
                          f"triangle, one of them at ({x:g}, {y:g}, {z:g}) m; repair the surface, "
                          "and export it as a solid")
-    volume = np.einsum("ni,ni->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2]))
-    return triangles if volume > 0 else triangles[:, ::-1]
+    pairs = sparse.coo_array((np.ones(len(edges)), edges.T))
+    shell = connected_components(pairs, directed=False)[1][number[:, 0]]
+    volumes = np.asarray(np.bincount(shell, np.einsum(
+        "ni,ni->n", triangles[:, 0] - triangles[0, 0],
+        np.cross(triangles[:, 1] - triangles[0, 0], triangles[:, 2] - triangles[0, 0]))), float)
+    outer = int(np.abs(volumes).argmax())
+    if volumes[outer] < 0:
+        triangles, volumes = triangles[:, ::-1], -volumes
+    _check_cavities(triangles, shell, volumes)
+    return triangles
+
+
+def _check_cavities(triangles: Floats, shell: Ints, volumes: Floats) -> None:
+    """Refuse shells of triangles (n, 3, 3) but an outer one and its cavities.
+
+    ``shell`` (n,) is that of each triangle, and ``volumes`` (shells,) have the sign of its normals.
+
+    Raises
+    ------
+    ValueError
+    """
+    if (volumes > 0).sum() > 1:
+        raise ValueError(f"it has {(volumes > 0).sum()} closed shells with normals outwards, but a "
+                         "file is one body; export every body to a file of its own, and list them "
+                         "as bodies (a cavity has its normals into the cavity)")
+    for other in np.flatnonzero(volumes < 0):
+        rest = triangles[shell != other] - triangles[shell == other][0, 0]
+        a, b, c = np.moveaxis(rest, 1, 0)
+        far = np.linalg.norm(rest, axis=2)
+        # the solid angle of every triangle, of which half is the arctangent; 2 pi add up inside
+        flat = far.prod(axis=1) + sum(np.einsum("ni,ni->n", one, two) * far[:, side] for (
+            one, two, side) in ((a, b, 2), (b, c, 0), (c, a, 1)))
+        if np.arctan2(np.einsum("ni,ni->n", a, np.cross(b, c)), flat).sum() < np.pi:
+            raise ValueError("it has a closed shell with normals inwards that is no cavity, since "
+                             "it does not lie inside the outer shell, or lies in another cavity; "
+                             "turn its normals, and export it to a file of its own")
 
 
 def read_stl(path: Path) -> Floats:

@@ -88,7 +88,8 @@ class RoundCoil(WoundCoil):
 class Racetrack(WoundCoil):
     """A rectangle with round corners, of ``size_m`` along its own x and y, in the section's middle.
 
-    ``corner_radius_m`` is there too. The field takes each corner as 12 chords around the same area.
+    ``corner_radius_m`` is there too. The field takes each corner as chords around the same
+    area, 12 or, near them, more.
     """
 
     kind: Literal["racetrack"]

@@ -108,6 +108,7 @@ def _doubted_units(study: Study) -> list[str]:
     # from the next one beyond which it is not turned on purpose.
     large_turn_rad, off_step = 0.3, 0.05
     large_block_m = 1.0  # size of no block of a magnet: it would weigh some tons
+    small_iron_m = 1e-3  # size of no body of iron that is worth a file
     found = []
     for instrument in (study.instrument, *(one.instrument for one in study.maps)):
         for turn in instrument.rotation_rad if instrument else ():
@@ -120,6 +121,12 @@ def _doubted_units(study: Study) -> list[str]:
     thick = study.array.outer_radius_m - study.array.inner_radius_m
     if study.array.rings and thick > large_block_m:
         found.append(f"its blocks are {thick:.3g} m thick. Were other units than metres meant?")
+    for number, body in enumerate(study.iron.bodies if study.iron else ()):
+        if body.kind == "stl" and body.triangles_m:
+            largest = np.ptp(np.array(body.triangles_m).reshape(-1, 3), axis=0).max()
+            if largest < small_iron_m:
+                found.append(f"`iron.bodies[{number}]` is only {1e3 * largest:.3g} mm large. Were "
+                             "metres meant? Then set its unit_m = 1.")
     return found
 
 
@@ -168,7 +175,9 @@ def _with_triangles(body: IronBody, key: str, folder: Path, where: str) -> IronB
     with _reading(folder / body.file, f"{key}.file", where, "a closed surface in an STL file"
                   ) as path:
         triangles = closed_surface(body.unit_m * read_stl(path)).tolist()
-        return body.with_(file=None, triangles_m=triangles)
+        # the triangles are in m: the unit was that of the file
+        return body.with_(file=None, triangles_m=triangles,
+                          unit_m=type(body).model_fields["unit_m"].default)
 
 
 @contextmanager

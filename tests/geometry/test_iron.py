@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from time import perf_counter
 
 import numpy as np
 import pytest
 import tomlkit
 
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.study.reader import read_study
+from halbach_fe.study.iron import closed_surface
+from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, changed
 
 SIZE = DIPOLE["array"]["outer_radius_m"]
@@ -144,6 +146,33 @@ def test_triangles_are_as_a_box(short_dipole, generator):
             assert not ours.contains(points + found.outward)[found.on_face].any()
 
 
+def test_shells_of_triangles():
+    """One outer shell, with cavities in it; and a row or a unit that would do nothing."""
+    shell = triangles_of_box([0.1, 0.1, 0.1])
+    small = shell / 4
+    hole = small[:, ::-1]
+    right = closed_surface(np.vstack([shell, hole + 0.02, hole - 0.02])[:, ::-1])
+    assert np.einsum("ni,ni->", right[:, 0], np.cross(right[:, 1], right[:, 2])) / 6 == (
+        pytest.approx(1e-3 * (1 - 2 / 64)))
+    for second, wrong in ((small + 0.2, "2 closed shells with normals outwards"),
+                          (small, "2 closed shells with normals outwards"),
+                          (hole + 0.2, "no cavity"),
+                          (np.vstack([hole, hole / 4]), "no cavity")):
+        with pytest.raises(ValueError, match=wrong):
+            closed_surface(np.vstack([shell, second]))
+    stl = {"kind": "stl", "triangles_m": shell.tolist()}
+    for body, wrong in ((stl | {"unit_m": 1.0}, "leave unit_m out"),
+                        (BOX | {"step_m": [0.0, 0.0, 1.0]}, "step_m needs repeats")):
+        with pytest.raises(StudyError, match=wrong):
+            parse_study(changed(DIPOLE, iron={"relative_permeability": 9, "bodies": [body]}))
+    row = BOX | {"centre_m": [9.0, 9.0, 9.0], "repeats": 512, "step_m": [1e-3, 0.0, 0.0]}
+    start = perf_counter()
+    study = parse_study(changed(DIPOLE, dimension=3, array__ring_length_m=0.08, iron={
+        "relative_permeability": 9, "bodies": [row | {"mirrored": ["x", "y", "z"]}]}))
+    assert len(study.iron.each) == 4096
+    assert perf_counter() - start < 5  # 14.7 s when all pairs were compared
+
+
 def test_triangles_that_overlap_a_block(short_dipole):
     """The blocks begin at a radius of 0.1 m: a bar through one is found, a bar in the bore not."""
     for size, fits in (([0.15, 0.02, 0.02], True), ([0.5, 0.01, 0.01], False),
@@ -201,6 +230,10 @@ def test_stl_files(tmp_path, change, sentence):
     if sentence is None:
         (body,) = build_magnet(read_study(study)).iron
         assert body.measures[0] == pytest.approx(0.1 * 0.2 * 0.04)
+        text = study.read_text()
+        study.write_text(text.replace('"body.stl"', '"body.stl"\nunit_m = 1e-6'))
+        with pytest.warns(HalbachWarning, match=r"only 0\.2 mm large\. Were metres meant"):
+            read_study(study)
         return
     with pytest.raises(StudyError, match=sentence):
         read_study(study)

@@ -1,0 +1,103 @@
+"""Places of the windings of coils, to keep readings, blocks and iron clear of them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.geometry.blocks import rotation_matrix
+from halbach_fe.study.magnet import AnyCoil, PolygonCoil, Racetrack
+
+
+def closest(coil: AnyCoil) -> float:
+    """Return the distance in m from a winding below which its field is not computed."""
+    nearest_probe_m, of_section = 1e-6, 1e-4  # a winding is halved 13 times for the latter
+    return max(nearest_probe_m,
+               0.0 if coil.kind == "polygon" else of_section * max(coil.section_m))
+
+
+def distance(coil: AnyCoil, points: Floats) -> Floats:
+    """Return distances (n,) in m of points (n, 3) in its own axes from a coil.
+
+    They are negative in its winding.
+    """
+    if coil.kind == "polygon":
+        return np.min([_from_segment(points, *ends) for ends in pairwise(closed_polygon(coil))],
+                      axis=0)
+    if coil.kind == "round":
+        across = np.hypot(*points[:, :2].T) - coil.radius_m
+    else:
+        beyond = np.abs(points[:, :2]) - np.array(coil.size_m) / 2 + coil.corner_radius_m
+        across = np.hypot(*np.maximum(beyond, 0.0).T) + np.minimum(
+            beyond.max(axis=1), 0.0) - coil.corner_radius_m
+    apart = np.abs(np.column_stack([across, points[:, 2]])) - np.array(coil.section_m) / 2
+    return np.asarray(np.hypot(*np.maximum(apart, 0.0).T) + np.minimum(apart.max(axis=1), 0.0))
+
+
+def _from_segment(points: Floats, start: Floats, end: Floats) -> Floats:
+    """Return distances (n,) of points (n, 3) from a straight segment."""
+    along = end - start
+    share = np.clip((points - start) @ along / (float(along @ along) or 1.0), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(points - start - share[:, None] * along, axis=1))
+
+
+def closed_polygon(coil: PolygonCoil) -> Floats:
+    """Return the corners (m + 1, 3) in m of a polygon, the first one again at the end."""
+    return np.array([*coil.points_m, coil.points_m[0]])
+
+
+def turn_corners(coil: Racetrack, across: float, chords: int) -> Floats:
+    """Return the corners (m, 3) in m of a closed turn of a racetrack, ``across`` m off the middle.
+
+    An arc becomes ``chords`` chords around the same area.
+    """
+    step = np.pi / 2 / chords
+    # radius of the inner corners of the chords, relative to that of the arc, for the same area
+    wider = (np.sqrt(1 + (chords - 2) * chords * step / np.sin(step)) - 1) / (chords - 2)
+    radii = np.array([1.0, *(wider,) * (chords - 1), 1.0])
+    middle = np.array(coil.size_m) / 2 - coil.corner_radius_m
+    corners = [np.array(sign) * middle + (coil.corner_radius_m + across) * radii[:, None]
+               * np.column_stack([np.cos(angle), np.sin(angle)])
+               for number, sign in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+               for angle in [np.pi / 2 * number + step * np.arange(chords + 1)]]
+    turn = np.vstack([*corners, corners[0][:1]])
+    return np.column_stack([turn, np.zeros(len(turn))])
+
+
+def in_winding(coil: AnyCoil, points: Floats) -> Ints:
+    """Return which points (n, 3) in m of the magnet lie in a winding, and not at its surface."""
+    if coil.kind == "polygon" or not all(coil.section_m):
+        return np.zeros(0, int)
+    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
+    return np.flatnonzero(distance(coil, (points - coil.centre_m) @ axes) < -closest(coil))
+
+
+def points_in_winding(coil: AnyCoil) -> Floats:
+    """Return points (n, 3) in m of the magnet all along a winding: in its middle and its edges."""
+    if coil.kind == "polygon":
+        turns = [closed_polygon(coil)]
+    else:
+        turns = []
+        # bodies in a thick winding hold points in it themselves, those that a sheet cuts do not
+        just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 97)
+        for across in np.unique(just_inside * coil.section_m[0]):
+            if coil.kind == "round":
+                angle = np.linspace(0.0, 2 * np.pi, 97)
+                turn = (coil.radius_m + across) * np.column_stack(
+                    [np.cos(angle), np.sin(angle), 0 * angle])
+            else:
+                turn = turn_corners(coil, across, 12)
+            turns += [turn + np.array([0.0, 0.0, height])
+                      for height in np.unique(just_inside * coil.section_m[1])]
+    own = np.vstack([_along(turn) for turn in turns])
+    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
+    return np.asarray(own @ axes.T + coil.centre_m)
+
+
+def _along(corners: Floats) -> Floats:
+    """Return points (200, 3) at equal distances along a line with the corners (m, 3)."""
+    place = np.cumsum([0.0, *np.linalg.norm(np.diff(corners, axis=0), axis=1)])
+    at = np.linspace(0.0, place[-1], 200)
+    return np.column_stack([np.interp(at, place, part) for part in corners.T])
