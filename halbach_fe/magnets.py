@@ -7,6 +7,7 @@ any of it, and `write_study` writes it down.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import refuse_unknown, typed
-from halbach_fe.core.errors import OutputError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, OutputError, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
@@ -313,7 +314,8 @@ def _turned(turn: Rotation) -> dict[str, float]:
 def to_magpylib(magnet: Magnet) -> Any:
     """Return a magnet's blocks as a ``magpylib.Collection``.
 
-    Its polarizations are the remanences: magpylib's own field has no permeability and no iron.
+    Its polarizations are the remanences: magpylib's own field has no permeability and no iron, nor
+    what is beside the magnet. A warning names what of this magnet is left out.
 
     Parameters
     ----------
@@ -340,6 +342,16 @@ def to_magpylib(magnet: Magnet) -> Any:
     if magnet.dimension == 2:
         raise StudyError(must_be("magnet", "to_magpylib", "of finite length", "a cross-section"))
     table = FreeBlocks.model_validate(blocks_table(magnet))
+    external = magnet.external
+    left_out = [name for name, given in (
+        ("the permeability of the blocks", any(
+            block.recoil_permeability != 1 or block.recoil_permeability_across != 1
+            for block in magnet.blocks)),
+        ("iron", magnet.iron), ("coils", external.coils), ("neighbours", external.neighbours),
+        ("dipoles", external.dipoles), ("the background", any(external.background_T))) if given]
+    if left_out:
+        warnings.warn(f"Sources of magpylib leave out {', '.join(left_out)} of magnet "
+                      f"{magnet.name}: their field is another one.", HalbachWarning, stacklevel=2)
     return magpylib.Collection([_source(magpylib, table, number) for number in range(len(table))],
                                style_label=magnet.name)
 

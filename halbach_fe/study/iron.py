@@ -166,6 +166,9 @@ class PlacedIron(StudyModel):
 
     @model_validator(mode="after")
     def _of_distinct_images(self) -> Self:
+        if self.repeats == 1 and any(self.step_m):
+            raise ValueError("step_m stands beside repeats, the number of bodies in the row: add "
+                             "repeats, 2 or more, or leave step_m out")
         images = self.images
         if any(one in images[:number] for number, one in enumerate(images)):
             raise ValueError("repeats and mirrored must make bodies in different places; give "

@@ -100,6 +100,8 @@ def test_repeated_and_mirrored(short_dipole, generator, body):
         some = images[number * len(plain):(number + 1) * len(plain)]
         np.testing.assert_array_equal(
             np.any([each.contains(seen) for each in some], axis=0), inside)
+    with pytest.raises(StudyError, match="step_m stands beside repeats"):
+        magnet_of(short_dipole, placed | {"step_m": step})
     for wrong in ({"repeats": 2}, {"mirrored": ["y", "y"]}):
         with pytest.raises(StudyError, match="bodies in different places"):
             magnet_of(short_dipole, placed | wrong)
