@@ -28,7 +28,6 @@ from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
 from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
-from halbach_fe.study.magnet import External
 from halbach_fe.study.model import Study
 from halbach_fe.study.template import (
     OUTER_RADIUS,
@@ -315,8 +314,8 @@ def _turned(turn: Rotation) -> dict[str, float]:
 def to_magpylib(magnet: Magnet) -> Any:
     """Return a magnet's blocks as a ``magpylib.Collection``.
 
-    Its polarizations are the remanences: magpylib's own field has no permeability, no iron and no
-    external sources.
+    Its polarizations are the remanences: magpylib's own field has no permeability and no iron, nor
+    what is beside the magnet. A warning names what of this magnet is left out.
 
     Parameters
     ----------
@@ -342,10 +341,17 @@ def to_magpylib(magnet: Magnet) -> Any:
     magpylib = import_extra("magpylib")
     if magnet.dimension == 2:
         raise StudyError(must_be("magnet", "to_magpylib", "of finite length", "a cross-section"))
-    if magnet.external != External():
-        warnings.warn(f"The external sources of study {magnet.name} are not in the collection: add "
-                      "them to it.", HalbachWarning, stacklevel=2)
     table = FreeBlocks.model_validate(blocks_table(magnet))
+    external = magnet.external
+    left_out = [name for name, given in (
+        ("the permeability of the blocks", any(
+            block.recoil_permeability != 1 or block.recoil_permeability_across != 1
+            for block in magnet.blocks)),
+        ("iron", magnet.iron), ("coils", external.coils), ("neighbours", external.neighbours),
+        ("dipoles", external.dipoles), ("the background", any(external.background_T))) if given]
+    if left_out:
+        warnings.warn(f"Sources of magpylib leave out {', '.join(left_out)} of magnet "
+                      f"{magnet.name}: their field is another one.", HalbachWarning, stacklevel=2)
     return magpylib.Collection([_source(magpylib, table, number) for number in range(len(table))],
                                style_label=magnet.name)
 

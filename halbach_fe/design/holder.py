@@ -333,6 +333,9 @@ def _plate(
     low = min(block.prism.z_min for block in group) - frame.floor
     top = max(block.prism.z_max for block in group) - low
     thickness = holder.thickness_m or top
+    if thickness / 2 < (depth := holder.engraving_m) > Holder().engraving_m:
+        raise CannotBeMadeError(f"a number engraved {_mm(depth)} deep, more than half through a "
+                                f"plate of {_mm(thickness)}", "Reduce engraving_m.")
     openings: list[tuple[str, Prism]] = []
 
     def through(prism: Prism) -> Prism:

@@ -308,6 +308,10 @@ def reach(study: Study, ring: RingOfBlocks) -> tuple[float, float]:
 def _rings(study: Study, layer: DesignLayer) -> Iterator[RingOfBlocks]:
     """Yield the rings of a layer: for each size those of each radius."""
     array = study.array.of_ring(1)
+    if layer.gap_m and array.block.shape != "cuboid":
+        raise StudyError(must_be(
+            "`design.layer.gap_m`", f"study {study.name}", "left out, but for cuboids",
+            f"{layer.gap_m:g} m of a {array.block.shape}", "Its gaps are those of array.block."))
     sizes = layer.sizes_m or (array.outer_radius_m - array.inner_radius_m,)
     for size in sizes:
         for number, radius in enumerate(layer.radii_m):
@@ -317,12 +321,15 @@ def _rings(study: Study, layer: DesignLayer) -> Iterator[RingOfBlocks]:
                 raise StudyError(must_be(
                     "`design.layer.radii_m`", f"study {study.name}",
                     "so large that four blocks fit",
-                    f"{radius:g} with blocks of {1e3 * size:g} mm"))
+                    f"{radius:g} with blocks of {1e3 * size:g} mm"
+                    + f", {1e3 * layer.gap_m:g} mm apart" * bool(layer.gap_m)))
             ring = RingOfBlocks(radius, size, blocks)
-            if blocks > most and overlapping_blocks(blocks_of(study, [ring.table(array, 0.0)])):
+            if blocks > most and (layer.gap_m or overlapping_blocks(
+                    blocks_of(study, [ring.table(array, 0.0)]))):
                 raise StudyError(must_be(
                     "`design.layer.blocks_per_ring`", f"study {study.name}",
-                    f"so small that blocks of {1e3 * size:g} mm fit at the radius {radius:g} m",
+                    f"so small that blocks of {1e3 * size:g} mm fit at the radius {radius:g} m"
+                    + f", {1e3 * layer.gap_m:g} mm apart" * bool(layer.gap_m),
                     blocks, f"{most} do."))
             yield ring
 

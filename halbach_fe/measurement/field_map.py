@@ -341,12 +341,22 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
     write_csv(columns, data.attrs, path)
 
 
+def warn_of_left_out(data: xr.Dataset, kept: Sequence[str], path: Path) -> None:
+    """Warn of columns of a map for which the format of a file has no place."""
+    if left := [name for name in (*TOTAL_COLUMNS, *OTHER_COLUMNS) if name in data
+                and name not in kept]:
+        warnings.warn(f"Left out, as the format of {path} has no place for it: {', '.join(left)}. "
+                      "Files .csv and .h5 of halbach-fe keep everything.", HalbachWarning,
+                      stacklevel=4)
+
+
 def _write_vtu(data: xr.Dataset, path: Path) -> None:
     refuse_undirected(data)  # the format has no attributes
     points = points_of(data)
     cells = [("vertex", np.arange(len(points))[:, None])]
-    values = {name: data[name].values
-              for name in ("B_T", *TOTAL_COLUMNS, "sigma_T", "time_s") if name in data}
+    kept = ("B_T", *TOTAL_COLUMNS, "sigma_T", "time_s")
+    values = {name: data[name].values for name in kept if name in data}
+    warn_of_left_out(data, kept, path)
     meshio.write(path, meshio.Mesh(points, cells, point_data=values), file_format="vtu")
 
 

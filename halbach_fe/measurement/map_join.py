@@ -491,7 +491,8 @@ def _match(one: Checked, other: Checked, axes: Sequence[tuple[Floats, int]]) -> 
     starts: list[tuple[float, Pose, int]] = []
     for turn, sign in axes:
         starts += [(odds, pose, sign) for odds, pose in _shifts(one, other, turn, sign)]
-    starts.sort(key=lambda each: -each[0])
+    # of places that are as likely, as in a symmetric magnet, the one with the simplest axes
+    starts.sort(key=lambda each: -round(each[0] / CERTAIN))
     nothing = _Match(Pose(np.eye(3), np.zeros(3)), 1, np.inf, np.nan, -np.inf)
     found = [nothing]
     for _, pose, sign in starts[:PLACES]:
@@ -590,7 +591,9 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
                               max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
         pose = pose.moved(middle, found.x[:3], found.x[3:])
     # at the edge of the other map its field is not known as well as the noise is
-    off = float(MAD_TO_SD * np.median(np.abs(found.fun)))
+    # and of two components that agree, the third may have the opposite sign
+    medians = np.median(np.abs(found.fun.reshape(-1, 3)), axis=0)
+    off = float(MAD_TO_SD * np.sqrt(np.mean(medians**2)))
     size = float(np.sqrt(np.mean(read**2))) / noise
     odds = float(3 * len(rows) * np.log(np.hypot(size, 1) / np.hypot(off, 1)))
     if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:]).max() > 0.3:

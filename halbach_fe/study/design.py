@@ -232,6 +232,12 @@ class Holder(StudyModel):
         if inner is not None and outer is not None and inner >= outer:
             raise ValueError(f"outer_radius_m ({outer}) of the holder must be larger than "
                              f"inner_radius_m ({inner})")
+        for side, rim, radius in (("inner", self.inner_rim_m, inner),
+                                  ("outer", self.outer_rim_m, outer)):
+            # a study that halbach-fe wrote states defaults too
+            if radius is not None and rim != type(self).model_fields[f"{side}_rim_m"].default:
+                raise ValueError(f"give either {side}_radius_m ({radius}) or {side}_rim_m ({rim}) "
+                                 "of the holder; the radius leaves the rim no effect")
         if self.floor_m is not None and self.thickness_m is not None and (
                 self.floor_m >= self.thickness_m):
             raise ValueError(f"thickness_m ({self.thickness_m}) of the holder must be larger than "

@@ -168,8 +168,9 @@ class PlacedIron(StudyModel):
 
     @model_validator(mode="after")
     def _of_distinct_images(self) -> Self:
-        if any(self.step_m) and self.repeats == 1:
-            raise ValueError("step_m needs repeats, the number of bodies that stand in the row")
+        if self.repeats == 1 and any(self.step_m):
+            raise ValueError("step_m stands beside repeats, the number of bodies in the row: add "
+                             "repeats, 2 or more, or leave step_m out")
         images = self.images
         # shapes are compared by what mirrors change of them; all else is common to the images
         if len({repr([getattr(one, key, None) for key in (

@@ -103,7 +103,7 @@ def _syntax_hint(text: str, error: str) -> str:
 
 
 def _doubted_units(study: Study) -> list[str]:
-    """Return sentences about numbers that are possible, but rather in another unit."""
+    """Return sentences about numbers that are possible, but rather in another unit, or idle."""
     # Angle above which no mapper is turned by mistake, and the distance, in steps of 15 degrees,
     # from the next one beyond which it is not turned on purpose.
     large_turn_rad, off_step = 0.3, 0.05
@@ -118,6 +118,9 @@ def _doubted_units(study: Study) -> list[str]:
                 found.append(f"`instrument.rotation_rad` turns the map by {np.degrees(turn):.0f}°. "
                              f"Were degrees meant? Then write {np.radians(turn):.3g} for "
                              f"{turn:.4g}.")
+        if instrument and instrument.memory_rows and not instrument.memory:
+            found.append("`instrument.memory_rows` is without effect, as `instrument.memory`, how "
+                         "much of each reading comes from those before it, is 0.")
     thick = study.array.outer_radius_m - study.array.inner_radius_m
     if study.array.rings and thick > large_block_m:
         found.append(f"its blocks are {thick:.3g} m thick. Were other units than metres meant?")

@@ -67,6 +67,20 @@ def test_magnets_go_to_magpylib_and_back():
     assert magnet.field_T(POINTS) != pytest.approx(sources.getB(POINTS), abs=1e-4)
 
 
+def test_what_magpylib_leaves_out_is_said():
+    ring = hf.halbach_ring(blocks=4, inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
+    assert hf.to_magpylib(ring)  # control: permeability 1, and nothing else; warnings are errors
+    for changes, said in (
+            ({"array__recoil_permeability": 1.05}, "the permeability of the blocks of magnet"),
+            ({"external__background_T": (0.0, 0.0, 1e-3)}, "the background"),
+            ({"iron_ring": {"inner_radius_m": 0.05, "outer_radius_m": 0.06,
+                            "relative_permeability": 100.0},
+              "external__coils": [{"kind": "round", "radius_m": 0.2, "current_A": 1.0}]},
+             "iron, coils of magnet")):
+        with pytest.warns(hf.HalbachWarning, match=said):
+            hf.to_magpylib(ring.with_(**changes))
+
+
 @pytest.mark.parametrize(("sources", "said"), [
     (magpylib.magnet.Sphere(diameter=0.01, polarization=(0, 0, 1)), "a Sphere"),
     ([], "instead received none"),
@@ -84,7 +98,7 @@ def test_a_prism_that_is_not_convex_is_refused():
     with pytest.raises(StudyError, match="convex"):
         hf.to_magpylib(magnet)
     ring = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
-    with pytest.warns(hf.HalbachWarning, match="external sources .* are not in the collection"):
+    with pytest.warns(hf.HalbachWarning, match="leave out the background"):
         hf.to_magpylib(ring.with_(external={"background_T": (0.0, 0.01, 0.0)}))
     with pytest.raises(StudyError, match="uniformly"):
         hf.to_magpylib(hf.halbach_ring(

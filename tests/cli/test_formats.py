@@ -73,3 +73,21 @@ def test_wrong_options(tmp_path, capsys, wrong):
         main(["import-map", "hall.txt", "-o", str(tmp_path / "map.csv"), *wrong])
     assert caught.value.code == 2
     assert "usage:" in capsys.readouterr().err
+
+
+def test_columns_for_which_a_format_has_no_place_are_said(tmp_path, capsys):
+    """Control: a CSV file keeps them all, without a word."""
+    source = tmp_path / "map.h5"
+    places = np.stack(np.meshgrid(*[[0.0, 0.01]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    data = field_map(places, np.full((8, 3), 0.1), sigma_T=1e-5)
+    write_map(data.assign(scan=("point", ["a"] * 8)), source)
+    for name, suffix, left in (("bdsim", ".dat", "sigma_T, scan."), ("geant4", ".t", "sigma_T"),
+                               ("openpmd", ".hdf5", "sigma_T"), ("vtu", ".vtu", ": scan."),
+                               ("csv", ".csv", "")):
+        out = tmp_path / f"out{suffix}"
+        assert main(["export", str(source), "--format", name, "-o", str(out)]) == 0
+        said = capsys.readouterr().err
+        assert ("Left out" in said, left in said) == (bool(left), True)
+    code, sentence = refused(["export", source, "--format", "bdsim", "-o", tmp_path / "b.vtu"],
+                             capsys)
+    assert (code, "another format" in sentence) == (8, True)

@@ -221,8 +221,11 @@ def test_heights_that_are_zero_but_for_rounding_are_zero():
     ({"least_wall_m": 9e-3}, "thinner than least_wall_m = 9 mm.*Reduce least_wall_m"),
     ({"thickness_m": 0.03}, "plates that overlap by .*Reduce floor_m or thickness_m"),
     ({"outer_radius_m": 0.05}, "edge of the plate"),
-    ({"outer_rim_m": 8.0}, "`outer_rim_m` of 8000 mm .* Then write 0.008"),
+    ({"outer_radius_m": None, "outer_rim_m": 8.0}, "`outer_rim_m` of 8000 mm .* Then write 0.008"),
     ({"outer_radius_m": 9.9}, "meant in millimetres"),
+    ({"engraving_m": 8e-3}, "more than half through.*Reduce engraving_m"),
+    ({"inner_rim_m": 0.004}, "either inner_radius_m .* or inner_rim_m"),
+    ({"outer_rim_m": 0.004}, "either outer_radius_m .* or outer_rim_m"),
 ])
 def test_holders_that_cannot_be_made(holder, said):
     with pytest.raises(StudyError, match=said):

@@ -208,6 +208,9 @@ def test_numbers_of_blocks_are_the_largest_that_fit():
     ({"spacing_m": 0.009}, REGION, "the length of a ring"),
     ({"layer": [{"radii_m": [0.06]}, {"radii_m": [0.062]}]}, REGION, "fit inside one another"),
     ({"layer": [{"radii_m": [0.004]}]}, REGION, "so large that four blocks fit"),
+    ({"layer": [{"radii_m": [0.063], "gap_m": 0.08}]}, REGION, "four blocks fit.*80 mm apart"),
+    ({"layer": [{"radii_m": [0.063], "gap_m": 0.02, "blocks_per_ring": [16]}]}, REGION,
+     "20 mm apart; instead received 16. 11 do"),
     ({}, Region.sphere(0.06), "reaches"), ({}, Region.sphere(0.01, (-0.055, 0, 0)), "reaches"),
     ({}, Region.sphere(0.003, (0, 0.062, 0.0765)), "reaches"),
     ({}, Region("cylinder", (0.02, 0.02, 0.06)), None)])
@@ -226,6 +229,8 @@ def test_impossible_designs_are_refused(changes, region, message, session):
         "size_x_m": [0.01], "size_y_m": [0.01], "size_z_m": [0.01], "remanence_T": [1.3]}}},
      r"free blocks or exceptions.*halbach-fe new"),
     ({"dimension": 2}, "dimension"),
+    ({"array": DOCUMENT["array"] | {"block": {"shape": "sector"}}, "design": DOCUMENT["design"] | {
+        "layer": [{"radii_m": [0.058, 0.063], "gap_m": 0.001}]}}, "gap_m.* left out"),
     ({"iron_ring": {"inner_radius_m": 0.1, "outer_radius_m": 0.12,
                     "relative_permeability": 1000.0}}, "without iron"),
     ({"array": DOCUMENT["array"] | {"multipole_order": 2}}, "multipole_order"),

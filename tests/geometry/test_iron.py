@@ -104,6 +104,8 @@ def test_repeated_and_mirrored(short_dipole, generator, body):
         some = images[number * len(plain):(number + 1) * len(plain)]
         np.testing.assert_array_equal(
             np.any([each.contains(seen) for each in some], axis=0), inside)
+    with pytest.raises(StudyError, match="step_m stands beside repeats"):
+        magnet_of(short_dipole, placed | {"step_m": step})
     for wrong in ({"repeats": 2}, {"mirrored": ["y", "y"]}):
         with pytest.raises(StudyError, match="bodies in different places"):
             magnet_of(short_dipole, placed | wrong)
@@ -162,7 +164,7 @@ def test_shells_of_triangles():
             closed_surface(np.vstack([shell, second]))
     stl = {"kind": "stl", "triangles_m": shell.tolist()}
     for body, wrong in ((stl | {"unit_m": 1.0}, "leave unit_m out"),
-                        (BOX | {"step_m": [0.0, 0.0, 1.0]}, "step_m needs repeats")):
+                        (BOX | {"step_m": [0.0, 0.0, 1.0]}, "step_m stands beside repeats")):
         with pytest.raises(StudyError, match=wrong):
             parse_study(changed(DIPOLE, iron={"relative_permeability": 9, "bodies": [body]}))
     row = BOX | {"centre_m": [9.0, 9.0, 9.0], "repeats": 512, "step_m": [1e-3, 0.0, 0.0]}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.pace import Pace
@@ -149,6 +150,23 @@ def test_the_sign_that_no_single_map_shows():
     assert joined.poses[0].sign == -1
     assert (np.abs(errors(joined, poses)[:3]) < 3e-4).all()
     assert "opposite sign" in sentences(joined)[0]
+
+
+def test_a_reversed_map_of_a_symmetric_magnet(generator):
+    """It fitted beside the other map, face to face: two components of three agree there. That it
+    is turned half round, or mirrored, is as likely as its sign, which is simpler.
+    """
+    magnet = hf.to_magpylib(hf.halbach_ring(blocks=8, inner_radius_m=0.04, outer_radius_m=0.056,
+                                            length_m=0.012))
+    axes = np.linspace(-0.01, 0.01, 4), np.linspace(-0.01, 0.01, 4), np.linspace(-0.02, 0.02, 5)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    maps = {name: field_map(points, sign * magnet.getB(points)
+                            + 5e-6 * generator.standard_normal(points.shape))
+            for name, sign in (("here", 1), ("back", -1))}
+    (_, own), (pose, sign) = map_join._places(as_checked(maps))
+    assert (own, sign) == (1, -1)
+    np.testing.assert_allclose(pose.turn, np.eye(3), atol=1e-2)  # bars of a turn are 1e-3 or less
+    assert np.linalg.norm(pose.shift_m) < 1e-4
 
 
 def test_contradictions_are_refused_or_named(monkeypatch):

@@ -431,6 +431,15 @@ def test_a_turn_in_degrees_is_asked_about(tmp_path, turn, asked):
         read_study(path)
 
 
+@pytest.mark.parametrize(("keys", "asked"), [
+    ("memory_rows = 10", "memory_rows` is without effect"), ("memory_rows = 10\nmemory = 0.1", "")])
+def test_a_memory_of_nothing_is_said(tmp_path, keys, asked):
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(DIPOLE) + f"\n[instrument]\n{keys}\n")
+    with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
+        read_study(path)
+
+
 @pytest.mark.parametrize(("outer", "asked"), [("1.5", "its blocks are 1.4 m thick"), ("0.9", "")])
 def test_blocks_of_tons_are_asked_about(tmp_path, outer, asked):
     path = tmp_path / "study.toml"

@@ -17,6 +17,7 @@ from halbach_fe.measurement.field_map import (
     check_readings,
     points_of,
     read_map,
+    warn_of_left_out,
     write_map,
 )
 from halbach_fe.measurement.formats import (
@@ -200,11 +201,16 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
     if path.suffix not in SUFFIXES.get(name, (path.suffix,)):
         raise OutputError(must_be("suffix", f"output {path}", " or ".join(SUFFIXES[name]),
                                   f"'{path.suffix}'"))
+    others = {suffix for each in ("vtu", "openpmd") for suffix in SUFFIXES[each]}
+    if name not in SUFFIXES and path.suffix in others:
+        raise OutputError(must_be("suffix", f"output {path}", f"one of text, as {name} is",
+                                  f"'{path.suffix}', that of another format"))
     if name not in GRIDS:
         write_map(data, path)
         return
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
     content = GRIDS[name](grid_of(data, where))
+    warn_of_left_out(data, ("B_T",), path)
     with atomic(path) as temporary:
         temporary.write_bytes(content)
 
