@@ -126,6 +126,7 @@ def csv_text(columns: Mapping[str, NDArray[Any] | Sequence[object]]) -> str:
 
     Examples
     --------
+    >>> import numpy as np
     >>> print(csv_text({"label": ["Bx", "By"], "value_T": np.array([0.1, 1e-9])}), end="")
     label,value_T
     Bx,0.1
