@@ -92,7 +92,8 @@ def judged(case: Brought, folder: Path) -> dict[str, tuple[float, str]]:
     body = magnet.bodies[weak]
     true = np.dot(body.orientation.apply(body.remanence), block.easy_axis) / (
         MU_0 * block.recoil_permeability)
-    alone, alone_sd = by_readings_alone(stored["prior"], known, along)
+    alone, alone_sd = (float(value[0]) for value in by_readings_alone(
+        stored["prior"], known, along[None]))
     pose = summary["poses"]["map"]
     held_out = next(one for one in summary["scores"] if one["part"] == "held out")
     named = _named(out / "diagnosed" / "diagnosis.json")
