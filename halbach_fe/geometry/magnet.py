@@ -23,7 +23,12 @@ from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, ro
 from halbach_fe.geometry.coils import in_winding, points_in_winding
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import points_on
-from halbach_fe.geometry.overlaps import block_in_iron, block_in_others, overlapping_blocks
+from halbach_fe.geometry.overlaps import (
+    block_in_iron,
+    block_in_others,
+    overlapping_blocks,
+    points_of_block,
+)
 from halbach_fe.geometry.surface import Surroundings, surroundings
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
@@ -454,9 +459,11 @@ def _check_coils(array: Array, iron_ring: IronRing | None, iron: Iron | None,
     StudyError
     """
     blocks = tuple(block for block in blocks_of_array(array, 3) if block.remanence)
+    if not blocks:
+        return
     reach = max(abs(end) for block in blocks for end in (block.z_min, block.z_max))
     solids = iron_solids(3, iron_ring, iron, reach)
-    bodies = [(f"block {block.name}", block, _points_of(block)) for block in blocks] + [
+    bodies = [(f"block {block.name}", block, points_of_block(block)) for block in blocks] + [
         (f"body {number + 1} of iron", solid, np.stack(solid.surface, axis=-1).reshape(-1, 3))
         for number, solid in enumerate(solids)]
     owner = np.repeat(np.arange(len(bodies)), [len(points) for _, _, points in bodies])
@@ -479,14 +486,6 @@ def _check_coils(array: Array, iron_ring: IronRing | None, iron: Iron | None,
         raise StudyError(must_be(
             f"`external.coils[{coil}]`", "study", "clear of blocks and iron",
             f"a winding in {bodies[number][0]}", "Move the coil, or what is in its winding."))
-
-
-def _points_of(block: MagnetBlock) -> Floats:
-    """Return points (n, 3) in m on the edges of a finite block, and in its middle."""
-    outline = np.vstack([edge.at(np.array([0.0, 0.5]))[0] for edge in block.outline])
-    outline = np.vstack([outline, outline.mean(axis=0)])
-    return block.from_frame(np.vstack([np.column_stack([outline, np.full(len(outline), z)])
-                                       for z in np.linspace(block.z_min, block.z_max, 3)]))
 
 
 @lru_cache(maxsize=128)  # a diagnosis builds the same magnets hundreds of times

@@ -152,13 +152,15 @@ def _in_triangles(
         allowed = max(tolerance, ALLOWED_PENETRATION)
         if depth > allowed * extent:
             return number, float(depth)
-        if body.contains(_points_below_surface(block, 2 * allowed * extent)).any():
+        if body.contains(points_of_block(block, 2 * allowed * extent)).any():
             return number, extent
     return None
 
 
-def _points_below_surface(block: MagnetBlock, depth: float) -> Floats:
-    """Return points (n, 3) in m along the edges of a block and in its middle, ``depth`` m deep."""
+def points_of_block(block: MagnetBlock, depth: float = 0.0) -> Floats:
+    """Return points (n, 3) in m along the edges of a finite block, ``depth`` m deep, and in its
+    middle.
+    """
     edges = np.vstack([edge.at(np.linspace(0, 1, 5))[0] for edge in block.outline])
     points = np.vstack([np.column_stack([edges, np.full(len(edges), z)]) for z in (
         block.z_min, (block.z_min + block.z_max) / 2, block.z_max)])

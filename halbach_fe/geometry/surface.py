@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
+from halbach_fe.study.iron import windings
 from halbach_fe.study.types import look_like_mm
 
 ON_SURFACE = 1e-8
@@ -141,8 +142,7 @@ def contact_of_sphere(radius: float, points: Floats) -> Contact:
 def contact_of_triangles(triangles: Floats, points: Floats) -> Contact:
     """Return where points (n, 3) in m lie relative to a closed surface of triangles (m, 3, 3).
 
-    Their normals point outwards. Points are inside where the triangles fill the whole solid angle
-    (A. van Oosterom, J. Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125).
+    Their normals point outwards.
     """
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     size = float((high - low).max())
@@ -158,12 +158,6 @@ def _touch_triangles(found: Contact, triangles: Floats, points: Floats, some: In
                      small: float) -> None:
     """Set the contact of ``some`` of the points with triangles, ``small`` in m thick."""
     a, b, c = np.moveaxis(triangles[None] - points[some, None, None], 2, 0)
-    sides = np.stack([np.linalg.norm(each, axis=2) for each in (a, b, c)])
-    det = np.einsum("nmi,nmi->nm", a, np.cross(b, c))
-    rest = sides.prod(axis=0) + sum(
-        np.einsum("nmi,nmi->nm", one, other) * side for one, other, side in (
-            (a, b, sides[2]), (b, c, sides[0]), (c, a, sides[1])))
-    full = np.arctan2(det, rest).sum(axis=1) / (2 * np.pi)  # 1 inside, 0 outside
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal = across / np.linalg.norm(across, axis=1)[:, None]
     height = -np.einsum("nmi,mi->nm", a, normal)
@@ -178,7 +172,7 @@ def _touch_triangles(found: Contact, triangles: Floats, points: Floats, some: In
     # on an edge where triangles meet that are not in one plane
     along = np.einsum("nm,mi,ni->nm", on, normal, normal[first])
     edge = face & (np.where(on, along, 1.0).min(axis=1) < 1 - 1e-9)
-    found.inside[some] = (full > 0.5) & ~face
+    found.inside[some] = (windings(triangles, points[some]) > 0.5) & ~face
     found.on_edge[some], found.on_face[some] = edge, face & ~edge
     beside = np.where(face & ~edge, small - height[np.arange(len(some)), first], 0.0)
     found.outward[some] = beside[:, None] * normal[first]

@@ -352,16 +352,25 @@ def _check_cavities(triangles: Floats, shell: Ints, volumes: Floats) -> None:
                          "file is one body; export every body to a file of its own, and list them "
                          "as bodies (a cavity has its normals into the cavity)")
     for other in np.flatnonzero(volumes < 0):
-        rest = triangles[shell != other] - triangles[shell == other][0, 0]
-        a, b, c = np.moveaxis(rest, 1, 0)
-        far = np.linalg.norm(rest, axis=2)
-        # the solid angle of every triangle, of which half is the arctangent; 2 pi add up inside
-        flat = far.prod(axis=1) + sum(np.einsum("ni,ni->n", one, two) * far[:, side] for (
-            one, two, side) in ((a, b, 2), (b, c, 0), (c, a, 1)))
-        if np.arctan2(np.einsum("ni,ni->n", a, np.cross(b, c)), flat).sum() < np.pi:
+        if windings(triangles[shell != other], triangles[shell == other][0, :1])[0] < 0.5:
             raise ValueError("it has a closed shell with normals inwards that is no cavity, since "
                              "it does not lie inside the outer shell, or lies in another cavity; "
                              "turn its normals, and export it to a file of its own")
+
+
+def windings(triangles: Floats, points: Floats) -> Floats:
+    """Return how often triangles (m, 3, 3) go around points (n, 3): 1 inside, and 0 outside.
+
+    That is the sum of their solid angles over 4 pi (A. van Oosterom, J. Strackee, IEEE Trans.
+    Biomed. Eng. 30 (1983) 125), if their normals point outwards.
+    """
+    a, b, c = np.moveaxis(triangles[None] - points[:, None, None], 2, 0)
+    far = np.stack([np.linalg.norm(each, axis=2) for each in (a, b, c)])
+    rest = far.prod(axis=0) + sum(
+        np.einsum("nmi,nmi->nm", one, other) * far[side] for one, other, side in (
+            (a, b, 2), (b, c, 0), (c, a, 1)))
+    return np.asarray(np.arctan2(np.einsum("nmi,nmi->nm", a, np.cross(b, c)), rest).sum(
+        axis=1) / (2 * np.pi))
 
 
 def read_stl(path: Path) -> Floats:
