@@ -29,6 +29,7 @@ from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
+from halbach_fe.diagnosis.linearization import Linearization, NominalSolver
 from halbach_fe.diagnosis.model_selection import (
     EFFECT_PRIOR_ODDS,
     WIDE_PRIOR_SD,
@@ -38,13 +39,7 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import (
-    Linearization,
-    NominalSolver,
-    Search,
-    identify_effects,
-    score_hypotheses,
-)
+from halbach_fe.diagnosis.search import Search, identify_effects, score_hypotheses
 from halbach_fe.diagnosis.unknown_cause import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer

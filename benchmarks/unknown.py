@@ -22,8 +22,8 @@ from benchmarks.note import Note
 from halbach_fe.cli import common
 from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
+from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.search import NominalSolver
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.unlisted_causes import UnlistedCause, simulate_unlisted

@@ -13,6 +13,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, each_block
 from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect, BlockDisplacedEffect
+from halbach_fe.diagnosis.linearization import Training
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,
@@ -20,7 +21,6 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import DetectionLimits
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import Training
 from halbach_fe.inference.result import InferenceResult
 
 

@@ -43,6 +43,12 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
 from halbach_fe.diagnosis.evidence import Marginal, ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.flexible_causes import Family
+from halbach_fe.diagnosis.linearization import (
+    Linearization,
+    NominalSolver,
+    Signatures,
+    apply_effects,
+)
 from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
     blocks_of,
@@ -70,12 +76,8 @@ from halbach_fe.diagnosis.result import (
 )
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
-    Linearization,
-    NominalSolver,
     Say,
     Search,
-    Signatures,
-    apply_effects,
     identify_effects,
     possible,
     score_hypotheses,

@@ -17,6 +17,7 @@ import xarray as xr
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
 from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
+from halbach_fe.diagnosis.linearization import Training
 from halbach_fe.diagnosis.model_selection import (
     INDISTINGUISHABLE_LOG_EVIDENCE,
     Candidate,
@@ -24,7 +25,6 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect, PossiblePosition
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import Training
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Data

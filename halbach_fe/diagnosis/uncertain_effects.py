@@ -17,9 +17,9 @@ from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects.base import Parameter
+from halbach_fe.diagnosis.linearization import apply_effects
 from halbach_fe.diagnosis.model_selection import WIDE_PRIOR_FROM, WIDE_PRIOR_SD
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.search import apply_effects
 from halbach_fe.study.model import Study
 from halbach_fe.study.uncertain import Uncertain, number_changes
 

@@ -34,10 +34,10 @@ from halbach_fe.core.files import write_text
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.material import TYPICAL_COEFFICIENT_PER_K
+from halbach_fe.diagnosis.linearization import NominalSolver, Training
 from halbach_fe.diagnosis.model_selection import best_factors
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import NominalSolver, Training
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT, InferenceResult

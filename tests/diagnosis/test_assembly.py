@@ -11,14 +11,9 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.linearization import Linearization, NominalSolver, apply_effects
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.diagnosis.search import (
-    Linearization,
-    NominalSolver,
-    apply_effects,
-    identify_effects,
-    score_hypotheses,
-)
+from halbach_fe.diagnosis.search import identify_effects, score_hypotheses
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.mounting import mountings, turns_in_slot
 from halbach_fe.inference.infer import infer

@@ -11,9 +11,10 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter
 from halbach_fe.diagnosis.effects.knee import COERCIVITIES, STATED, KneeEffect
+from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.search import NominalSolver, with_short_steps
+from halbach_fe.diagnosis.search import with_short_steps
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer

@@ -14,8 +14,9 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
+from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.result import IdentifiedEffect
-from halbach_fe.diagnosis.search import NominalSolver, possible
+from halbach_fe.diagnosis.search import possible
 from halbach_fe.diagnosis.unknown_cause import are_scattered
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
