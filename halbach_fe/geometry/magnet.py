@@ -408,8 +408,10 @@ def _check_external(study: Study) -> None:
     if study.external.neighbours:
         _check_neighbours(study.dimension, study.array, study.iron_ring, study.iron,
                           study.external.neighbours)
-    if study.external.coils and study.dimension == 3:
-        _check_coils(study.array, study.iron_ring, study.iron, study.external.coils)
+    if study.external.coils:
+        _check_windings(study.external.coils)
+        _check_coils(study.dimension, study.array, study.iron_ring, study.iron,
+                     study.external.coils)
 
 
 def neighbour_blocks(
@@ -448,27 +450,58 @@ def _check_neighbours(
 
 
 @lru_cache(maxsize=128)
-def _check_coils(array: Array, iron_ring: IronRing | None, iron: Iron | None,
-                 coils: tuple[AnyCoil, ...]) -> None:
-    """Refuse blocks and iron of a 3D study in windings; they may touch.
-
-    Points of bodies are tested, and points of windings, so that thin ones are found too.
+def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
+    """Refuse coils in the winding of another one; they may touch.
 
     Raises
     ------
     StudyError
     """
-    blocks = tuple(block for block in blocks_of_array(array, 3) if block.remanence)
-    if not blocks:
+    windings = [points_in_winding(coil) for coil in coils]
+    middles = np.array([points.mean(axis=0) for points in windings])
+    sizes = np.array([np.linalg.norm(points - middle, axis=1).max()
+                      for points, middle in zip(windings, middles, strict=True)])
+    for number, coil in enumerate(coils):
+        apart = np.linalg.norm(middles[:number] - middles[number], axis=1)
+        for other in np.flatnonzero(apart < sizes[:number] + sizes[number]).tolist():
+            if len(in_winding(coil, windings[other])) or len(
+                    in_winding(coils[other], windings[number])):
+                raise StudyError(must_be(
+                    f"`external.coils[{number}]`", "study", "clear of other coils",
+                    f"a winding in that of `external.coils[{other}]`",
+                    "Move one of them, or join both in one coil of more turns."))
+
+
+@lru_cache(maxsize=128)
+def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None,
+                 coils: tuple[AnyCoil, ...]) -> None:
+    """Refuse blocks and iron in windings; they may touch.
+
+    Points of bodies are tested, and points of windings, so that thin ones are found too. Blocks and
+    iron of a cross-section have no ends, so that the height of a coil does not matter.
+
+    Raises
+    ------
+    StudyError
+    """
+    blocks = tuple(block for block in blocks_of_array(array, dimension) if block.remanence)
+    reach = max((abs(end) for block in blocks for end in (block.z_min, block.z_max)), default=0.0)
+    solids = iron_solids(dimension, iron_ring, iron, reach)
+    if dimension == 2:
+        coils = tuple(coil.model_copy(update={"centre_m": (*coil.centre_m[:2], 0.0)})
+                      for coil in coils)
+    windings = [points_in_winding(coil) for coil in coils]
+    if dimension == 2:
+        reach = 1e-3 + max(float(np.abs(one[:, 2]).max()) for one in windings)
+        blocks = tuple(replace(block, z_min=-reach, z_max=reach) for block in blocks)
+        solids = tuple(replace(solid, z_min=-reach, z_max=reach) for solid in solids)
+    if not blocks and not solids:
         return
-    reach = max(abs(end) for block in blocks for end in (block.z_min, block.z_max))
-    solids = iron_solids(3, iron_ring, iron, reach)
     bodies = [(f"block {block.name}", block, points_of_block(block)) for block in blocks] + [
         (f"body {number + 1} of iron", solid, np.stack(solid.surface, axis=-1).reshape(-1, 3))
         for number, solid in enumerate(solids)]
     owner = np.repeat(np.arange(len(bodies)), [len(points) for _, _, points in bodies])
     everywhere = np.vstack([points for _, _, points in bodies])
-    windings = [points_in_winding(coil) for coil in coils]
     tree, coil_of = KDTree(np.vstack(windings)), np.repeat(
         np.arange(len(coils)), [len(points) for points in windings])
     found = [(number, int(owner[inside[0]])) for number, coil in enumerate(coils)

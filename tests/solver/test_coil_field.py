@@ -208,6 +208,38 @@ def test_blocks_and_iron_in_windings_are_refused():
             magnet.with_(external=study.external)
 
 
+@pytest.mark.parametrize(("one", "where"), [
+    ({"kind": "round", "radius_m": 0.3, "section_m": [0.02, 0.02]}, None),  # around the tube
+    ({"kind": "round", "radius_m": 0.05}, None),
+    ({"kind": "round", "radius_m": 0.11}, "block r01s"),
+    ({"kind": "round", "radius_m": 0.11, "centre_m": [0.0, 0.0, 5.0]}, "block r01s"),
+    ({"kind": "round", "radius_m": 0.3, "section_m": [0.5, 0.02]}, "block r01s"),
+    ({"kind": "round", "radius_m": 0.19}, "body 1 of iron"),
+    ({"kind": "polygon", "points_m": [[0.0, 0.0, -0.1], [0.3, 0.0, 0.2], [0.0, 0.3, 0.1]]},
+     "block r01s")])
+def test_windings_in_a_cross_section_are_refused_at_any_height(one, where):
+    """The blocks fill radii from 0.104 to 0.1865 m, and the tube is as long as they are."""
+    study = parse_study(changed(DIPOLE, iron_ring={
+        "inner_radius_m": 0.1875, "outer_radius_m": 0.2, "relative_permeability": 9.0},
+        external={"coils": [one | {"current_A": 1.0}]}))
+    with nullcontext() if where is None else pytest.raises(
+            StudyError, match=rf"coils\[0\].* clear of blocks and iron; .* in {where}"):
+        build_magnet(study)
+
+
+def test_windings_in_one_another_are_refused():
+    """Two pancakes may lie on each other; one coil stated twice may not."""
+    one = {"kind": "round", "current_A": 1.0, "radius_m": 0.05, "section_m": [0.02, 0.01]}
+    for other, refused in (
+            ({"centre_m": [0.0, 0.0, 0.01]}, False), ({"centre_m": [0.0, 0.0, 0.009]}, True),
+            ({}, True), ({"radius_m": 0.07}, False), ({"radius_m": 0.068}, True),
+            ({"section_m": [0.0, 0.0]}, True), ({"centre_m": [0.5, 0.0, 0.0]}, False)):
+        study = parse_study(changed(DIPOLE, external={"coils": [one, one | other]}))
+        with pytest.raises(StudyError, match=r"coils\[1\].* clear of other coils") if refused else (
+                nullcontext()):
+            build_magnet(study)
+
+
 def test_other_refusals():
     with pytest.raises(StudyError, match="corner_radius_m"):
         parse_study(changed(DIPOLE, external={"coils": [
