@@ -170,3 +170,16 @@ def test_what_a_mesh_does_not_tell(tmp_path, magnet, dipole):
     assert direct.radial is None
     flat = build_magnet(dipole())
     assert stray_field(flat, Session.open(tmp_path)) is None
+
+
+def test_coils_are_no_part_of_the_magnet_beside_iron(tmp_path):
+    """A coil of ten times the field changes nothing; its iron does."""
+    iron = {"relative_permeability": 100.0, "bodies": [
+        {"kind": "box", "size_m": [0.02, 0.02, 0.02], "centre_m": [0.1, 0.0, 0.055]}]}
+    coil = {"kind": "round", "radius_m": 0.05, "current_A": 1e6, "centre_m": [0.1, 0.0, 0.1]}
+    alone, beside, bare = (
+        stray_field(build_magnet(parse_study(changed(LONE, mesh__block_size_m=0.04, **keys))),
+                    Session.open(tmp_path))
+        for keys in ({"iron": iron}, {"iron": iron, "external": {"coils": [coil]}}, {}))
+    np.testing.assert_allclose(beside.radial.distance_m, alone.radial.distance_m, rtol=1e-12)
+    assert abs(bare.axial.distance_m / alone.axial.distance_m - 1) > 0.01
