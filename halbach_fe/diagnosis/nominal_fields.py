@@ -130,11 +130,17 @@ class NominalFields:
 
     @cached_property
     def gradient(self) -> Floats:
-        """Gradient of B of the nominal magnet, (n, 3, 3) in T/m, without external sources.
+        """Gradient of B of the nominal magnet and of external sources, (n, 3, 3) in T/m.
 
         Element ``[i, c, j]`` is the derivative of component c along direction j.
         """
-        return np.asarray(self.block_gradients.sum(axis=0))
+        own, external = self.block_gradients.sum(axis=0), self.study.external
+        if not (external.neighbours or external.dipoles or external.coils):
+            return np.asarray(own)
+        step = 1e-4 * np.eye(3)  # in m, small beside the distance of any source
+        return np.asarray(own + np.stack([
+            external_field(self.magnet, self.points + one)
+            - external_field(self.magnet, self.points - one) for one in step], axis=2) / 2e-4)
 
     @cached_property
     def finite_element_field(self) -> Floats:

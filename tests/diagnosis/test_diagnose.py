@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import magpylib
 import numpy as np
 import pytest
 
@@ -24,8 +25,10 @@ from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_delivery
+from tests.conftest import DIPOLE, changed, circle
 from tests.diagnosis.campaign import (
     CIRCLES,
     DOCUMENT,
@@ -107,6 +110,45 @@ def test_a_search_among_pairs_of_blocks(name, session, generator):
         scale = found.identified[0]
         assert scale.values == pytest.approx([0.005], abs=4 * scale.sd[0])
     assert np.isfinite(found.loo_residuals_after).all()
+
+
+@pytest.mark.parametrize("fraction", [0.03, -2.0])
+def test_the_current_of_a_coil(fraction, session, generator):
+    """It is 3 % larger than stated, or the coil is connected the wrong way round."""
+    ring = {"radius_m": 0.3, "current_A": 2e3}
+    study = parse_study(DOCUMENT | {"external": {"coils": [
+        {"kind": "round", "centre_m": [0.0, 0.0, z]} | ring for z in (-0.1, 0.1)]}})
+    shown = measured(study, generator)
+    for z, factor in ((-0.1, 1.0), (0.1, 1.0 + fraction)):
+        shown["B_T"].values[:] += magpylib.current.Circle(
+            diameter=0.6, current=2e3 * factor, position=(0, 0, z)).getB(CIRCLES)
+    some = [effect for effect in catalogue() if effect.name in (
+        "coil_current", "background", "gain_z", "offset_z", "block_missing")]
+    (named,) = diagnose(study, shown, session, effects=some).identified
+    assert named.hypothesis.key == ("coil_current", Place(slot=2, words="coil 2"))
+    assert named.values == pytest.approx([fraction], abs=4 * named.sd[0])
+    assert named.sd[0] < 0.01
+
+
+def test_iron_of_another_permeability(session, generator):
+    """A tube in cross-section, and the exact field of a magnet with another one."""
+    tube = {"inner_radius_m": 0.19, "outer_radius_m": 0.2}
+    study = parse_study(changed(
+        DIPOLE, array__blocks_per_ring=8, iron_ring=tube | {"relative_permeability": 20.0},
+        prior={"magnitude_sd": 1e-3, "direction_sd_deg": 0.1}, mesh__block_size_m=0.007,
+        noise={"regions": [{"name": "bore", "sigma_T": 1e-4}]},
+        observation__positions={"kind": "circles", "radius_m": 0.09, "angles": 96}))
+    points = circle(0.09, 96)
+    exact = np.zeros((96, 3))
+    exact[:, :2] = layered_bore_field(ideal_sectors(1, 8, 1.06, np.pi / 2, np.pi), 0.104, 0.1865,
+                                      1.05, points[:, :2], (0.19, 0.2, 40.0))
+    shown = field_map(points, exact + 1e-4 * generator.standard_normal(exact.shape))
+    some = [effect for effect in catalogue() if effect.name in (
+        "iron_permeability", "temperature_gradient", "gain_x")]
+    found = diagnose(study, shown, session, effects=some)
+    (named,) = found.identified
+    assert named.hypothesis.effect.name == "iron_permeability"
+    assert named.values == pytest.approx([1.0], abs=4 * named.sd[0])
 
 
 @pytest.mark.parametrize("name", ["azimuthal_gap", "radial_gap"])

@@ -21,11 +21,18 @@ from tests.conftest import DIPOLE, changed, circle
 
 STUDY = parse_study(changed(
     DIPOLE, dimension=3, array__rings=4, array__ring_length_m=0.083,
-    array__recoil_permeability=1.0))
+    array__recoil_permeability=1.0, external={"coils": [
+        {"kind": "round", "radius_m": 0.25, "current_A": 1e3, "centre_m": [0.0, 0.05, 0.1]}]}))
+IN_IRON = STUDY.with_(external={}, iron={"relative_permeability": 30.0, "bodies": [
+    {"kind": "tube", "inner_radius_m": 0.2, "outer_radius_m": 0.21},
+    {"kind": "box", "size_m": [0.1] * 3, "centre_m": [0.0, 0.0, 0.4],
+     "curve": {"kind": "steel", "name": "aisi_1010"}},
+    {"kind": "sphere", "radius_m": 0.05, "centre_m": [0.4, 0.0, 0.0],
+     "relative_permeability": 1.2}]})
 POINTS = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.25, 0.25, 7)])
 TIME = np.linspace(0, 1, len(POINTS))
 EFFECTS = {effect.name: effect for effect in catalogue()}
-SOLVED = {"iron_ring", "iron_saturation", "knee", "recoil_permeability",
+SOLVED = {"iron_permeability", "iron_ring", "iron_saturation", "knee", "recoil_permeability",
           "recoil_permeability_across"}
 EQUAL = {"rings_swapped"}
 """Changes nothing in a magnet of equal rings; see test_assembly.py."""
@@ -148,9 +155,11 @@ def test_effects_of_no_size_change_nothing(name):
     effect = EFFECTS[name]
     if effect.applied_in_full:
         pytest.skip("all or nothing")
-    place = effect.places(STUDY)[0]
-    applied = effect.apply(STUDY, place, [0.0] * len(effect.parameters))
-    assert shown(applied) == pytest.approx(shown(STUDY), abs=1e-15)
+    study = IN_IRON if name == "iron_permeability" else STUDY
+    place = effect.places(study)[0]
+    applied = effect.apply(study, place, [0.0] * len(effect.parameters))
+    assert applied.iron == study.iron
+    assert shown(applied) == pytest.approx(shown(study), abs=1e-15)
 
 
 def test_places_are_in_the_magnet():
@@ -193,3 +202,15 @@ def test_only_blocks_of_four_edges_have_corners(magnet, uneven):
         assert bool(places) == uneven
         for place in places[:1]:
             build_magnet(EFFECTS[name].apply(study, place, [0.01]))
+
+
+def test_iron_of_another_permeability():
+    """What is common to all bodies and what is a body's own; none is below 1."""
+    effect = EFFECTS["iron_permeability"]
+    common, own = effect.places(IN_IRON)
+    assert [place.name for place in (common, own)] == ["the iron", "body 3 of iron"]
+    assert effect.apply(IN_IRON, common, [0.5]).iron.relative_permeability == 45.0
+    changed_one = effect.apply(IN_IRON, own, [-0.5]).iron
+    assert changed_one.bodies[2].relative_permeability == 1.0
+    assert changed_one.bodies[:2] == IN_IRON.iron.bodies[:2]
+    assert effect.places(STUDY) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, added
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.solver.coil_field import coil_field
 from halbach_fe.solver.exact_block_field import dipole_field, neighbour_field
 from halbach_fe.solver.formulation_choice import choose_route
+from halbach_fe.solver.separate_blocks import external_acts
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.magnet import Neighbour, PointDipole
 from halbach_fe.study.model import Study, iron_of
@@ -310,5 +313,79 @@ class IronSaturationEffect(Effect):
             length_m=ring.length_m, curve=SteelCurve(kind="steel", name=STEEL)))
 
 
+SHARE = 0.1
+"""Step of the finite differences with respect to currents and permeabilities, relative to them."""
+
+
+class CoilCurrentEffect(Effect):
+    """A coil carries another current than the study says; -1 is none, -2 the reverse."""
+
+    name = "coil_current"
+    title = "current of a coil"
+    kind = "field"
+    parameters = (Parameter("fraction", "1", 0.05),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return [Place(slot=number, words=f"coil {number}")
+                for number, coil in enumerate(study.external.coils, start=1) if coil.current_A]
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        study = nominal.study
+        if not external_acts(nominal.magnet):
+            coil = study.external.coils[place.slot - 1]
+            return coil_field(coil, nominal.points, study.name)[None]
+        more = nominal.solve(self.apply(study, place, [SHARE]))
+        return ((more - nominal.finite_element_field) / SHARE)[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        coils = list(study.external.coils)
+        coil = coils[place.slot - 1]
+        coils[place.slot - 1] = coil.with_(current_A=(1 + float(values[0])) * coil.current_A)
+        return study.with_(external__coils=tuple(coils))
+
+
+class IronPermeabilityEffect(Effect):
+    """Iron of a constant permeability has another one.
+
+    A place is a body with a material of its own, or the material of all others.
+    """
+
+    name = "iron_permeability"
+    title = "permeability of iron"
+    kind = "field"
+    parameters = (Parameter("fraction", "1", 0.3, minimum=-0.99),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        iron = iron_of(study)
+        if iron is None:
+            return []
+        bodies = enumerate(getattr(iron, "bodies", ()), start=1)
+        own = [Place(slot=number, words=f"body {number} of iron") for number, body in bodies
+               if body.relative_permeability is not None]
+        return ([] if iron.relative_permeability is None else [Place(words="the iron")]) + own
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        more = nominal.solve(self.apply(nominal.study, place, [SHARE]))
+        return ((more - nominal.finite_element_field) / SHARE)[None]
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        key = "iron" if study.iron_ring is None else "iron_ring"
+        iron = iron_of(study)
+        if iron is None:
+            return study
+        if place.slot:
+            bodies = list(iron.bodies)
+            bodies[place.slot - 1] = _more_permeable(bodies[place.slot - 1], values[0])
+            return study.with_(iron__bodies=tuple(bodies))
+        return study.with_(**{key: _more_permeable(iron, values[0])})
+
+
+def _more_permeable(material: Any, fraction: float) -> Any:
+    """Return iron of a permeability that is larger by a fraction, but at least 1."""
+    return material.with_(relative_permeability=max(
+        1.0, (1 + float(fraction)) * material.relative_permeability))
+
+
 EFFECTS = (BackgroundEffect(), NeighbourMagnetEffect(), FerromagneticObjectEffect(),
-           IronRingEffect(), IronSaturationEffect())
+           IronRingEffect(), IronSaturationEffect(), CoilCurrentEffect(),
+           IronPermeabilityEffect())
