@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -32,8 +33,8 @@ IN_IRON = STUDY.with_(external={}, iron={"relative_permeability": 30.0, "bodies"
 POINTS = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.25, 0.25, 7)])
 TIME = np.linspace(0, 1, len(POINTS))
 EFFECTS = {effect.name: effect for effect in catalogue()}
-SOLVED = {"iron_permeability", "iron_ring", "iron_saturation", "knee", "recoil_permeability",
-          "recoil_permeability_across"}
+SOLVED = {"iron_displaced", "iron_permeability", "iron_ring", "iron_saturation", "knee",
+          "recoil_permeability", "recoil_permeability_across"}
 EQUAL = {"rings_swapped"}
 """Changes nothing in a magnet of equal rings; see test_assembly.py."""
 
@@ -155,7 +156,7 @@ def test_effects_of_no_size_change_nothing(name):
     effect = EFFECTS[name]
     if effect.applied_in_full:
         pytest.skip("all or nothing")
-    study = IN_IRON if name == "iron_permeability" else STUDY
+    study = IN_IRON if name in ("iron_displaced", "iron_permeability") else STUDY
     place = effect.places(study)[0]
     applied = effect.apply(study, place, [0.0] * len(effect.parameters))
     assert applied.iron == study.iron
@@ -214,3 +215,32 @@ def test_iron_of_another_permeability():
     assert changed_one.bodies[2].relative_permeability == 1.0
     assert changed_one.bodies[:2] == IN_IRON.iron.bodies[:2]
     assert effect.places(STUDY) == []
+
+
+def test_iron_is_displaced_where_there_is_room():
+    """The field of a stand-in for the solver is the height of the box in m."""
+    effect = EFFECTS["iron_displaced"]
+    assert [place.name for place in effect.places(IN_IRON)] == [
+        f"body {number} of iron" for number in (1, 2, 3)]
+    assert effect.places(STUDY) == []
+    beside = IN_IRON.with_(iron__bodies=[{
+        "kind": "box", "size_m": [0.1] * 3, "centre_m": [0.0, 0.0, height]}
+        for height in (0.3, 0.4, 0.5 + 3e-4)])  # the last one is 0.3 mm above the one below it
+
+    def height_of(number):
+        def solve(study):
+            heights = [body.centre_m[2] for body in study.iron.bodies]
+            if min(np.diff(heights)) < 0.1 - 1e-9:
+                raise StudyError("iron in iron")
+            return heights[number] + 0 * POINTS
+
+        return solve
+
+    x, y, z = effect.signature(NominalFields(beside, POINTS, TIME, height_of(2)),
+                               effect.places(beside)[2])
+    assert x == pytest.approx(0 * POINTS)
+    assert y == pytest.approx(0 * POINTS)
+    assert z == pytest.approx(1 + 0 * POINTS)  # upwards only
+    between = effect.signature(NominalFields(beside, POINTS, TIME, height_of(1)),
+                               effect.places(beside)[1])
+    assert between[2] == pytest.approx(0 * POINTS)  # it can move to neither side

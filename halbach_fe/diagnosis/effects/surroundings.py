@@ -380,6 +380,53 @@ class IronPermeabilityEffect(Effect):
         return study.with_(**{key: _more_permeable(iron, values[0])})
 
 
+class IronDisplacedEffect(Effect):
+    """A body of iron of any shape is displaced, with all that stand in its row and its mirrors.
+
+    A place is a body of the study. Every displacement is solved on a mesh of its own, so that the
+    differences are taken over steps whose effect is larger than what meshes differ by: over 0.5 mm
+    to both sides that was 2 to 4 % of the derivative beside a pole 25 mm away.
+    """
+
+    name = "iron_displaced"
+    title = "body of iron displaced"
+    kind = "field"
+    parameters = tuple(Parameter(axis, "m", 3e-4) for axis in "xyz")
+
+    def places(self, study: Study) -> Sequence[Place]:
+        if study.iron is None or build_magnet(study).iron_is_axisymmetric:
+            return []
+        return [Place(slot=number, words=f"body {number} of iron")
+                for number in range(1, len(study.iron.bodies) + 1)]
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        return np.array([self._derivative(nominal, place, axis) for axis in np.eye(3)])
+
+    def _derivative(self, nominal: NominalFields, place: Place, axis: Floats) -> Floats:
+        """Return the derivative (n, 3) in T/m, to the side that is free; 0 if there is none."""
+        step, fields = 5e-4, []
+        for side in (step, -step):
+            try:
+                fields.append((side, nominal.solve(
+                    self.apply(nominal.study, place, (side * axis).tolist()))))
+            except StudyError:  # what stands there is in the way
+                continue
+        if len(fields) == 1:
+            fields.append((0.0, nominal.finite_element_field))
+        if not fields:
+            return np.zeros_like(nominal.points)
+        (first, here), (last, there) = fields
+        return np.asarray((here - there) / (first - last))
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        if study.iron is None:
+            return study
+        bodies = list(study.iron.bodies)
+        body = bodies[place.slot - 1]
+        bodies[place.slot - 1] = body.with_(centre_m=tuple(added(body.centre_m, values)))
+        return study.with_(iron__bodies=tuple(bodies))
+
+
 def _more_permeable(material: Any, fraction: float) -> Any:
     """Return iron of a permeability that is larger by a fraction, but at least 1."""
     return material.with_(relative_permeability=max(
@@ -388,4 +435,4 @@ def _more_permeable(material: Any, fraction: float) -> Any:
 
 EFFECTS = (BackgroundEffect(), NeighbourMagnetEffect(), FerromagneticObjectEffect(),
            IronRingEffect(), IronSaturationEffect(), CoilCurrentEffect(),
-           IronPermeabilityEffect())
+           IronPermeabilityEffect(), IronDisplacedEffect())
