@@ -123,12 +123,17 @@ class IronReaction:
         return _evaluate(self.name, self.problem.modes, {
             number: self._continued[number] for number in numbers[needed].tolist()}, points)[0]
 
-    def error(self, points: Floats) -> Floats:
-        """Return the error bar (n, 3) in T of `field`: the change from the coarser solution."""
+    def field_with_errors(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return `field` and its error bar, the change from the coarser solution, or nan."""
+        found = self.field(points)
         if self.coarse is None:
-            return np.full((len(points), 3), np.nan)
-        change = self.field(points) - self.coarse.field(points)
-        return np.repeat(np.linalg.norm(change, axis=1)[:, None], 3, axis=1)
+            return found, np.full_like(found, np.nan)
+        change = np.linalg.norm(found - self.coarse.field(points), axis=1)
+        return found, np.repeat(change[:, None], 3, axis=1)
+
+    def error(self, points: Floats) -> Floats:
+        """Return the error bar (n, 3) in T of `field`, nan without a coarser solution."""
+        return self.field_with_errors(points)[1]
 
     def inside(self, points: Floats) -> tuple[Floats, Floats]:
         """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""

@@ -89,7 +89,8 @@ class SeparateReaction:
             field = self.blocks[0].reaction(points)
             error = error + np.linalg.norm(self.error_of_losses(points), axis=1)[:, None]
         if self.iron is not None:
-            field, error = field + self.iron.field(points), error + self.iron.error(points)
+            of_iron, bar = self.iron.field_with_errors(points)
+            field, error = field + of_iron, error + bar
         return field, error
 
     def error_of_losses(self, points: Floats) -> Floats:

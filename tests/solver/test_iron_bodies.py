@@ -126,6 +126,25 @@ def test_a_body_of_triangles_is_as_a_box(session):
     assert np.abs(found[2] - found[0]).max() > 0.05 * scale
 
 
+def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
+    """At its edges the field is singular; what is left is less than half of what it was."""
+    uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    body = {"kind": "box", "size_m": [0.02, 0.03, 0.01], "centre_m": [0.0, 0.0, 0.05]}
+    points = np.array([[0.0, 0.0, 0.04], [0.02, 0.0, 0.05], [0.0, -0.025, 0.06], [0.0, 0.0, 0.08],
+                       [0.0, 0.0, 0.03], [0.018, 0.0, 0.06]])
+    coarse, fine = (solve_bodies(
+        build_magnet(study_with(body, mesh={"block_size_m": 0.02, "growth": growth})), uniform,
+        session.within(name)) for name, growth in (("coarse", 1.7), ("fine", 1.4)))
+    found, bars = coarse.field_with_errors(points)
+    plain = iron_bodies._field_of(coarse.problem, coarse.polarization, points)
+    truth = fine.field(points)  # extrapolated, too: its bars are half as long
+    off, before = (np.linalg.norm(one - truth, axis=1) for one in (found, plain))
+    assert (off < 2 * bars[:, 0]).all()
+    # the first one is too near to its elements: it stays as it was, and its bar is longer
+    assert np.sqrt(np.mean(off[1:]**2)) < 0.5 * np.sqrt(np.mean(before[1:]**2))
+    assert (before > bars[:, 0]).any()  # the control
+
+
 def test_external_field_acts_on_the_iron(session, coarse_mesh):
     """The sphere's dipole is added to the background; the field of the block is negligible."""
     background = [0.0, 0.0, 0.5]
