@@ -109,7 +109,9 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         occ.synchronize()
         pieces = [[tag for _, tag in part] for part in parts]
         iron = {tag for part in pieces[:-2] for tag in part}
-        if sum(occ.getMass(3, tag) for tag in iron) < (1 - SAME_VOLUME) * whole:
+        # part of the iron's volume that overlaps may take: rounding of coordinates
+        overlapping = 1e-6
+        if sum(occ.getMass(3, tag) for tag in iron) < (1 - overlapping) * whole:
             raise StudyError(must_be("`iron.bodies`", f"study {name}", "bodies that do not overlap",
                                      "bodies that do", "Move them apart, or let them touch."))
         air = set(pieces[-2]) - iron
@@ -134,10 +136,6 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         blocks=tuple(BlockRegion(name=f"iron{number + 1}", ring=number + 1, slot=0,
                                  tag=tags.FIRST_BLOCK_TAG + number)
                      for number in range(len(bodies)))), shell
-
-
-SAME_VOLUME = 1e-6
-"""Part of the iron's volume that overlaps may take: rounding of coordinates."""
 
 
 def _shell(volumes: Sequence[tuple[int, int]]) -> Shell:

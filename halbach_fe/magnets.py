@@ -41,9 +41,6 @@ from halbach_fe.synthetic.optional_packages import import_extra
 WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
 """First line of the studies that `write_study` writes."""
 
-FIELDS = 200
-"""About so many points suffice for the size of the field."""
-
 
 def halbach_ring(
     order: int = 1, blocks: int = 16, *, inner_radius_m: float, outer_radius_m: float,
@@ -188,7 +185,9 @@ def with_noise(template: MagnetTemplate, magnet: Magnet) -> MagnetTemplate:
     stages_m = (1e-5, 1e-4)  # errors in m of good and of usual stages
     least_sigma_t = 1e-6  # noise of the best probes in T
     points = points_from(magnet.study.observation.positions)
-    points = points[::max(1, len(points) // FIELDS)]
+    # about so many points suffice for the size of the field
+    enough = 200
+    points = points[::max(1, len(points) // enough)]
     sigma = max(least_sigma_t, 1e-4 * float(np.abs(field_of(magnet.blocks, points)).max()))
     slope = float(np.sqrt(np.mean(gradient_of(magnet.blocks, points) ** 2)))
     stage = float(np.clip(sigma / slope if slope else np.inf, *stages_m))

@@ -61,9 +61,6 @@ def digits(
 LEVEL_M = 1e-5
 """Blocks that overlap by less than this in z are above one another."""
 
-FLAT = 0.1
-"""Part of the magnetization in the plane of a plate below which it is not marked there."""
-
 
 class CannotBeMadeError(Exception):
     """A plate cannot be made.
@@ -312,7 +309,9 @@ def _pocket(block: HeldBlock, holder: Holder) -> Prism:
             f"pockets for blocks like {block.name}, which is too small for a clearance of "
             f"{_mm(holder.clearance_m)}", "Reduce clearance_m.")
     direction = prism.axes.T @ block.direction[:2]
-    if holder.mark_m and np.linalg.norm(direction) > FLAT:
+    # part of the magnetization in the plane of a plate below which it is not marked there
+    flat = 0.1
+    if holder.mark_m and np.linalg.norm(direction) > flat:
         narrow = min(edge.length for edge in prism.outline)
         corners = np.array([edge.start for edge in prism.outline])
         outline = with_notch(outline, corners.mean(axis=0), direction, holder.mark_m,

@@ -109,10 +109,6 @@ from halbach_fe.study.model import Study
 MAX_ROUNDS = 8
 """Largest number of rounds, each of which solves the model once."""
 
-CONVERGENCE_TOLERANCE = 0.2
-"""Largest change of an amplitude between rounds that counts as converged, in units of the
-amplitude's posterior standard deviation."""
-
 WORSE = 3.0
 """Standard deviations of the mean square of held-out residuals by which a round must predict worse
 than the best one if it is not to be the answer."""
@@ -608,7 +604,10 @@ def _same_amplitudes(old: IdentifiedEffect, new: IdentifiedEffect) -> bool:
     """
     if len(old.values) != len(new.values):
         return False
-    close = np.abs(old.values - new.values) <= CONVERGENCE_TOLERANCE * new.sd
+    # largest change of an amplitude between rounds that counts as converged, in units of the
+    # amplitude's posterior standard deviation
+    tolerance = 0.2
+    close = np.abs(old.values - new.values) <= tolerance * new.sd
     return bool(close[old.hypothesis.effect.applied_in_full:].all())
 
 

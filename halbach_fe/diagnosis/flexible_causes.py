@@ -154,11 +154,6 @@ ActsOn = Literal["field", "readings", "gains", "positions"]
 SIZES = np.geomspace(0.1, 1000, 17)
 """Candidate rms sizes, in units of the noise of a reading."""
 
-NEGLIGIBLE = 1e-12
-"""Largest information of the readings about a term, in units of the inverse of its prior variance
-at the largest size, for which it is left out: a residual of a thousand standard deviations along it
-would change the log evidence by less than 1e-6."""
-
 MOST_WAVES = 48
 """Largest number of half waves; finer structure is noise to this comparison."""
 
@@ -257,13 +252,17 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
     """Return the evidence of a family, from the evidence of its terms (and of nothing else)."""
     factors: list[float] = []
     best: tuple[float, tuple[int, ...], bool, Floats, Floats] | None = None
+    # largest information of the readings about a term, in units of the inverse of its prior
+    # variance at the largest size, for which it is left out: a residual of a thousand standard
+    # deviations along it would change the log evidence by less than 1e-6
+    negligible = 1e-12
     for axes in _axes_seen(family, evidence) if (family.axis >= 0).any() else ((),):
         used = np.flatnonzero(np.isin(family.axis, axes)) if axes else np.arange(len(family.axis))
         information = evidence.information[np.ix_(used, used)]
         for spectrum, smooth in zip(family.spectra[:, used], family.smooth, strict=True):
             # terms that are too small to change anything cost most of the time
             kept = np.flatnonzero(
-                (SIZES[-1] * spectrum)**2 * np.diag(information) > NEGLIGIBLE)
+                (SIZES[-1] * spectrum)**2 * np.diag(information) > negligible)
             weights = spectrum[kept]
             values, vectors = np.linalg.eigh(
                 weights[:, None] * information[np.ix_(kept, kept)] * weights)

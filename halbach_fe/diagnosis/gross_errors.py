@@ -52,9 +52,6 @@ from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes, Component
 
-MAX_POINTS = 160
-"""Number of points of the map that are compared."""
-
 MIN_READINGS = 12
 """Smallest number of readings for the search. With fewer readings some gross error would fit any
 map."""
@@ -190,7 +187,9 @@ def misfit_of(study: Study, data: xr.Dataset) -> float:
 
 def _search(study: Study, data: xr.Dataset, blocks: BlockTable | None = None) -> _Search:
     """Return the search with some points of a map."""
-    rows = np.unique(np.linspace(0, data.sizes["point"] - 1, MAX_POINTS).round().astype(int))
+    # number of points of the map that are compared
+    most_points = 160
+    rows = np.unique(np.linspace(0, data.sizes["point"] - 1, most_points).round().astype(int))
     thinned = data.isel(point=rows)
     return _Search(study, points_of(thinned), np.asarray(thinned["B_T"].values, float), blocks)
 

@@ -30,9 +30,6 @@ from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Data
 from halbach_fe.study.model import Study
 
-STEPS = 2
-"""Number of steps that refine a position: it starts from a fit of nominal blocks, within 2 mm."""
-
 Start = tuple[IdentifiedEffect, ...]
 """Effects that amount to a displacement of the map."""
 
@@ -96,9 +93,11 @@ def _refined(
     campaign: Campaign,
 ) -> _Refined:
     """Return the position to which a few steps lead, and its log evidence."""
-    for step in range(STEPS + 1):
+    # number of steps that refine a position: it starts from a fit of nominal blocks, within 2 mm
+    steps = 2
+    for step in range(steps + 1):
         update = updated(start, name)
-        if step == STEPS:
+        if step == steps:
             break
         training = Training.of(update, campaign)
         scene = campaign.scene(update.study)  # displacements need the field in vacuum only

@@ -27,10 +27,6 @@ MIN_MISFIT_OF_A_POSE = 0.3
 searched. In a bore of radius 20 mm a displacement by 4 mm leaves up to 0.13 and one by 6 mm, which
 is found as a gross error, up to 0.2."""
 
-GOOD = 0.05
-"""Misfit that is good enough even if it was not larger in the stated place: of a map that lies
-right beside another one that does not."""
-
 
 @dataclass(frozen=True)
 class FoundPose:
@@ -135,7 +131,10 @@ def find_poses(
         say(f"no pose explains the map: {error}")
         return (), study
     after = misfits_of(registered, data)
-    if any(after[name] > min(MIN_MISFIT_OF_A_POSE, max(misfit / min_reduction, GOOD))
+    # misfit that is good enough even if it was not larger in the stated place: of a map that lies
+    # right beside another one that does not
+    good = 0.05
+    if any(after[name] > min(MIN_MISFIT_OF_A_POSE, max(misfit / min_reduction, good))
            for name, misfit in before.items()):
         say("no pose explains the map")
         return (), study

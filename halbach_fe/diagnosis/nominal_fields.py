@@ -30,10 +30,6 @@ from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
-FEW_BLOCKS = 10
-"""Number of blocks whose gradients are computed one by one. If more are asked for, those of all
-blocks will be needed."""
-
 
 @dataclass(frozen=True)
 class NominalFields:
@@ -118,7 +114,10 @@ class NominalFields:
     def block_gradient(self, block: int) -> Floats:
         """Return the gradient of B of block number ``block``, (n, 3, 3) in T/m."""
         if block not in self._gradients:
-            if "block_gradients" in vars(self) or len(self._gradients) == FEW_BLOCKS:
+            # number of blocks whose gradients are computed one by one. If more are asked for, those
+            # of all blocks will be needed.
+            few_blocks = 10
+            if "block_gradients" in vars(self) or len(self._gradients) == few_blocks:
                 return np.asarray(self.block_gradients[block])
             self._gradients[block] = next(block_gradients([self.blocks[block]], self.points))
         return self._gradients[block]

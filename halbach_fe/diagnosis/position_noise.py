@@ -32,12 +32,6 @@ from halbach_fe.study.model import Study
 CANDIDATE_SDS_M = np.geomspace(2e-5, 5e-4, 8)
 """Standard deviations of a position whose evidence is averaged, with equal prior probability."""
 
-MAX_READINGS = 3000
-"""Largest number of readings that are compared. Of more readings, a random subset is taken."""
-
-CONVERGENCE_TOLERANCE = 0.1
-"""Largest relative change between rounds that counts as converged."""
-
 
 @dataclass(frozen=True)
 class PositionNoise:
@@ -139,8 +133,10 @@ def _of_map(
     analysis = sparse.csr_array(sparse.csc_array(update.observation.analysis[training])[
         :, 3 * scanned.rows.start:3 * scanned.rows.stop])
     rows = np.arange(count)
-    if count > MAX_READINGS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_READINGS, replace=False))
+    # largest number of readings that are compared. Of more readings, a random subset is taken.
+    most_readings = 3000
+    if count > most_readings:
+        rows = np.sort(np.random.default_rng(0).choice(rows, most_readings, replace=False))
     # the whitening contains the present noise of positions in the gradient of this magnet
     magnet = update.noise_magnet.with_study(scanned.study_of(update.study))
     moved = noise.whitening @ readings_per_displacement(magnet, analysis, points, np.ones(3))
@@ -159,8 +155,10 @@ def _of_map(
 def have_settled(old: Sequence[PositionNoise], new: Sequence[PositionNoise]) -> bool:
     """Tell whether the estimates have converged between two rounds."""
     before = {noise.map: noise.sd_m for noise in old}
+    # largest relative change between rounds that counts as converged
+    tolerance = 0.1
     return before.keys() == {noise.map for noise in new} and all(
-        abs(noise.sd_m / before[noise.map] - 1) < CONVERGENCE_TOLERANCE for noise in new)
+        abs(noise.sd_m / before[noise.map] - 1) < tolerance for noise in new)
 
 
 def with_position_noise(study: Study, found: Sequence[PositionNoise]) -> Study:

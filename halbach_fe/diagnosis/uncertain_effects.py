@@ -27,9 +27,6 @@ STEP = 1e-3
 """Step of the differences by an amplitude, in its prior standard deviations, see
 `halbach_fe.diagnosis.effects.base.STEP`."""
 
-DIGITS = 9
-"""Digits of a derivative that differences have, of which rounding leaves no more."""
-
 
 def with_uncertain_effects(
     study: Study, identified: Sequence[IdentifiedEffect],
@@ -154,7 +151,9 @@ def _change(
         changes = number_changes(sides[-1][1], sides[0][1])
     except ValueError:
         return {}
-    return {name: float(f"{change / between:.{DIGITS}g}") for name, change in changes.items()}
+    # digits of a derivative that differences have, of which rounding leaves no more
+    digits = 9
+    return {name: float(f"{change / between:.{digits}g}") for name, change in changes.items()}
 
 
 def _name(effect: IdentifiedEffect, parameter: Parameter, taken: set[str]) -> str:

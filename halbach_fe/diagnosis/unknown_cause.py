@@ -50,14 +50,6 @@ in the first round, in which the signatures of large effects are not yet exact: 
 that is the whole cause had 0.84 in a quadrupole of 26 mm. What is kept costs a round, and is judged
 anew with its exact signature."""
 
-MOST = 0.5
-"""Share of the excess of chi-squared that terms may leave if they account for most of it. Of
-independent errors at hundreds of points they account for a fifth, as they have `MOST_WAVES`
-functions for each component."""
-
-MANY = 3
-"""Number of sources from which they may stand for a field of any shape."""
-
 SUSPECTED = 0.5
 """Probability from which an effect that is not certain enough to be named is suspected."""
 
@@ -100,7 +92,11 @@ class Judgement:
         if not self.best.terms:
             return False
         before = self.competition.explanation(self.best.effects, ()).chi2
-        return self.best.chi2 - 1 < MOST * (before - 1)
+        # share of the excess of chi-squared that terms may leave if they account for most of it. Of
+        # independent errors at hundreds of points they account for a fifth, as they have
+        # `MOST_WAVES` functions for each component.
+        most = 0.5
+        return self.best.chi2 - 1 < most * (before - 1)
 
     def whitened_terms(self) -> list[Floats]:
         """Return the columns (rows, k) of each term, per standard deviation of its amplitudes."""
@@ -156,7 +152,9 @@ def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
     # Distance, relative to that from the axis, within which two magnetized objects may stand for
     # one between them: the places that are compared are 30 degrees apart, which is 0.52.
     near_sources = 0.6
-    if len(places) < MANY:
+    # number of sources from which they may stand for a field of any shape
+    many = 3
+    if len(places) < many:
         return False
     points = np.array(places)
     radius = np.hypot(points[:, 0], points[:, 1])

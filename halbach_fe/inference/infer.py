@@ -65,22 +65,9 @@ ROUNDS, AT_REST = 16, 0.3
 """Largest number of updates about terms of the instrument, and change of each of them in its
 standard deviations up to which they are at rest."""
 
-NEGLECTED = 2.0
-"""Standard deviations of the unknowns up to which a response is moved with the sensors, instead of
-solving for it again. What is neglected shrinks with the changes of the terms: updates of the
-stepped dipole of docs/accuracy.md were solved anew at 54, 29 and 6, and moved from 1.2 on, down to
-0.2."""
-
 NO_WORSE, SMALLEST_SHARE = 1.0, 0.2
 """A change of the terms is halved if their log posterior density decreases by more than the first,
 but not to less than the second."""
-
-SEEN = 0.1
-"""Size in noises, over all readings together, below which a mode of neighbours is left out."""
-
-LEFT_OUT = 0.02
-"""Relative change of a posterior variance (1 % of a standard deviation) that discarded information
-may cause; a larger change causes a warning."""
 
 
 @taking_arrays
@@ -165,7 +152,10 @@ def infer(
             HalbachWarning, stacklevel=2)
     last = search.last
     warn_of_bent_readings(last.readings, last.magnitudes)
-    if last.update.discarded_information > LEFT_OUT:
+    # relative change of a posterior variance (1 % of a standard deviation) that discarded
+    # information may cause without a warning
+    harmless = 0.02
+    if last.update.discarded_information > harmless:
         warnings.warn(
             f"Study {magnet.name} has so many parameters and readings that some combinations of "
             "readings were discarded, which may change a posterior variance by a fraction of up to "
@@ -339,9 +329,14 @@ class _Search:
 
     def _vectors(self, readings: Readings) -> Response:
         """Return the response of `Readings.vectors`, solved for or moved with the sensors."""
+        # standard deviations of the unknowns up to which a response is moved with the sensors,
+        # instead of solving for it again. What is neglected shrinks with the changes of the terms:
+        # updates of the stepped dipole of docs/accuracy.md were solved anew at 54, 29 and 6, and
+        # moved from 1.2 on, down to 0.2.
+        neglected = 2.0
         if self.solved is not None and (
                 self.at is None
-                or self.solved.neglected(self.at, self.maps, readings) <= NEGLECTED):
+                or self.solved.neglected(self.at, self.maps, readings) <= neglected):
             return self.solved.response if self.at is None else self.solved.moved(
                 self.at, self.maps, readings)
         self.solved = _Solved(
@@ -455,7 +450,9 @@ def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) 
         found.append(neighbour_deviations(magnet, points) @ sensor_matrix(instrument).T)
     columns = readings.observation.read(np.concatenate(found, axis=1)).T
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    seen = sizes > SEEN * float(np.median(readings.noise.sd))
+    # size in noises, over all readings together, below which a mode of neighbours is left out
+    least_size = 0.1
+    seen = sizes > least_size * float(np.median(readings.noise.sd))
     return np.asarray(left[:, seen] * sizes[seen])
 
 

@@ -26,9 +26,6 @@ least squares would not find the way."""
 STEP = 0.2
 """Distance of the points of the table, and step of the shifts, in units of the bore's radius."""
 
-POINTS = 40
-"""Number of readings that are used."""
-
 MOST_STEPS, DIFFERENCE = 8, 1e-4
 """Largest number of steps of the improvement, and step of its finite differences in units of the
 bore's radius, and of the scale."""
@@ -75,7 +72,9 @@ def poses_along(
     """
     most_starts = 12  # largest number of candidates that are improved
     rows = np.flatnonzero(training.any(axis=1))
-    rows = rows[np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).astype(int)]
+    # number of readings that are used
+    most_readings = 40
+    rows = rows[np.linspace(0, len(rows) - 1, min(most_readings, len(rows))).astype(int)]
     points, used, seen = points[rows], np.where(training, readings, 0.0)[rows], training[rows]
     starts = _transverse_starts(magnet, across_m)
     table = _Table.of(magnet, vacuum, starts, float(np.ptp(points @ direction)))

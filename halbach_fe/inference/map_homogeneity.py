@@ -48,15 +48,8 @@ WITHIN = 0.75
 """Radius up to which readings are used, relative to that of the free sphere: at its surface the
 series has no end."""
 
-DEGREES = 28
-"""Highest degree of the harmonics: at `WITHIN` the next ones are 3e-4 of what they are on the free
-sphere."""
-
 DIRECTIONS = 60
 """Degree of the directions in which the free sphere is looked for (6° apart)."""
-
-BEYOND = 0.02
-"""How far a region may reach beyond the box around the readings, relative to its sides."""
 
 POOR = 1.15
 """Noise that a fit finds, relative to the stated one, above which it is not to be relied on: the
@@ -153,7 +146,9 @@ def _check_within(readings: Readings, model: HomogeneityModel) -> None:
     """Refuse a region that reaches beyond the readings, where a fit of them tells nothing."""
     points, region = readings.observation.points, model.points[:len(model.weights)]
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = BEYOND * (high - low)
+    # how far a region may reach beyond the box around the readings, relative to its sides
+    beyond = 0.02
+    margin = beyond * (high - low)
     outside = (region < low - margin) | (region > high + margin)
     if outside.any():
         axis = int(np.argmax(outside.sum(axis=0)))
@@ -318,7 +313,10 @@ def _noise(left: Floats, fit: HarmonicFit) -> float:
 
 def _fields(points: Floats) -> Floats:
     """Return B (3 n, amplitudes) at points (n, 3) in units of the free sphere's radius."""
-    fields = solid_harmonic_fields(points, DEGREES).reshape(3 * len(points), -1)
+    # highest degree of the harmonics: at `WITHIN` the next ones are 3e-4 of what they are on the
+    # free sphere
+    most_degrees = 28
+    fields = solid_harmonic_fields(points, most_degrees).reshape(3 * len(points), -1)
     fields[:, :3] *= UNIFORM
     return fields
 

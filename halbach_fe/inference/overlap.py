@@ -30,12 +30,6 @@ overlap: half the diagonal of a cell of its grid."""
 END = 0.15
 """Part of the length of a single map that is left out at each end."""
 
-ENOUGH = 20
-"""Fewest readings that are left out, and that are left: chi-squared of 20 has a sd of a third."""
-
-MOST = 4000
-"""Largest number of readings that are compared: chi-squared of 4 000 is known to 2 %."""
-
 
 def overlaps(
     matrix: Rows, residual: Floats, errors: NoiseCovariance, prior: Gaussian, readings: Readings
@@ -95,11 +89,15 @@ def left_out(
     that with these terms fitted to the map itself.
     """
     found = []
+    # fewest readings that are left out, and that are left: chi-squared of 20 has a sd of a third
+    enough = 20
+    # largest number of readings that are compared: chi-squared of 4 000 is known to 2 %
+    most = 4000
     for name, chosen in _regions(readings).items():
         rows, index = np.flatnonzero(readings.training & ~chosen), np.flatnonzero(chosen)
-        if min(len(rows), len(index)) < ENOUGH:
+        if min(len(rows), len(index)) < enough:
             continue
-        index = index[::-(-len(index) // MOST)]
+        index = index[::-(-len(index) // most)]
         updated = linear_gaussian.update(
             matrix, residual[rows], errors.subset(rows), prior, rows).distribution
         response, noise = matrix[index], errors.subset(index)

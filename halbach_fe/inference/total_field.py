@@ -26,12 +26,6 @@ AT_REST = 0.1
 """Change of a reading of |B| by other directions, and of its bend, up to which they are at rest, in
 units of the noise."""
 
-TINY_T = 1e-12
-"""Field below which no direction is known."""
-
-BENT = 0.3
-"""Bend of a reading, in units of its noise, from which it is named."""
-
 
 @dataclass(frozen=True)
 class Magnitudes:
@@ -77,7 +71,9 @@ class Magnitudes:
             np.sum(readings.of_components(sd)**2, axis=1) - along**2, 0.0))
         bend, turned = np.zeros(len(readings.total)), np.zeros(len(readings.total))
         # no length differs from that along a direction by more than the part across it
-        bend[readings.total] = across * np.minimum(1.0, across / np.maximum(2 * size, TINY_T))
+        # field below which no direction is known
+        tiny_T = 1e-12
+        bend[readings.total] = across * np.minimum(1.0, across / np.maximum(2 * size, tiny_T))
         turned[readings.total] = size - (readings.projection @ mean)[readings.total]
         maps = np.array(readings.maps)[readings.total]
         return Magnitudes({name: unit_vectors(here[maps == name]) for name in readings.directions},
@@ -107,13 +103,15 @@ def warn_of_bent_readings(readings: Readings, magnitudes: Magnitudes) -> None:
     """Warn of readings of |B| that what is not known of the field across it bends noticeably."""
     if not len(magnitudes.bend):
         return
-    bent_ones = np.flatnonzero(magnitudes.bend > BENT * readings.noise.sd)
+    # bend of a reading, in units of its noise, from which it is named
+    bent = 0.3
+    bent_ones = np.flatnonzero(magnitudes.bend > bent * readings.noise.sd)
     if len(bent_ones):
         least = bent_ones[np.argmin(readings.values[bent_ones])]
         x, y, z = (1e3 * readings.observation.positions[least]).tolist()
         warnings.warn(
             f"What is left unknown across the field bends {len(bent_ones)} of "
-            f"{int(readings.total.sum())} readings of |B| by over {BENT:g} of their noise, "
+            f"{int(readings.total.sum())} readings of |B| by over {bent:g} of their noise, "
             f"such as {1e3 * readings.values[least]:.3g} mT at ({x:.4g}, {y:.4g}, {z:.4g}) mm. "
             "They count with more noise: components of B at some points would tell.",
             HalbachWarning, stacklevel=3)

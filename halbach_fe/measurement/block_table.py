@@ -25,10 +25,6 @@ MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
 REQUIRED_COLUMNS = ("serial", *MOMENT_COLUMNS, "sigma_A_m2")
 COLUMNS = ("serial", "type", "ring", "slot", *REQUIRED_COLUMNS[1:], "volume_m3", "temperature_C")
 
-COLDEST_C, HOTTEST_C = -200.0, 200.0
-"""Range of temperatures at which moments are measured: from liquid nitrogen to far above any
-laboratory, but below room temperature in kelvin."""
-
 
 @dataclass(frozen=True)
 class BlockTable:
@@ -199,6 +195,9 @@ def _check(table: BlockTable) -> None:
         refuse(number, "moment and sigma", f"below {max_moment:g} A m^2",
                f"{given[number].max():g}")
     size = np.linalg.norm(table.moment, axis=1)
+    # range of temperatures at which moments are measured: from liquid nitrogen to far above any
+    # laboratory, but below room temperature in kelvin
+    coldest_C, hottest_C = -200.0, 200.0
     for number in range(len(table)):
         if not table.sigma[number] > 0:
             refuse(number, "sigma_A_m2", "positive", f"{table.sigma[number]:g}")
@@ -211,8 +210,8 @@ def _check(table: BlockTable) -> None:
         if np.isinf(table.volume[number]):
             refuse(number, "volume_m3", "a finite number", "an infinite value")
         if not np.isnan(table.temperature[number]) and not (
-                COLDEST_C <= table.temperature[number] <= HOTTEST_C):
-            refuse(number, "temperature_C", f"from {COLDEST_C:g} to {HOTTEST_C:g} °C",
+                coldest_C <= table.temperature[number] <= hottest_C):
+            refuse(number, "temperature_C", f"from {coldest_C:g} to {hottest_C:g} °C",
                    f"{table.temperature[number]:g}", "Is it in kelvin?")
         if table.sigma[number] < smallest_sigma * size[number]:
             refuse(number, "sigma_A_m2", f"at least {smallest_sigma:g} of the moment of "

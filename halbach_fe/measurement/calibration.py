@@ -25,12 +25,6 @@ from halbach_fe.study.types import COMPONENTS
 HEADER = "Bx (T),%err Bx,By (T),%err By,Bz (T),%err Bz"
 """Header of a table; a sensor that the map does not have may be missing."""
 
-BEYOND = 0.05
-"""Part of a table's range by which readings may exceed it; they have the error of its end."""
-
-MAX_NAME = 80
-"""Largest number of characters of a file's or column's name in a message."""
-
 _FIELD = re.compile(r"B([xyz])\s*(?:_|\(|\[)\s*(\w+)\s*[)\]]?", re.IGNORECASE)
 _ERROR = re.compile(r"%\s*err\w*\s*B([xyz])|B([xyz])_error_percent", re.IGNORECASE)
 
@@ -60,6 +54,8 @@ class Calibration:
             If the table lacks a sensor that the map has, or its range.
         """
         field = np.array(data["B_T"].values, float)
+        # part of a table's range by which readings may exceed it; they have the error of its end
+        beyond = 0.05
         for number, axis in enumerate(COMPONENTS):
             shown = field[:, number]
             if np.isnan(shown).all():
@@ -70,7 +66,7 @@ class Calibration:
                     f"those of {', '.join('B' + name for name in self.sensors) or 'none'}",
                     f"A header is {HEADER}."))
             at, error = self.sensors[axis]
-            low, high = at[0] - BEYOND * np.ptp(at), at[-1] + BEYOND * np.ptp(at)
+            low, high = at[0] - beyond * np.ptp(at), at[-1] + beyond * np.ptp(at)
             if np.nanmin(shown) < low or np.nanmax(shown) > high:
                 raise MeasurementError(must_be(
                     f"fields of B{axis}", self.name,
@@ -91,7 +87,9 @@ def read_calibration(path: Path) -> Calibration:
         If the file is no such table.
     """
     largest_percent = 50.0  # errors above this are no calibration, but another column or unit
-    where = printable(path.name, MAX_NAME)
+    # largest number of characters of a file's or column's name in a message
+    longest_name = 80
+    where = printable(path.name, longest_name)
     raw = file_bytes(path, where)
     _, header, rows = csv_table(raw, where, f"A header is {HEADER}.")
     fields, errors = {}, {}
@@ -102,7 +100,7 @@ def read_calibration(path: Path) -> Calibration:
             fields[found[1].lower()] = number, unit
         else:
             raise MeasurementError(must_be("column", where, f"one of a header like {HEADER}",
-                                           printable(name, MAX_NAME), "Rename or remove it."))
+                                           printable(name, longest_name), "Rename or remove it."))
     if not fields or fields.keys() != errors.keys() or len(fields) + len(errors) < len(header):
         raise MeasurementError(must_be(
             "columns", where, "one field and one error for every sensor", ", ".join(header),

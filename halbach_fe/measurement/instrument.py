@@ -36,9 +36,6 @@ from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS, Axes
 
-ROUNDS = 50
-"""Largest number of fixed-point iterations that invert the law of the sensors."""
-
 
 @dataclass(frozen=True)
 class SensorModel:
@@ -281,7 +278,9 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
     check_components(instrument, missing)
     linear = instrument.with_(rotation_rad=(0.0, 0.0, 0.0))
     matrix, field = sensor_matrix(linear), np.nan_to_num(shown)
-    for _ in range(ROUNDS):
+    # largest number of fixed-point iterations that invert the law of the sensors
+    most_rounds = 50
+    for _ in range(most_rounds):
         rest = nonlinear_part(instrument, field, time)
         wrong = np.where(missing, 0.0, np.nan_to_num(shown) - field @ matrix.T - rest)
         field = field + wrong  # converges, since the law is nearly the identity

@@ -29,10 +29,6 @@ TOTAL = "abs"
 
 TOTAL_LABEL = "|B|"
 
-RADIUS_M = 1e-4
-"""Largest distance in m of a reading from a held-out radius. Coordinates of maps are rounded, and
-the radii of circles differ by more than this tolerance."""
-
 
 @dataclass(frozen=True)
 class Observation:
@@ -444,7 +440,10 @@ def held_out_readings(
                 "readings", where, "at enough z positions for the study to hold some out",
                 f"{rank.max() + 1} positions",
                 "Remove inference.held_out, or make its window smaller."))
-    named = {f"radii_m = {radius:g}": np.isclose(observation.radii, radius, 0, RADIUS_M)
+    # largest distance in m of a reading from a held-out radius. Coordinates of maps are rounded,
+    # and the radii of circles differ by more than this tolerance.
+    same_radius_m = 1e-4
+    named = {f"radii_m = {radius:g}": np.isclose(observation.radii, radius, 0, same_radius_m)
              for radius in settings.radii_m}
     named |= {f"components = {component}": np.array(observation.components) == component
               for component in settings.components}

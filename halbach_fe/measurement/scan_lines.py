@@ -14,18 +14,8 @@ from halbach_fe.core.arrays import Floats, Ints
 HELD_OUT_EVERY = 5
 """Every so many scan lines one is held out by default."""
 
-STRAIGHT = 0.5
-"""Cosine of the angle between two steps from which they are of one line, or of one circle."""
-
-AGAINST, MANY = -0.5, 0.2
-"""Cosine of the angle between two ways below which they are opposite, and share of points with such
-a neighbour that are many."""
-
 OF_REGION = 8
 """Largest number of points of a region of a scattered map: a region has an inside."""
-
-ENOUGH = 2000
-"""Number of points that show how a stage moves."""
 
 
 def point_spacing(points: Floats) -> float:
@@ -103,7 +93,9 @@ def motion(points: Floats, time: Floats | None = None) -> Floats:
     size = np.linalg.norm(step, axis=1)
     way = step / np.where(size > 0, size, 1.0)[:, None]
     ratio = size[1:] / np.where(size[:-1] > 0, size[:-1], np.inf)
-    goes_on = np.sum(way[1:] * way[:-1], axis=1) > STRAIGHT
+    # cosine of the angle between two steps from which they are of one line, or of one circle
+    straight = 0.5
+    goes_on = np.sum(way[1:] * way[:-1], axis=1) > straight
     on_a_line = np.zeros(len(places), bool)
     on_a_line[1:] |= goes_on & (ratio <= jump)
     on_a_line[:-1] |= goes_on & (ratio >= 1 / jump)
@@ -114,7 +106,9 @@ def goes_both_ways(points: Floats) -> bool:
     """Tell whether many of a map's points (n, 3) were come to against the way to the nearest point
     of another line.
     """
-    points = points[:ENOUGH]
+    # number of points that show how a stage moves
+    enough = 2000
+    points = points[:enough]
     way = motion(points)
     moved = way.any(axis=1)
     line = np.cumsum(~moved)[moved]
@@ -123,7 +117,10 @@ def goes_both_ways(points: Floats) -> bool:
     apart = cdist(points[moved], points[moved])
     apart[line[:, None] == line] = np.inf
     other = way[moved][apart.argmin(axis=1)]
-    return bool(np.mean(np.sum(way[moved] * other, axis=1) < AGAINST) > MANY)
+    # cosine of the angle between two ways below which they are opposite, and share of points with
+    # such a neighbour that are many
+    against, many = -0.5, 0.2
+    return bool(np.mean(np.sum(way[moved] * other, axis=1) < against) > many)
 
 
 def held_out_lines(lines: Ints, every: int) -> NDArray[np.bool_]:

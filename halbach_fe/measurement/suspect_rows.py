@@ -14,9 +14,6 @@ from halbach_fe.core.pace import Pace
 from halbach_fe.measurement.field_map import TOTAL_COLUMN
 from halbach_fe.measurement.scan_lines import point_spacing
 
-CHANCE = 1e-3
-"""Probability below which so many repetitions are no chance."""
-
 SPIKE = 12.0
 """A reading is a spike if its residual is larger than this multiple of the standard deviation of
 the residuals around it and of all, both from their medians."""
@@ -61,7 +58,9 @@ def _no_chance(alike: NDArray[np.bool_], pairs: NDArray[np.bool_]) -> NDArray[np
         return found & bool(found.sum() > 1 + many * len(found))
     by_chance = max(_all_alike_by_chance(alike[pairs][:, order])
                     for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]))
-    if found.any() and gammainc(found.sum(), by_chance) > CHANCE:  # of Poisson's distribution
+    # probability below which so many repetitions are no chance
+    chance = 1e-3
+    if found.any() and gammainc(found.sum(), by_chance) > chance:  # of Poisson's distribution
         found[:] = False
     return found
 

@@ -164,8 +164,6 @@ def finite(cell: str, what: str, where: str, hint: str = "") -> float:
                                        hint)) from None
 
 
-DAY_S = 86_400.0
-
 TIME_OF_DAY = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:[.,]\d{1,9})?))?")
 
 
@@ -222,8 +220,9 @@ def _over_midnight(times: Floats) -> Floats:
     steps = np.diff(times, prepend=times[:1])
     days = np.zeros(len(times))
     day = 0
-    for row in np.flatnonzero(np.abs(steps) > DAY_S / 2):
+    day_s = 86_400.0
+    for row in np.flatnonzero(np.abs(steps) > day_s / 2):
         day = day + 1 if steps[row] < 0 else max(0, day - 1)
         days[row:] = day
-    times = times + DAY_S * days
+    times = times + day_s * days
     return np.asarray(times - times.min())

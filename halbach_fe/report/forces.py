@@ -34,15 +34,6 @@ from halbach_fe.study.types import COMPONENTS
 LISTED = 12
 """Number of the blocks on page and terminal: those with the largest forces."""
 
-ROUGH = 0.1
-"""Error of a force, relative to it, above which the answer is not to be trusted."""
-
-EQUAL = 1e-3
-"""Part of the largest force by which others may be smaller that are as large for who assembles."""
-
-NUMBERED_SLOTS = 48
-"""Largest number of blocks of a ring that have their numbers in the figure."""
-
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""
 
@@ -73,12 +64,14 @@ def answer(found: Forces) -> Answer:
             f"when it has come to its place: {_newton(inserted)} ({_heavy(inserted)}), "
             f"{direction_in_words(block, found.inserted.force_N[next_one])}.")
     error = float(found.in_place.error_N[worst])
+    # error of a force, relative to it, above which the answer is not to be trusted
+    rough = 0.1
     return Answer(
         question, " ".join([*text, *_on_rings(found), _mass(found)]),
         "Yes, for the blocks of the study, at rest in their places: a block that is 1 % stronger "
         "feels 1 % more, and one that comes nearer to its neighbours than its place is may feel "
         f"more. The integration itself is right to {_newton(error)}.", *plan,
-        sound=error <= ROUGH * size, numbers=(("largest force in place", _newton(size)),))
+        sound=error <= rough * size, numbers=(("largest force in place", _newton(size)),))
 
 
 def _on_rings(found: Forces) -> list[str]:
@@ -108,7 +101,9 @@ def _as_large(found: Forces, worst: int) -> str:
     """Name the other blocks whose force is as large as that of the block ``worst``, by symmetry."""
     size = found.in_place.magnitude
     slots: dict[int, list[str]] = {}
-    for number in np.flatnonzero(size >= (1 - EQUAL) * size[worst]).tolist():
+    # part of the largest force by which others may be smaller that are as large for who assembles
+    equal = 1e-3
+    for number in np.flatnonzero(size >= (1 - equal) * size[worst]).tolist():
         if number != worst:
             slots.setdefault(found.blocks[number].ring, []).append(str(found.blocks[number].slot))
     count = sum(map(len, slots.values()))
@@ -224,7 +219,9 @@ def _drawn_ring(found: Forces) -> list[int]:
 
 def _is_numbered(found: Forces) -> bool:
     """Tell whether the blocks of the ring that is drawn have their numbers."""
-    return len(_drawn_ring(found)) <= NUMBERED_SLOTS
+    # largest number of blocks of a ring that have their numbers in the figure
+    most_numbered = 48
+    return len(_drawn_ring(found)) <= most_numbered
 
 
 def forces_figure(found: Forces) -> Figure:

@@ -27,9 +27,6 @@ from halbach_fe.study.types import COMPONENTS
 UNSIGNED = "Cividis"
 """Colour scale of unsigned numbers, readable with any colour vision."""
 
-AROUND = 1.5
-"""How far that plane reaches around a magnet without a bore, relative to its outer radius."""
-
 LONGEST = 0.3
 """Length of the longest arrow of a residual relative to the radius of the bore."""
 
@@ -63,7 +60,9 @@ def cut_trace(magnet: Magnet) -> go.Surface | None:
     near_blocks = 0.9
     if len(magnet.blocks) > MOST_SUMMED:
         return None
-    reach = 0.9 * magnet.bore_radius if magnet.has_bore else AROUND * magnet.radius
+    # how far the plane reaches around a magnet without a bore, relative to its outer radius
+    around = 1.5
+    reach = 0.9 * magnet.bore_radius if magnet.has_bore else around * magnet.radius
     first = np.linspace(-reach, reach, cut[0])
     far = reach if magnet.dimension == 2 else magnet.half_length + reach
     a, b = np.meshgrid(first, np.linspace(-far, far, cut[1]))
@@ -86,7 +85,6 @@ def cut_trace(magnet: Magnet) -> go.Surface | None:
                       "<extra></extra>")
 
 
-ARC_POINTS = 5
 SIGNED = "RdBu_r"
 """Colour scale of signed numbers, readable with any colour vision."""
 
@@ -96,9 +94,6 @@ OUTSIDE = 1.3
 ARROW, HEAD = 0.7, 0.35
 """Length of an arrow relative to the radial thickness of a block; length of the arrow's head
 relative to the arrow."""
-
-FLAT = 0.2
-"""Drawn height of a two-dimensional magnet relative to its outer radius."""
 
 LEGEND = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"}
 """Place of the names: below the picture, where they hide nothing at any width."""
@@ -516,7 +511,8 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     triangles : ndarray of int, shape (m, 3)
         Numbers of the corners of each triangle.
     """
-    flat = np.vstack([edge.at(np.linspace(0, 1, ARC_POINTS)[:-1] if edge.arc else np.zeros(1))[0]
+    arc_points = 5
+    flat = np.vstack([edge.at(np.linspace(0, 1, arc_points)[:-1] if edge.arc else np.zeros(1))[0]
                       for edge in block.outline])
     count = len(flat)
     face = _triangles(block.outline, flat)
@@ -544,7 +540,9 @@ def _triangles(outline: tuple[Edge, ...], flat: Floats) -> Ints:
 
 def _prism_height(magnet: Magnet) -> float:
     """Return the drawn height in m of blocks of infinite length."""
-    return FLAT * magnet.array_outer_radius
+    # drawn height of a two-dimensional magnet relative to its outer radius
+    flat = 0.2
+    return flat * magnet.array_outer_radius
 
 
 def _arrow_traces(

@@ -43,9 +43,6 @@ from halbach_fe.study.types import COMPONENTS
 
 TITLE = "Check of a field map"
 
-REMAINS = 0.3
-"""Correlation of neighbouring residuals from which they are no noise."""
-
 
 def answer(check: MapCheck) -> Answer:
     """Say whether the map obeys Maxwell's equations, and what to do next."""
@@ -103,7 +100,9 @@ def _trust(check: MapCheck) -> str:
              "magnet that predicts readings worse than this fit lacks something; close to the "
              "edges of blocks, where the field varies more than the fit can follow, it can do "
              "better.")
-    if check.structure > REMAINS:
+    # correlation of neighbouring residuals from which they are no noise
+    remains = 0.3
+    if check.structure > remains:
         trust = ("Only nearly: what remains is no noise, as neighbouring residuals have a "
                  f"correlation of {check.structure:.2f}. Something that this check does not know, "
                  "such as a probe that moves in its holder, is still in the map.")

@@ -52,13 +52,8 @@ DRAWS = 10_000
 """Number of samples of the multipoles from which the probability of being within a limit is
 estimated, with a standard error of 0.5 % at most."""
 
-MIDDLE_M = 1e-9
-"""Distance in m from the middle of a magnet below which a circle is there, but for rounding."""
-
 COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
-SHIFT = 0.18
-"""Horizontal distance between the markers of different magnets at the same order."""
 
 
 def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, object]:
@@ -98,10 +93,12 @@ def multipole_figure(
     axes = figure.subplots(1, 2, sharey=True)
     orders = next(iter(magnets.values())).orders
     place = np.arange(len(orders))
+    # horizontal distance between the markers of different magnets at the same order
+    shift = 0.18
     for letter, part, axis in zip("ba", (slice(len(orders)), slice(len(orders), None)), axes,
                                   strict=True):
         for number, (name, known) in enumerate(magnets.items()):
-            axis.errorbar(place + SHIFT * (number - (len(magnets) - 1) / 2), known.mean[part],
+            axis.errorbar(place + shift * (number - (len(magnets) - 1) / 2), known.mean[part],
                           2 * known.sd[part], fmt=MARKERS[number], color=COLOURS[number], ms=5,
                           capsize=3, label=name or None)
         axis.axhline(0, color=PUBLISHED, lw=0.8)
@@ -154,7 +151,9 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
         return ""
     model, magnets = middle_circle(tables)
     known = list(magnets.values())[-1]
-    where = "In the middle" if abs(model.z or 0.0) < MIDDLE_M else (
+    # distance in m from the middle of a magnet below which a circle is there, but for rounding
+    middle_m = 1e-9
+    where = "In the middle" if abs(model.z or 0.0) < middle_m else (
         f"At z = {1e3 * (model.z or 0.0):.4g}\u00a0mm")
     circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
     name, scale, unit = {

@@ -35,10 +35,6 @@ from halbach_fe.report.page import (
 from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import Study, is_nonlinear
 
-LITTLE = 0.97
-"""Uncertainty relative to that of as many of the study's positions from which on a plan is hardly
-better."""
-
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
 
@@ -100,9 +96,12 @@ def answer(plan: MeasurementPlan) -> Answer:
             "plan only orders them. ")
     if plan.deviation is None:
         left, of_study = _patterns(plan)
+        # uncertainty relative to that of as many of the study's positions from which on a plan is
+        # hardly better
+        little = 0.97
         beside = "" if _is_the_study(plan) else (
             f"; with as many of the study's own positions to {fraction(of_study)}"
-            f"{'' if left < LITTLE * of_study else ', which is hardly more'}")
+            f"{'' if left < little * of_study else ', which is hardly more'}")
         blocks = _rms(plan.planned_sd) / _rms(plan.prior_sd)
         better = "What blocks that deviate together do to the field is known better: the"
         said += (f"After {'all of ' if everything else ''}them the uncertainty of a block's "

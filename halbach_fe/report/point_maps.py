@@ -20,9 +20,6 @@ from halbach_fe.report.page import figure_of
 SAME = 1e-3
 """Part of the size of a map within which lengths count as equal."""
 
-NOTHING = 1e-9
-"""Part of the largest value of all components below which a component is zero, and not drawn."""
-
 
 @dataclass(frozen=True)
 class Panel:
@@ -200,8 +197,10 @@ def residual_figure(points: Floats, rows: Mapping[str, Mapping[str, Floats]], un
 def _not_zero(rows: Mapping[str, Floats]) -> dict[str, Floats]:
     """Return the values that are not zero everywhere; the first ones if all are."""
     sizes = {name: float(np.nanmax(np.abs(values), initial=0.0)) for name, values in rows.items()}
+    # part of the largest value of all components below which a component is zero, and not drawn
+    nothing = 1e-9
     return {name: values for name, values in rows.items()
-            if sizes[name] > NOTHING * max(sizes.values())} or dict(list(rows.items())[:1])
+            if sizes[name] > nothing * max(sizes.values())} or dict(list(rows.items())[:1])
 
 
 def _grid(rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:

@@ -25,9 +25,6 @@ UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 PARTS = ("in length", "in direction, in the plane of the ring", "in direction, towards z")
 """Parts of the deviation of a magnetization from the nominal one."""
 
-ALONG_Z = 1e-9
-"""Part of a magnetization in the plane of the ring below which it is along z."""
-
 NOTHING = "–"
 
 
@@ -112,7 +109,9 @@ def _axes(nominal: Floats) -> Floats:
     along = nominal / np.linalg.norm(nominal, axis=1)[:, None]
     if nominal.shape[1] == 2:
         return np.stack([along, np.column_stack([-along[:, 1], along[:, 0]])], axis=1)
-    flat = np.hypot(along[:, 0], along[:, 1])[:, None] > ALONG_Z
+    # part of a magnetization in the plane of the ring below which it is along z
+    along_z = 1e-9
+    flat = np.hypot(along[:, 0], along[:, 1])[:, None] > along_z
     across = np.where(flat, np.column_stack([-along[:, 1], along[:, 0], 0 * along[:, 0]]),
                       [0.0, 1.0, 0.0])
     across = across / np.linalg.norm(across, axis=1)[:, None]

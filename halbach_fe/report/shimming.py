@@ -49,9 +49,6 @@ T = TypeVar("T")
 LITTLE = 0.05
 """Part of the rms below which the gain of all moves together is called hardly worth the work."""
 
-MOST = 0.9
-"""Part of the gain of all moves that the first of them make, which the answer names."""
-
 STUDY_FILE = "study.shimmed.toml"
 
 DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change places in a cycle",
@@ -281,7 +278,9 @@ def _first_moves(shim: Shim) -> str:
     """Say how few of the moves make most of the gain, if not all of them are needed for that."""
     sizes = np.array([known.rms for known in (shim.before, *(step.after for step in shim.steps))])
     part = (sizes[0] - sizes) / (sizes[0] - sizes[-1])
-    first = int(np.argmax(part >= MOST))
+    # part of the gain of all moves that the first of them make, which the answer names
+    most = 0.9
+    first = int(np.argmax(part >= most))
     if first == len(shim.steps):
         return ""
     return (f" The first {'one makes' if first == 1 else f'{first} make'} "

@@ -40,9 +40,6 @@ from halbach_fe.report.words import counted, in_a_row, ppm
 
 T = TypeVar("T")
 
-LITTLE = 0.05
-"""Part of the rms below which the gain of sorting is called hardly worth the work."""
-
 QUANTILES = (0.025, 0.5, 0.975)
 """Quantiles of the rms of random orders that sort.json states: the outer ones hold 95 % of them, as
 all ranges of the page do."""
@@ -167,9 +164,11 @@ def _answer(found: SortedBlocks) -> Answer:
     orders = (f"in all random orders about {text(low)}" if text(low) == text(high) else
               f"in 95 % of random orders {text(low)} to {text(high)}")
     gains = sorted(1 - best / each for each in (own, float(np.median(found.random))))
-    hardly = "" if gains[0] >= LITTLE else (
-        "The order of the table is nearly as good already. " if gains[1] >= LITTLE > 1 - best / own
-        else "A random order is nearly as good. " if gains[1] >= LITTLE else
+    # part of the rms below which the gain of sorting is called hardly worth the work
+    little = 0.05
+    hardly = "" if gains[0] >= little else (
+        "The order of the table is nearly as good already. " if gains[1] >= little > 1 - best / own
+        else "A random order is nearly as good. " if gains[1] >= little else
         "The order hardly matters: the sorted one is "
         f"{' to '.join(dict.fromkeys(f'{100 * gain:.2g}' for gain in gains))}\u00a0% better than "
         "that of the table or a random one. ")

@@ -25,9 +25,6 @@ from halbach_fe.response.stray_field import NEAREST, StrayField
 
 STRAY_FIGURE = "stray_field.png"
 
-AROUND = 1.15
-"""Half width of the figure's planes, relative to the largest distance of the line."""
-
 
 def line_name(stray: StrayField) -> str:
     """Return the name of the line at which |B| falls to the limit."""
@@ -101,7 +98,9 @@ def stray_figure(stray: StrayField) -> Figure:
     axes = figure.subplots(2, 2).ravel()
     radius, half = 1e3 * stray.radius_m, 1e3 * stray.half_length_m
     reached = [reach.distance_m for reach in (stray.radial, stray.axial) if reach]
-    widest = 1e3 * (AROUND * max(reached) if reached else max(
+    # half width of the figure's planes, relative to the largest distance of the line
+    around = 1.15
+    widest = 1e3 * (around * max(reached) if reached else max(
         float(np.abs(plane.first_m).max()) for plane in stray.planes))
     for axis, plane in zip(axes[:-1], stray.planes, strict=True):
         names = [name for name in "xyz" if name != plane.across]

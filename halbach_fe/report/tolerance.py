@@ -44,10 +44,6 @@ from halbach_fe.study.model import Study
 ENOUGH = 0.9
 """Share of the magnets within the limit from which the tolerances suffice."""
 
-LEAST_OF_SD = 5e-3
-"""Part of its standard deviation below which a mean is 0 in the table."""
-
-
 OF_THE_DESIGN = 0.9
 """Largest multipole, or rms deviation, of the magnet as ordered, relative to what half of the
 magnets have at most, from which on the answer says that it is the design's. (Tolerances add by
@@ -95,7 +91,9 @@ def _size(found: Tolerance, number: int) -> str:
     What symmetry forbids is 0 but for the mesh.
     """
     size, sd = found.known.sizes[number], found.known.sd.reshape(2, -1)[:, number].max()
-    return "0" if size < LEAST_OF_SD * sd else f"{size:.3g}"
+    # part of its standard deviation below which a mean is 0 in the table
+    least = 5e-3
+    return "0" if size < least * sd else f"{size:.3g}"
 
 
 def answer(found: Tolerance | HomogeneityTolerance) -> Answer:

@@ -17,9 +17,6 @@ from halbach_fe.study.model import Study, iron_of
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
 
-MOST_PLACES = 4
-"""Largest number of blocks that a line names."""
-
 CERTAIN = 100
 """Power of ten beyond which a Bayes factor is not told in detail."""
 
@@ -134,8 +131,10 @@ def faults_in_words(study: Study) -> str:
                 if one.mounted_from not in (None, (one.ring, one.slot)) else None)
         if kind:
             found.setdefault(kind, []).append(block_in_words(one.ring, one.slot))
+    # largest number of blocks that a line names
+    most_places = 4
     return "; ".join(
-        f"{kind}: " + ("; ".join(places) if len(places) <= MOST_PLACES else f"{len(places)} blocks")
+        f"{kind}: " + ("; ".join(places) if len(places) <= most_places else f"{len(places)} blocks")
         for kind, places in found.items())
 
 

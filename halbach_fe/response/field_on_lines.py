@@ -206,9 +206,6 @@ class FieldOnLines:
                 (second[..., 0], np.linalg.norm(second[..., 1:], axis=2)))
 
 
-ANGLES = 64
-"""Angles at which the fields of single blocks on iron with rotational symmetry are given."""
-
 OF_LINES = "--from-m and --to-m"
 """What places the points, for messages."""
 
@@ -431,7 +428,9 @@ def _add_answer(
 
     ``remanence`` (blocks, 3, q) in T are the deviations. In iron it is all of mu_0 H.
     """
-    nodes = iron.nodes(ANGLES)
+    # angles at which the fields of single blocks on iron with rotational symmetry are given
+    angles = 64
+    nodes = iron.nodes(angles)
     order = np.concatenate([np.flatnonzero(~in_iron), np.flatnonzero(in_iron)])
     for block, unit in enumerate(unit_fields(magnet.blocks, nodes)):
         if remanence[block].any():

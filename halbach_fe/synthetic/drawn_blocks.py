@@ -44,10 +44,6 @@ def _known_matrix(shape: Shape, permeability: tuple[float, ...]) -> Floats:
     return lone_moment_matrix(shape, np.reshape(permeability, (3, 3)))
 
 
-ALONG_Z = 1e-6
-"""Sine of the angle to the magnet's axis below which a magnetization has no direction across."""
-
-
 @dataclass(frozen=True)
 class DrawnMagnet:
     """A magnet whose blocks have the errors that were drawn for them.
@@ -102,7 +98,9 @@ def _deviating(body: Body, deviation: Floats) -> Body:
         return body
     along = nominal / size
     across = np.cross([0, 0, 1], along)
-    if np.linalg.norm(across) < ALONG_Z:
+    # sine of the angle to the magnet's axis below which a magnetization has no direction across
+    along_z = 1e-6
+    if np.linalg.norm(across) < along_z:
         across = np.cross([0, 1, 0], along)
     across /= np.linalg.norm(across)
     axes = size * np.array([along, across, np.cross(along, across)])

@@ -41,9 +41,6 @@ steps."""
 NEAR = 6.0
 """Distance of a cell, in cube roots of its volume, beyond which it is a dipole."""
 
-NEGLIGIBLE = 1e-6
-"""Losses below this part of the remanence are left out."""
-
 
 @dataclass(frozen=True)
 class _Cell:
@@ -72,11 +69,13 @@ def with_knee_losses(magnet: TrueMagnet, coercivity_T: float, squareness: float)
     count = sum(bool(np.any(body.remanence)) for body in magnet.bodies)
     fewer, more = ALONG_SIDE if count <= FEW_BLOCKS else ALONG_SIDE_OF_MANY
     beyond = 1 / ((more / fewer)**2 - 1)
+    # losses below this part of the remanence are left out
+    negligible = 1e-6
     return replace(magnet, losses=(*magnet.losses, *(
         cell.lost(factor * part)
         for along_side, factor in ((more, 1 + beyond), (fewer, -beyond))
         for cell, part in losses_in_cells(magnet, coercivity_T, squareness, along_side)
-        if part > NEGLIGIBLE)))
+        if part > negligible)))
 
 
 def losses_in_cells(

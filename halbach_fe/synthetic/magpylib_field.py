@@ -107,9 +107,6 @@ def _arc(centre: complex, radius: float, start: float, end: float, z: Complex) -
     return result
 
 
-SAME_PLACE = 10
-"""Decimals of coordinates in m to which two points count as the same: 1e-10 m, or 1e-9 T."""
-
 ASIDE = np.array([1e-8, 2e-8, 3e-8])
 """Displacement in m of points at which magpylib returns no finite field.
 
@@ -209,12 +206,14 @@ def _tasks(
         seen = [local * [1, 1, 0] for local in seen]
     if len(members) > 3:
         together = np.vstack(seen)
+        # decimals of coordinates in m to which two points count as the same: 1e-10 m, or 1e-9 T
+        digits = 10
         # one number for a place: many times faster than np.unique of rows
-        places = together.round(SAME_PLACE) @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
-        _, first, inverse = np.unique(places.round(SAME_PLACE), return_index=True,
+        places = together.round(digits) @ np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
+        _, first, inverse = np.unique(places.round(digits), return_index=True,
                                       return_inverse=True)
         if 3 * len(first) < len(together) and np.allclose(
-                together[first][inverse], together, rtol=0, atol=10 * 10.0**-SAME_PLACE):
+                together[first][inverse], together, rtol=0, atol=10 * 10.0**-digits):
             rows = inverse.reshape(len(members), len(points))
             yield _Task(piece, np.eye(3), together[first], tuple(
                 (number, rows[row], polarization)

@@ -340,10 +340,6 @@ def vector(values: Floats | tuple[float, ...]) -> Vector:
     return x, y, z
 
 
-SAME = 1e-6
-"""Difference of two moments, relative to the moment, that rounding in a table may make."""
-
-
 def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> TrueMagnet:
     """Return the magnet with its blocks in the places of a table.
 
@@ -366,6 +362,8 @@ def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> T
     drawn = {body.made_for or (body.ring, body.slot): body for body in single.bodies}
     rows = {serial: row for row, serial in enumerate(measured.serial)}
     there: dict[tuple[int, int], Body] = {}
+    # difference of two moments, relative to the moment, that rounding in a table may make
+    same = 1e-6
     for number, (serial, place) in enumerate(zip(placed.serial, placed.places, strict=True)):
         if serial not in rows:
             raise MeasurementError(must_be(
@@ -383,7 +381,7 @@ def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> T
         turn = target.carried_from(source)
         moment = turn.apply(measured.moment[row])
         difference = np.linalg.norm(placed.moment[number] - moment) / np.linalg.norm(moment)
-        if difference > SAME:
+        if difference > same:
             raise MeasurementError(must_be(
                 f"moment of block {serial}", placed.source, "that of the simulated block, which "
                 "is not turned in its slot", f"another one by {difference:.2g} of its size",

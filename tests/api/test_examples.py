@@ -9,13 +9,14 @@ import pkgutil
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import tomlkit
 
 import halbach_fe as hf
-from tests.conftest import DIPOLE, changed
+from tests.conftest import DIPOLE, ROOT, changed
 from tests.support import cuboids
 
 MODULES = sorted(
@@ -163,6 +164,9 @@ def test_every_result_has_a_command():
 
     named = [re.findall(r' Page\(\s*"([a-z-]+)"', inspect.getsource(one)) for one in QUESTIONS]
     assert all(named)
+    assert {Path(one.__file__).name for one in QUESTIONS} == {
+        path.name for path in (ROOT / "halbach_fe" / "report").glob("*.py")
+        if "@page_of.register" in path.read_text(encoding="utf-8")}
     assert {verb for verbs in named for verb in verbs} <= set(ORDER) <= set(VERBS)
     assert {kind.__name__ for kind in page_of.registry} >= {"Solution", "Shim", "Tolerance"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from functools import partial
 
@@ -15,6 +16,7 @@ from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError
 from halbach_fe.study.reader import parse_study
+from tests.conftest import ROOT
 from tests.support.short_dipole import TEXT, measured, truth
 
 POINTS = np.array([[0.002, 0.001, 0.003], [-0.004, 0.003, -0.001], [0.0, -0.005, 0.002]])
@@ -276,6 +278,17 @@ def test_every_command_is_a_function():
     assert all(callable(getattr(hf, OTHER_NAMES.get(verb, verb).replace("-", "_")))
                for verb in VERBS if verb not in OF_THE_SHELL)
     assert without_function([*VERBS, "levitate"], hf.__all__) == ["levitate"]  # the control
+
+
+def without_row(verbs, page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return [verb for verb in verbs if not re.search(rf"\| `{verb}[ `]", text)]
+
+
+def test_every_command_has_its_rows():
+    assert without_row(VERBS, "README.md") == []
+    assert without_row(VERBS.keys() - OF_THE_SHELL, "docs/from-python.md") == []
+    assert without_row([*VERBS, "levitate"], "README.md") == ["levitate"]  # the control
 
 
 def test_options_of_other_names_are_refused(tmp_path):

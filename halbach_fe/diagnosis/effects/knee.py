@@ -28,13 +28,6 @@ down to that of NdFeB which is 80 K hotter."""
 SQUARENESS, LEAST_SQUARE = 0.85, 0.3
 """Squareness from which the search starts, and the smallest one; the largest is `MOST_SQUARE`."""
 
-MOST_BLOCKS = 100
-"""Largest number of blocks for which losses are searched unless the study describes the material:
-each place takes a solution of the whole magnet, of a few seconds for 64 blocks."""
-
-NODES = 3
-"""Gauss nodes per direction and block at which the field is computed for the cheap estimate."""
-
 STEPS = (0.01, 0.05)
 """Steps of the finite differences, in the logarithms of `KneeEffect.refinements`."""
 
@@ -64,12 +57,15 @@ class KneeEffect(Effect):
             return []
         blocks = build_magnet(study).blocks
         strongest = max((block.remanence for block in blocks), default=0.0)
+        # largest number of blocks for which losses are searched unless the study describes the
+        # material: each place takes a solution of the whole magnet, of a few seconds for 64 blocks
+        most_blocks = 100
         if material is not None:
             stated = material.intrinsic_coercivity_A_per_m * (
                 1 + material.coercivity_coefficient_per_K * (
                     material.temperature_C - material.reference_temperature_C))
             values = [factor * stated for factor in STATED]
-        elif len(blocks) <= MOST_BLOCKS:
+        elif len(blocks) <= most_blocks:
             values = [factor * strongest / MU_0 for factor in COERCIVITIES]
         else:
             return []
@@ -156,7 +152,9 @@ def _mean_losses(study: Study, places: Sequence[Place]) -> Floats:
     from halbach_fe.solver.moments.irreversible import KneeLaw
 
     blocks = build_magnet(study).blocks
-    cells = cells_of(blocks, 1, divisions=NODES)
+    # Gauss nodes per direction and block at which the field is computed for the cheap estimate
+    nodes = 3
+    cells = cells_of(blocks, 1, divisions=nodes)
     easy = np.array([block.easy_axis for block in blocks])
     strength = np.array([block.remanence for block in blocks])
     # within a block, the field without its own polarization is mu_0 H

@@ -189,13 +189,6 @@ def _at(place: Place, values: Sequence[float]) -> Floats:
     return np.array(place.at_m) + (np.array(values[3:]) if len(values) > 3 else 0.0)
 
 
-PERMEABILITY = 1000.0
-"""Relative permeability that every candidate ring is given.
-
-It is typical of iron that is not saturated. No other value is tried, because a thin shield acts by
-the product of permeability and thickness, and the thickness is varied.
-"""
-
 WEAKEST = 0.1
 """Smallest strength, relative to the whole ring at one of the places, of what may be a ring. A ring
 is applied in full: of one that is found with 2 % of its strength, for a small error that looks like
@@ -254,9 +247,13 @@ class IronRingEffect(Effect):
         farther, thicker = values[1:] or (0.0, 0.0)
         thickness = max(outer - inner + thicker, thinnest_m)
         inner = max(inner + farther, build_magnet(study).array_outer_radius + clearance_m)
+        # relative permeability that every candidate ring is given. It is typical of iron that is
+        # not saturated. No other value is tried, because a thin shield acts by the product of
+        # permeability and thickness, and the thickness is varied.
+        permeability = 1000.0
         return study.with_(iron_ring=IronRing(
             inner_radius_m=inner, outer_radius_m=inner + thickness,
-            relative_permeability=PERMEABILITY))
+            relative_permeability=permeability))
 
 
 STEEL = "aisi_1010"

@@ -74,7 +74,6 @@ KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys
         ("at", "length"), ("size", "length"), ("rotation", "angle"), *VECTORS.items())} | VECTORS
 """Kinds of the units of quantities that have one."""
 QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
-CELSIUS_OF_ZERO_K = -273.15
 
 
 @dataclass(frozen=True)
@@ -343,7 +342,7 @@ def _measured_blocks(
              if name in table else np.zeros(count, int) for name in ("ring", "slot")}
     temperature = table.si("temperature") if "temperature" in table else np.full(count, np.nan)
     if table.unit.get("temperature") in ("K", "kelvin"):
-        temperature = temperature + CELSIUS_OF_ZERO_K
+        temperature = temperature - 273.15
     return BlockTable(tuple(table.cells["serial"]), tuple(table.cells.get("type", [""] * count)),
                       place["ring"], place["slot"], moment, sigma, volume, temperature,
                       dict(attributes), table.where)
