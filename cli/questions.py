@@ -308,9 +308,9 @@ def forces(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     forces.json, forces.html and its figure, with the mass of the magnet.
     """
     from halbach_fe.design.forces import forces
+    from halbach_fe.geometry.blocks import present_blocks
     from halbach_fe.measurement.block_table import read_order
     from halbach_fe.report.forces import page
-    from halbach_fe.solver.separate_blocks import present_blocks
 
     names = [block.name for block in present_blocks(magnet.blocks)]
     order = read_order(arguments.order, names) if arguments.order else None

@@ -31,10 +31,10 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
-from halbach_fe.geometry.blocks import MagnetBlock, vector
+from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.exact_block_field import external_field, field_of
-from halbach_fe.solver.separate_blocks import present_blocks, solve_separate
+from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.geometry.blocks import MagnetBlock, vector
+from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import closed_outline
 from halbach_fe.geometry.overlaps import block_in_others, overlapping_blocks
@@ -39,7 +39,6 @@ from halbach_fe.response.homogeneity import (
     homogeneity_model,
 )
 from halbach_fe.solver.exact_block_field import unit_field
-from halbach_fe.solver.separate_blocks import present_blocks
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.design import ShimMagnet, ShimTray

@@ -414,3 +414,18 @@ class Diagnosis(ShownInNotebook):
         """Whether the diagnosis found gross errors, poses, outliers, effects or position noise."""
         return bool(self.gross_errors or self.poses or self.outliers or self.identified
                     or self.position_noise)
+
+    @property
+    def verdict(self) -> str:
+        """What kind of answer it is, a word of diagnosis.json that docs/diagnosis.md explains."""
+        after = self.after
+        if self.solver_error:
+            return "numerical"
+        if self.unknown and not (self.identified or self.gross_errors or self.poses):
+            return "unknown"
+        if self.suspected and not self.found_anything:
+            return "suspected"
+        conflicting = after.prior_conflict > after.conflict_limit or after.held_out_conflict
+        if conflicting and not self.identified and not self.unknown:
+            return "unexplained"
+        return "named" if self.found_anything else "nothing"

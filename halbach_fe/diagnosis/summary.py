@@ -378,8 +378,6 @@ def diagnosis_summary(
     diagnosis: Diagnosis, separations: Sequence[Separation] = ()
 ) -> dict[str, object]:
     """Return the content of diagnosis.json, whose keys docs/diagnosis.md describes."""
-    conflicting = (diagnosis.after.prior_conflict > diagnosis.after.conflict_limit
-                   or diagnosis.after.held_out_conflict)
     return {
         "study": diagnosis.before.study.name,
         "readings": {part: diagnosis.before.parts.count(part)
@@ -388,12 +386,7 @@ def diagnosis_summary(
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
         "answer": diagnosis.answer or diagnosis.rounds,
         "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},
-        "verdict": "numerical" if diagnosis.solver_error else
-        "unknown" if diagnosis.unknown and not (
-            diagnosis.identified or diagnosis.gross_errors or diagnosis.poses)
-        else "suspected" if diagnosis.suspected and not diagnosis.found_anything else
-        "unexplained" if not diagnosis.identified and not diagnosis.unknown and conflicting else
-        "named" if diagnosis.found_anything else "nothing",
+        "verdict": diagnosis.verdict,
         "held_out_conflict": diagnosis.after.held_out_conflict or None,
         "gross": [_gross(error) for error in diagnosis.gross_errors],
         "poses": [_pose(pose) for pose in diagnosis.poses],

@@ -220,6 +220,12 @@ class MagnetBlock:
         return found
 
 
+def present_blocks(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:
+    """Return the blocks that are there: a missing one has neither remanence nor permeability."""
+    return tuple(block for block in blocks if block.remanence
+                 or block.recoil_permeability != 1.0 or not block.isotropic)
+
+
 def moved_block(block: MagnetBlock, turn_rad: float, z_m: float, factor: float) -> MagnetBlock:
     """Return a block turned about the magnet's z axis, then moved along it.
 

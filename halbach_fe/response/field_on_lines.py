@@ -26,6 +26,7 @@ from scipy.integrate import cumulative_simpson, simpson
 from halbach_fe.core.arrays import Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import MU_0, check_number
+from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
@@ -36,7 +37,6 @@ from halbach_fe.solver.separate_blocks import (
     SeparateReaction,
     applies,
     external_acts,
-    present_blocks,
     solve_separate,
 )
 from halbach_fe.solver.session import Session

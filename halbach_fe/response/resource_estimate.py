@@ -26,6 +26,7 @@ from scipy.sparse.linalg import splu
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
 from halbach_fe.core.threads import available_memory
+from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -46,7 +47,6 @@ from halbach_fe.solver.formulation_choice import (
 )
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of
-from halbach_fe.solver.separate_blocks import present_blocks
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
 from halbach_fe.study.solver import CELLS_PER_SIDE

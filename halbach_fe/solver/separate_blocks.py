@@ -21,7 +21,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.pace import Progress
-from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.axisymmetric_iron import (
     MOST_MODES,
@@ -388,9 +388,3 @@ def _reaction_without_iron(own: _Blocks) -> SeparateReaction:
     """Return the reaction of blocks without iron."""
     known = _reaction_without_iron(replace(own, sizes=1)).blocks if own.sizes > 1 else ()
     return own.reaction(own.systems(), known=known)
-
-
-def present_blocks(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:
-    """Return the blocks that are there: a missing one has neither remanence nor permeability."""
-    return tuple(block for block in blocks if block.remanence
-                 or block.recoil_permeability != 1.0 or not block.isotropic)
