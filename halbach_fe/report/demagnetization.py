@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -42,6 +43,9 @@ PAST = "#D55E00"
 ROOM_C = 20.0
 """Temperature in °C at which a magnet is kept at least."""
 
+AT_ROOM = "It loses magnetization at room temperature already."
+"""Sentence about a magnet that does not keep its magnetization there."""
+
 
 def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
     """Return the content of demagnetization.json: margins, shares and limit temperatures."""
@@ -65,55 +69,120 @@ def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
 
 def answer(found: DemagnetizationMap) -> Answer:
     """Say whether blocks lose magnetization, at which temperature they begin to, and what next."""
-    temperature, lost = found.material.temperature_C, found.share_beyond_now
-    worst = int(np.argmin(found.margin))
-    block = place_of(found.blocks[found.cells.block[worst]])
-    most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
-    by_number = {each.name: each for each in found.blocks}
-    losing = "" if not lost else (
-        f" The block that loses most is {place_of(by_number[most['block']])}, of which "
-        f"{100 * most['share_beyond_knee']:.3g} % is past the knee.")
-    start = (f"{100 * lost:.3g} % of the magnet's volume is past the knee of its demagnetization "
-             "curve and loses magnetization for good" if lost > 0 else
-             "no cell is past the knee of the demagnetization curve")
-    limits = "; ".join(_limit_in_words(found, share) for share in SHARES)
-    nonlinear = (" At other temperatures the field of the iron is scaled with the remanence."
-                 if is_nonlinear(found.study) else "")
-    limit = found.limit_temperature(SHARES[-1])
-    room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
-    at_room = " It loses magnetization at room temperature already." if room else ""
-    loses, far = lost > 0 or room, found.far_from_reference
-    # what is past the knee at a temperature on the way, where the law holds, is lost
-    sure = room or (lost > 0 and math.isfinite(limit)
-                    and LINEAR[0] <= found.coercivity_factor(limit) <= LINEAR[1])
-    at = f"at {temperature:g}\u00a0°C"
-    reference = found.material.reference_temperature_C
-    cooler = "" if temperature == reference else (
-        f" The study's remanence counts as that at {reference:g}\u00a0°C.")
+    state = _Losses.of(found)
+    next_step, command = _next_step(found, state)
+    temperature, start = f"{found.material.temperature_C:g}\u00a0°C", _past_the_knee(found)
+    said = (f"{state.in_a_word}: at {temperature}, "
+            f"{'if the linear law held, ' if state.far else ''}{start}.")
+    concern = f"At {temperature}, {start}." if state.now else AT_ROOM if state.at_room else ""
     return Answer(
         "Do the blocks keep their magnetization?",
-        f"{'Not known' if far and not sure else 'No' if loses else 'Yes'}: {at}, "
-        f"{'if the linear law held, ' if far else ''}{start}.{losing} The smallest margin "
-        f"is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; {limits}.{at_room}",
-        (f"{'Only that it loses some' if sure else 'No'}: the coefficients of the "
-         f"study would make the coercivity {far:.2g} times that at "
-         f"{reference:g}\u00a0°C, and hold only nearer to it. " if far else
-         "Yes, as far as coercivity and coefficients of the study are right: data sheets state "
-         "them within some per cent. ")
-        + "The very edges of blocks are worse than any cell (the option --across makes them "
-        f"smaller); shares of the volume hardly depend on that.{nonlinear}{cooler}",
-        *(("State coercivity and remanence that were measured nearer to that temperature, and "
-           "theirs as reference_temperature_C.", "halbach-fe demagnetization STUDY -o DIR")
-          if far and not sure else
-          ("Choose a grade of a higher coercivity for these blocks (the table on the page says "
-           f"which), or keep the magnet {'warmer' if found.worst_when_cold else 'cooler'}. If it "
-           "is built already, a measurement shows what it has lost.",
-           "halbach-fe diagnose STUDY --measurements MAP -o DIR") if loses else
-          ("Nothing has to be done at this temperature. Next, see which forces the blocks feel.",
-           "halbach-fe forces STUDY -o DIR") if found.study.dimension == 3 else
-          ("Nothing has to be done at this temperature. Next, see what the tolerances of the "
-           "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")),
-        concern=f"A{at[1:]}, {start}." if lost > 0 else at_room.strip(), sound=not far)
+        " ".join(filter(None, [said, _worst_block(found), _margins(found),
+                               AT_ROOM if state.at_room else ""])),
+        _trust(found, state), next_step, command, concern=concern, sound=not state.far)
+
+
+@dataclass(frozen=True)
+class _Losses:
+    """Whether magnetization is lost, and whether that can be known.
+
+    Attributes
+    ----------
+    now, at_room : bool
+        Whether some is lost at the temperature of the study, and at room temperature.
+    far : float or None
+        Factor of the coercivity at that temperature, if it is so far from the reference that the
+        coefficients of the study do not hold.
+    sure : bool
+        Whether some is lost on the way to that temperature, where they hold.
+    """
+
+    now: bool
+    at_room: bool
+    far: float | None
+    sure: bool
+
+    @classmethod
+    def of(cls, found: DemagnetizationMap) -> _Losses:
+        """Return those of a map of margins."""
+        limit, now = found.limit_temperature(SHARES[-1]), found.share_beyond_now > 0
+        at_room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
+        low, high = LINEAR
+        on_the_way = now and math.isfinite(limit) and (
+            low <= found.coercivity_factor(limit) <= high)
+        return cls(now, at_room, found.far_from_reference, at_room or on_the_way)
+
+    @property
+    def in_a_word(self) -> str:
+        """Whether the blocks keep their magnetization."""
+        if self.far and not self.sure:
+            return "Not known"
+        return "No" if self.now or self.at_room else "Yes"
+
+
+def _past_the_knee(found: DemagnetizationMap) -> str:
+    """Say which share of the volume loses magnetization."""
+    lost = found.share_beyond_now
+    if not lost:
+        return "no cell is past the knee of the demagnetization curve"
+    return (f"{100 * lost:.3g} % of the magnet's volume is past the knee of its demagnetization "
+            "curve and loses magnetization for good")
+
+
+def _worst_block(found: DemagnetizationMap) -> str:
+    """Say which block loses most, if any does."""
+    if not found.share_beyond_now:
+        return ""
+    most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
+    by_name = {each.name: each for each in found.blocks}
+    return (f"The block that loses most is {place_of(by_name[most['block']])}, of which "
+            f"{100 * most['share_beyond_knee']:.3g} % is past the knee.")
+
+
+def _margins(found: DemagnetizationMap) -> str:
+    """Say how far the worst cell is from the knee, and which temperatures are too much."""
+    worst = int(np.argmin(found.margin))
+    block = place_of(found.blocks[found.cells.block[worst]])
+    limits = "; ".join(_limit_in_words(found, share) for share in SHARES)
+    return (f"The smallest margin is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; "
+            f"{limits}.")
+
+
+def _trust(found: DemagnetizationMap, state: _Losses) -> str:
+    """Say what the answer depends on."""
+    reference = found.material.reference_temperature_C
+    if state.far:
+        first = (f"{'Only that it loses some' if state.sure else 'No'}: the coefficients of the "
+                 f"study would make the coercivity {state.far:.2g} times that at "
+                 f"{reference:g}\u00a0°C, and hold only nearer to it.")
+    else:
+        first = ("Yes, as far as coercivity and coefficients of the study are right: data sheets "
+                 "state them within some per cent.")
+    sentences = [first, "The very edges of blocks are worse than any cell (the option --across "
+                 "makes them smaller); shares of the volume hardly depend on that."]
+    if is_nonlinear(found.study):
+        sentences.append("At other temperatures the field of the iron is scaled with the "
+                         "remanence.")
+    if found.material.temperature_C != reference:
+        sentences.append(f"The study's remanence counts as that at {reference:g}\u00a0°C.")
+    return " ".join(sentences)
+
+
+def _next_step(found: DemagnetizationMap, state: _Losses) -> tuple[str, str]:
+    """Return what to do next, and the command for it."""
+    if state.far and not state.sure:
+        return ("State coercivity and remanence that were measured nearer to that temperature, and "
+                "theirs as reference_temperature_C.", "halbach-fe demagnetization STUDY -o DIR")
+    if state.now or state.at_room:
+        return ("Choose a grade of a higher coercivity for these blocks (the table on the page "
+                f"says which), or keep the magnet {'warmer' if found.worst_when_cold else 'cooler'}"
+                ". If it is built already, a measurement shows what it has lost.",
+                "halbach-fe diagnose STUDY --measurements MAP -o DIR")
+    if found.study.dimension == 3:
+        return ("Nothing has to be done at this temperature. Next, see which forces the blocks "
+                "feel.", "halbach-fe forces STUDY -o DIR")
+    return ("Nothing has to be done at this temperature. Next, see what the tolerances of the "
+            "blocks do to the field.", "halbach-fe tolerance STUDY -o DIR")
 
 
 def _limit_in_words(found: DemagnetizationMap, share: float) -> str:
