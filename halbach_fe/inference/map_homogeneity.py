@@ -119,6 +119,8 @@ def map_homogeneity(
             found[name] = known
         if remark and (name == MAP or known is None):
             remarks.append(f"{what} {remark}")
+    if far := magnet.surroundings(readings.observation.points).far_away():
+        remarks.append(far)
     if MAP in found and HELD_OUT_PART in found:
         remark = not_carried(found[HELD_OUT_PART], found[MAP])
         if remark:

@@ -34,7 +34,13 @@ from numpy.typing import ArrayLike, NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, plain
-from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError, must_be
+from halbach_fe.core.errors import (
+    HalbachError,
+    HalbachWarning,
+    MeasurementError,
+    OutputError,
+    must_be,
+)
 from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
@@ -46,7 +52,7 @@ from halbach_fe.measurement.tables import (
     look_like_clock,
     write_csv,
 )
-from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
+from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T, look_like_mm
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
@@ -156,10 +162,35 @@ def taking_arrays(function: Function) -> Function:
         match arguments:
             case magnet, points_m, B_T, *others if np.ndim(B_T):  # no session
                 data = field_map(points_m, B_T, options.pop("sigma_T", None))
+                _refuse_exchanged(magnet, data)
                 return function(magnet, data, *others, **options)
         return function(*arguments, **options)
 
     return cast(Function, of_map_or_arrays)
+
+
+def _refuse_exchanged(magnet: Any, data: xr.Dataset) -> None:
+    """Refuse positions and readings that are each other's: at the readings, taken as positions, the
+    magnet's field is what was given as positions. Asked only where the field has a closed form.
+    """
+    near = 0.3  # part of what is given; fields of magnets that are built are closer to nominal ones
+    points, values = points_of(data), data["B_T"].values
+    if not getattr(magnet, "is_vacuum", False) or not np.isfinite(values).all():
+        return
+
+    def off(places: Floats, given: Floats) -> float:
+        try:
+            return float(np.linalg.norm(magnet.field_T(places) - given) / np.linalg.norm(given))
+        except HalbachError:  # not in air
+            return np.inf
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        exchanged = points.any() and off(values, points) < near and not off(points, values) < near
+    if exchanged:
+        raise MeasurementError(must_be(
+            "points_m and B_T", "the map", "given in this order",
+            "positions that are the field of the magnet at the readings", "Exchange them."))
 
 
 def undirected(data: xr.Dataset) -> xr.Dataset:
@@ -684,6 +715,23 @@ def check_magnitudes(data: xr.Dataset) -> None:
                 raise MeasurementError(must_be(
                     "sigma", where, f"from {MIN_SIGMA_T:g} to {MAX_SIGMA_T:g} T", f"{extreme:g}",
                     "Correct it, or instrument.flux_density_unit_T of the study."))
+
+
+def doubt_of_metres(data: xr.Dataset) -> str:
+    """Return a sentence if the points of a map lie where few magnets have a field, else nothing."""
+    points = points_of(data)
+    if not look_like_mm(points).any():
+        return ""
+    distance = float(np.linalg.norm(points, axis=1).max())
+    return (f"The points lie up to {distance:.3g} m from the origin, where few magnets of "
+            "permanent blocks have a field. Are they in mm?")
+
+
+def warn_of_millimetres(data: xr.Dataset) -> None:
+    """Warn, where no study tells how large the magnet is, of points that are rather in mm."""
+    if doubt := doubt_of_metres(data):
+        warnings.warn(f"{doubt} Then convert the map by halbach-fe import-map with --length-unit "
+                      "mm.", HalbachWarning, stacklevel=2)
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:

@@ -323,8 +323,8 @@ def _moments_part(
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
         return _join_parts(magnet, points, parts)
     if session.counter is not None:
-        if not magnet.iron_is_axisymmetric:
-            session.counter.batches.append((session.purpose, sizes_of_iron(magnet, estimate)))
+        if sizes := sizes_of_iron(magnet, estimate):
+            session.counter.batches.append((session.purpose, sizes))
         zero = np.zeros((len(points), 3))
         return ElementFields(np.nan, zero, zero, magnet.blocks, _refuse_column, zero)
     solved = solve_separate(magnet, session, estimate)

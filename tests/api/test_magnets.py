@@ -142,6 +142,16 @@ def test_a_study_that_somebody_wrote_is_not_replaced(tmp_path):
     assert table.read_text() == "mine"
 
 
+def test_positions_and_readings_that_are_exchanged(generator):
+    ring = hf.halbach_ring(order=1, blocks=8, inner_radius_m=0.03, outer_radius_m=0.05,
+                           length_m=0.06)
+    points = generator.uniform(-0.015, 0.015, (40, 3))
+    field = ring.field_T(points) + 5e-5 * generator.standard_normal((40, 3))
+    with pytest.raises(hf.MeasurementError, match="given in this order"):
+        hf.infer(ring, field, points, sigma_T=5e-5)
+    assert hf.infer(ring, points, field, sigma_T=5e-5).disagreement == ""
+
+
 def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator):
     """The truth is magpylib's: one block is 2 % weak. No file and no folder is named."""
     monkeypatch.chdir(tmp_path)
