@@ -99,6 +99,11 @@ def halbach_ring(
                                  "and a recoil permeability", "both"))
     check_number("order", "halbach_ring", order, 1)
     check_number("rings", "halbach_ring", rings, 1, whole=True)
+    for key, value in {"inner_radius_m": inner_radius_m, "outer_radius_m": outer_radius_m,
+                       "length_m": length_m, "remanence_T": remanence_T,
+                       "recoil_permeability": recoil_permeability}.items():
+        if value is not None:
+            check_number(key, "halbach_ring", value)
     ring_length = None if length_m is None else length_m / rings
     magnet = new_magnet(MagnetTemplate(
         order, blocks, rings, inner_radius_m, outer_radius_m, ring_length,

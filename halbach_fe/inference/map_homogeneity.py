@@ -151,6 +151,16 @@ def not_carried(part: Homogeneity, whole: Homogeneity) -> str:
     return ""
 
 
+def of_other_size(of_map: Homogeneity, of_magnet: Homogeneity) -> str:
+    """Say that the mean field of a map is not that of the magnet, or nothing."""
+    far = 0.1  # blocks of another grade are a few per cent off
+    factor = of_map.mean_T / of_magnet.mean_T
+    if abs(factor - 1) <= far + 3 * of_map.mean_sd_T / of_magnet.mean_T:
+        return ""
+    return (f"The mean field of the map is {decimals(factor)} times that of the magnet: is it a map "
+            "of this magnet, in m and T?")
+
+
 def _check_within(readings: Readings, model: HomogeneityModel) -> None:
     """Refuse a region that reaches beyond the readings, where a fit of them tells nothing."""
     points, region = readings.observation.points, model.points[:len(model.weights)]

@@ -113,7 +113,7 @@ def field_map(
     array([0.4 , 0.39])
     """
     try:
-        points, given = plain(points_m), plain(B_T)
+        points, given = plain(points_m), plain(B_T, components)
     except (TypeError, ValueError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
@@ -139,7 +139,11 @@ def field_map(
         attrs=dict(attributes or {}))
     data["B_T"].attrs["units"] = "T"
     if sigma_T is not None:
-        sigma = plain(sigma_T)
+        try:
+            sigma = plain(sigma_T, components)
+        except (TypeError, ValueError) as error:
+            raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
+                                           f"what is none: {error}")) from None
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
@@ -160,13 +164,19 @@ def taking_arrays(function: Function) -> Function:
     @wraps(function)
     def of_map_or_arrays(*arguments: Any, **options: Any) -> Any:
         match arguments:
-            case magnet, points_m, B_T, *others if np.ndim(B_T):  # no session
+            case magnet, points_m, B_T, *others if not isinstance(
+                    points_m, xr.Dataset | Mapping) and _is_array(B_T):
                 data = field_map(points_m, B_T, options.pop("sigma_T", None))
                 _refuse_exchanged(magnet, data)
                 return function(magnet, data, *others, **options)
         return function(*arguments, **options)
 
     return cast(Function, of_map_or_arrays)
+
+
+def _is_array(value: object) -> bool:
+    """Return whether an argument is an array of readings, and no session."""
+    return not isinstance(value, xr.Dataset) and bool(np.ndim(cast(ArrayLike, value)))
 
 
 def _refuse_exchanged(magnet: Any, data: xr.Dataset) -> None:

@@ -192,9 +192,9 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
     try:
         points = plain(points_m)
-    except (TypeError, ValueError):  # text, or rows of different lengths
+    except (TypeError, ValueError) as error:  # text, or rows of different lengths
         raise StudyError(must_be("points_m", magnet.name, "x, y, z in m: an array (..., 3)",
-                                 f"a {type(points_m).__name__} that is none")) from None
+                                 f"a {type(points_m).__name__} that is none: {error}")) from None
     if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
         missing = points.ndim and points.shape[-1] == 3
         raise StudyError(must_be("points_m", magnet.name, "finite x, y, z in m: an array (..., 3)",
