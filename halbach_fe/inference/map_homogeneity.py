@@ -157,8 +157,8 @@ def of_other_size(of_map: Homogeneity, of_magnet: Homogeneity) -> str:
     factor = of_map.mean_T / of_magnet.mean_T
     if abs(factor - 1) <= far + 3 * of_map.mean_sd_T / of_magnet.mean_T:
         return ""
-    return (f"The mean field of the map is {decimals(factor)} times that of the magnet: is it a map "
-            "of this magnet, in m and T?")
+    return (f"The mean field of the map is {decimals(factor)} times that of the magnet: is it a "
+            "map of this magnet, in m and T?")
 
 
 def _check_within(readings: Readings, model: HomogeneityModel) -> None:
