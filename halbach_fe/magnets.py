@@ -200,6 +200,7 @@ def with_noise(template: MagnetTemplate, magnet: Magnet) -> MagnetTemplate:
     return replace(template, sigma_T=float(f"{sigma:.1g}"), position_sd_m=float(f"{stage:.1g}"))
 
 
+@typed
 def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     """Write the study of a magnet as a file that `halbach_fe.read_study` reads back the same.
 
@@ -316,6 +317,7 @@ def _turned(turn: Rotation) -> dict[str, float]:
                     map(float, np.degrees(turn.as_rotvec())), strict=True))
 
 
+@typed
 def to_magpylib(magnet: Magnet) -> Any:
     """Return a magnet's blocks as a ``magpylib.Collection``.
 

@@ -41,7 +41,7 @@ from halbach_fe.core.errors import (
     OutputError,
     must_be,
 )
-from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
+from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes, refuse_other_table
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
 from halbach_fe.measurement.tables import (
@@ -118,7 +118,8 @@ def field_map(
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
-    if points.shape != (len(points), 3) or given.shape != (len(points), len(components)) or (
+    count = points.shape[0] if points.ndim else 0
+    if points.shape != (count, 3) or given.shape != (count, len(components)) or (
             len(set(columns)) != len(components)):
         raise MeasurementError(must_be(
             "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
@@ -304,7 +305,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     Raises
     ------
     OutputError
-        If the suffix is unknown, or the file cannot be written.
+        If the suffix is unknown, the file cannot be written, or another table would be lost.
 
     Examples
     --------
@@ -319,6 +320,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))
+    refuse_other_table(path, (*FIELD_COLUMNS, TOTAL_COLUMN, UNDIRECTED_COLUMN))
     with atomic(path) as temporary:
         writers[path.suffix](data, temporary)
 

@@ -160,6 +160,9 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
     (lambda frame: hf.field_map(frame, frame[["y", "x", "z"]]), "y, x, z in place of x, y, z"),
     (lambda frame: hf.field_map(frame, frame[["x", "y"]].rename(columns="B{}_T".format),
                                 components=["y", "x"]), "Bx_T, By_T in place of y, x"),
+    (lambda frame: hf.field_map(3.0, 3.0), "of shapes"),
+    (lambda frame: hf.to_magpylib(hf.halbach_ring(**RING).study), "must be a Magnet"),
+    (lambda frame: hf.write_study("ring.toml", hf.halbach_ring(**RING)), "be a Magnet"),
     (lambda frame: hf.field_map(frame, frame, "50 uT"), "sigma_T.*numbers in T"),
     (lambda frame: hf.infer(hf.halbach_ring(**RING), hf.Session.temporary(),
                             hf.field_map(frame, frame)), "must be a Session; instead")])
