@@ -169,8 +169,10 @@ def workbook_in(raw: bytes) -> str | None:
 
 def workbook_sentence(where: str, program: str) -> str:
     """Return the sentence for a workbook in place of a table of text."""
+    converted = ("; or convert the file by halbach-fe import-map, or import-blocks"
+                 if program == "Excel" else "")
     return must_be("content", where, "a table of text (CSV)", f"an {program} workbook",
-                   "Save the sheet as CSV.")
+                   f"Save the sheet as CSV{converted}.")
 
 
 @contextmanager

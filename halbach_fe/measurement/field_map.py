@@ -73,6 +73,10 @@ MAX_FIELD_T = 10.0
 """Largest flux density in T that is accepted. No permanent magnet reaches it; a larger value is
 probably in mT or G."""
 
+PLACEHOLDERS = 0.1
+"""Share of rows below which values too large are those of single rows, and no matter of the unit:
+no map of a magnet has so few strong readings, and 9999 stands for none."""
+
 COPIES = 0.1
 """Share of rows from which rows that are alike in all numbers are copies, and no chance."""
 
@@ -705,6 +709,13 @@ def check_magnitudes(data: xr.Dataset) -> None:
         values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
     by_component = np.nan_to_num(np.abs(values)).max(axis=0).reshape(-1)
     largest = float(by_component.max())
+    beyond = np.flatnonzero((np.nan_to_num(np.abs(values)) > MAX_FIELD_T).reshape(
+        len(values), -1).any(axis=1))
+    if 0 < len(beyond) < PLACEHOLDERS * len(values):
+        raise MeasurementError(must_be(
+            f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
+            f"{largest:g}, one of {len(beyond)} of {len(values)} rows that are not",
+            "If the meter had no reading there, leave the cell empty, or remove the row."))
     if largest > MAX_FIELD_T:
         unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
                                ("millitesla", "mT", 1e-3))

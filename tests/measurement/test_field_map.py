@@ -13,7 +13,14 @@ from halbach_fe.core.errors import MeasurementError, OutputError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import checked_map, field_map, points_of, read_map, write_map
+from halbach_fe.measurement.field_map import (
+    check_magnitudes,
+    checked_map,
+    field_map,
+    points_of,
+    read_map,
+    write_map,
+)
 from halbach_fe.measurement.map_check import check_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.free_blocks_file import write_free_blocks
@@ -176,6 +183,17 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
         write_map(field_map(np.eye(3), np.zeros((3, 3))), path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_single_rows_that_are_no_readings():
+    """9999 in one row of many is no matter of the unit of all of them."""
+    points = 1e-3 * np.arange(120.0).reshape(40, 3)
+    field = 0.1 + points
+    field[7, 1] = 9999.0
+    with pytest.raises(MeasurementError, match=r"reading 8 .*1 of 40 rows"):
+        check_magnitudes(field_map(points, field))
+    with pytest.raises(MeasurementError, match="Are they in gauss"):
+        check_magnitudes(field_map(points, 1e4 * (0.1 + points)))
 
 
 def test_another_table_is_not_replaced(tmp_path):
