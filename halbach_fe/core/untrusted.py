@@ -84,8 +84,9 @@ def sheet_text(raw: bytes) -> bytes:
     (read, rows), *others = full
     if others:
         names = printable(", ".join(f"'{name}'" for name, _ in others), MAX_QUOTED)
-        warnings.warn(f"Of the workbook only the sheet {printable(repr(read), MAX_QUOTED)} is read, "
-                      f"not {names}: move the one that is meant to the front, or save it as CSV.",
+        title = printable(repr(read), MAX_QUOTED)
+        warnings.warn(f"Of the workbook only the sheet {title} is read, not {names}: "
+                      "move the one that is meant to the front, or save it as CSV.",
                       HalbachWarning, stacklevel=2)
     width = max(n for row in rows for n, cell in enumerate(row, 1) if cell)
     text = io.StringIO()

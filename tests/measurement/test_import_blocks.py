@@ -178,7 +178,8 @@ def test_workbooks_and_the_command(tmp_path, capsys):
     book.create_sheet("other").append([1])
     book.save(tmp_path / "two.xlsx")
     assert main(["import-map", str(tmp_path / "two.xlsx"), "-o", str(tmp_path / "two.csv")]) == 0
-    assert "only the sheet 'Sheet' is read, not 'other'" in " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().err.split())
+    assert "only the sheet 'Sheet' is read, not 'other'" in said
     raw = (tmp_path / "map.xlsx").read_bytes()
     (tmp_path / "map.xlsx").write_bytes(raw[:-200])
     capsys.readouterr()
