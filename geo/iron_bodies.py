@@ -99,21 +99,8 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         If Gmsh fails.
     """
     with gmsh_session(name):
-        occ = gmsh.model.occ
-        drawn = [_volume(body) for body in bodies]
-        shell = _shell(drawn)
-        whole = sum(occ.getMass(*volume) for volume in drawn)
-        inner, outer = (occ.addSphere(*shell.middle, radius)
-                        for radius in (shell.inner, shell.outer))
-        _, parts = occ.fragment(drawn, [(3, inner), (3, outer)])
-        occ.synchronize()
-        pieces = [[tag for _, tag in part] for part in parts]
+        pieces, shell = _draw(name, bodies)
         iron = {tag for part in pieces[:-2] for tag in part}
-        # part of the iron's volume that overlaps may take: rounding of coordinates
-        overlapping = 1e-6
-        if sum(occ.getMass(3, tag) for tag in iron) < (1 - overlapping) * whole:
-            raise StudyError(must_be("`iron.bodies`", f"study {name}", "bodies that do not overlap",
-                                     "bodies that do", "Move them apart, or let them touch."))
         air = set(pieces[-2]) - iron
         regions = [(tags.AIR_TAG, air), (tags.SHELL_TAG, set(pieces[-1]) - air - iron)]
         regions += [(tags.FIRST_BLOCK_TAG + number, set(part))
@@ -136,6 +123,37 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         blocks=tuple(BlockRegion(name=f"iron{number + 1}", ring=number + 1, slot=0,
                                  tag=tags.FIRST_BLOCK_TAG + number)
                      for number in range(len(bodies)))), shell
+
+
+def check_apart(name: str, bodies: Sequence[IronSolid]) -> None:
+    """Refuse bodies of iron that overlap, as `mesh_iron` does, without meshing them.
+
+    Raises
+    ------
+    StudyError
+    """
+    with gmsh_session(name):
+        _draw(name, bodies)
+
+
+def _draw(name: str, bodies: Sequence[IronSolid]) -> tuple[list[list[int]], Shell]:
+    """Draw bodies and the air around; return the volumes that each body, the air with them, and
+    the air with the shell consist of, and the shell.
+    """
+    occ = gmsh.model.occ
+    drawn = [_volume(body) for body in bodies]
+    shell = _shell(drawn)
+    whole = sum(occ.getMass(*volume) for volume in drawn)
+    inner, outer = (occ.addSphere(*shell.middle, radius) for radius in (shell.inner, shell.outer))
+    _, parts = occ.fragment(drawn, [(3, inner), (3, outer)])
+    occ.synchronize()
+    pieces = [[tag for _, tag in part] for part in parts]
+    iron = {tag for part in pieces[:-2] for tag in part}
+    overlapping = 1e-6  # part of the iron's volume that rounding of coordinates may take
+    if sum(occ.getMass(3, tag) for tag in iron) < (1 - overlapping) * whole:
+        raise StudyError(must_be("`iron.bodies`", f"study {name}", "bodies that do not overlap",
+                                 "bodies that do", "Move them apart, or let them touch."))
+    return pieces, shell
 
 
 def _shell(volumes: Sequence[tuple[int, int]]) -> Shell:

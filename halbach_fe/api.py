@@ -45,7 +45,7 @@ from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.free_blocks import blocks_table
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
-from halbach_fe.inference.map_homogeneity import map_homogeneity
+from halbach_fe.inference.map_homogeneity import MAP, map_homogeneity, of_other_size
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.inference.storage import disagreement_of, distributions_of
 from halbach_fe.measurement.block_table import BlockTable
@@ -523,10 +523,12 @@ def homogeneity(
     distributions = known or {"prior": assembled_prior(magnet, model.response.nominal)}
     of_map, misfit, remarks = ({}, 1.0, ()) if data is None else map_homogeneity(
         magnet, data, model)
-    return HomogeneityResult(magnet, model, {
-        name: model.of(distribution, measured=name != "prior")
-        for name, distribution in distributions.items()},
-        distributions, disagreement_of(posterior),
+    by_name = {name: model.of(distribution, measured=name != "prior")
+               for name, distribution in distributions.items()}
+    if MAP in of_map and (remark := of_other_size(of_map[MAP], list(by_name.values())[-1])):
+        remarks = (*remarks, remark)
+    return HomogeneityResult(
+        magnet, model, by_name, distributions, disagreement_of(posterior),
         stray_field(magnet, session, list(distributions.values())[-1]),
         of_map, misfit, remarks)
 

@@ -96,6 +96,11 @@ def halbach_ring(
                                  "and a recoil permeability", "both"))
     check_number("order", "halbach_ring", order, 1)
     check_number("rings", "halbach_ring", rings, 1, whole=True)
+    for key, value in {"inner_radius_m": inner_radius_m, "outer_radius_m": outer_radius_m,
+                       "length_m": length_m, "remanence_T": remanence_T,
+                       "recoil_permeability": recoil_permeability}.items():
+        if value is not None:
+            check_number(key, "halbach_ring", value)
     ring_length = None if length_m is None else length_m / rings
     magnet = new_magnet(MagnetTemplate(
         order, blocks, rings, inner_radius_m, outer_radius_m, ring_length,
@@ -194,6 +199,7 @@ def with_noise(template: MagnetTemplate, magnet: Magnet) -> MagnetTemplate:
     return replace(template, sigma_T=float(f"{sigma:.1g}"), position_sd_m=float(f"{stage:.1g}"))
 
 
+@typed
 def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     """Write the study of a magnet as a file that `halbach_fe.read_study` reads back the same.
 
@@ -310,6 +316,7 @@ def _turned(turn: Rotation) -> dict[str, float]:
                     map(float, np.degrees(turn.as_rotvec())), strict=True))
 
 
+@typed
 def to_magpylib(magnet: Magnet) -> Any:
     """Return a magnet's blocks as a ``magpylib.Collection``.
 

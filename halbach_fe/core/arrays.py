@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,14 +12,26 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def plain(values: ArrayLike) -> Floats:
+AXIS = re.compile(r"[bB]?_?([xyzXYZ])(?![A-Za-z])")
+"""How the name of a column of a DataFrame begins that is of an axis: x, x_m, Bx, Bx_T."""
+
+
+def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     """Return a copy of numbers as floats, NaN where an array is masked.
 
     Raises
     ------
     TypeError, ValueError
-        If they are no real numbers.
+        If they are no real numbers, have a unit of their own, or are a DataFrame whose columns are
+        named after other axes than ``axes``, or in another order.
     """
     if np.iscomplexobj(values):
         raise TypeError("complex numbers")
+    if any(hasattr(values, name) for name in ("magnitude", "to_value")):  # of pint, of astropy
+        raise TypeError("numbers with a unit of their own; convert them to SI, and give their "
+                        "values alone")
+    named = [AXIS.match(str(name)) for name in getattr(values, "columns", ())]
+    if named and all(named) and [one[1].lower() for one in named if one] != list(axes):
+        raise ValueError(f"columns named {', '.join(map(str, values.columns))} in place of "  # type: ignore[union-attr]
+                         f"{', '.join(axes)}, in this order")
     return np.array(np.ma.filled(np.ma.asarray(values, float), np.nan))

@@ -18,7 +18,7 @@ import socket
 import stat
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cached_property
@@ -169,8 +169,10 @@ def workbook_in(raw: bytes) -> str | None:
 
 def workbook_sentence(where: str, program: str) -> str:
     """Return the sentence for a workbook in place of a table of text."""
+    converted = ("; or convert the file by halbach-fe import-map, or import-blocks"
+                 if program == "Excel" else "")
     return must_be("content", where, "a table of text (CSV)", f"an {program} workbook",
-                   "Save the sheet as CSV.")
+                   f"Save the sheet as CSV{converted}.")
 
 
 @contextmanager
@@ -222,6 +224,26 @@ def atomic(path: Path) -> Iterator[Path]:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def refuse_other_table(path: Path, columns: Sequence[str]) -> None:
+    """Refuse to replace a CSV file that is no table with one of some columns: one of blocks by a
+    map, say.
+
+    Raises
+    ------
+    OutputError
+    """
+    if path.suffix != ".csv" or not path.is_file():
+        return
+    with path.open("rb") as file:
+        header = next((line for line in file if not line.startswith(b"#")), b"")
+    if header.strip() and not {*header.strip().split(b",")} & {
+            column.encode() for column in columns}:
+        raise OutputError(must_be(
+            "path", str(path), "a new file, or a table with a column "
+            + " or ".join(columns),
+            "another table, which would be lost", "Choose another name, or remove it."))
 
 
 def _write_bytes(content: bytes, path: Path) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.core.errors import ExtraMissingError
+from halbach_fe.core.errors import MAX_QUOTED, ExtraMissingError, HalbachWarning, printable
 
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""
@@ -76,16 +76,23 @@ def sheet_text(raw: bytes) -> bytes:
             if sum(part.file_size for part in packed.infolist()) > max_sheet:
                 raise ValueError(f"it unpacks to more than {max_sheet} bytes")
         book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
-        for sheet in book.worksheets:
-            rows = [["" if cell is None else str(cell) for cell in row]
-                    for row in sheet.iter_rows(values_only=True)]
-            width = max((n for row in rows for n, cell in enumerate(row, 1) if cell), default=0)
-            if width:
-                text = io.StringIO()
-                csv.writer(text, lineterminator="\n").writerows(
-                    [*row, *[""] * width][:width] for row in rows if any(row))
-                return text.getvalue().encode()
-    raise ValueError("it has no sheet with cells")
+        full = [(sheet.title, rows) for sheet in book.worksheets if any(map(any, (rows := [
+            ["" if cell is None else str(cell) for cell in row]
+            for row in sheet.iter_rows(values_only=True)])))]
+    if not full:
+        raise ValueError("it has no sheet with cells")
+    (read, rows), *others = full
+    if others:
+        names = printable(", ".join(f"'{name}'" for name, _ in others), MAX_QUOTED)
+        title = printable(repr(read), MAX_QUOTED)
+        warnings.warn(f"Of the workbook only the sheet {title} is read, not {names}: "
+                      "move the one that is meant to the front, or save it as CSV.",
+                      HalbachWarning, stacklevel=2)
+    width = max(n for row in rows for n, cell in enumerate(row, 1) if cell)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(
+        [*row, *[""] * width][:width] for row in rows if any(row))
+    return text.getvalue().encode()
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -112,6 +112,8 @@ def map_homogeneity(
             found[name] = known
         if remark and (name == MAP or known is None):
             remarks.append(f"{what} {remark}")
+    if far := magnet.surroundings(readings.observation.points).far_away():
+        remarks.append(far)
     if MAP in found and HELD_OUT_PART in found:
         remark = not_carried(found[HELD_OUT_PART], found[MAP])
         if remark:
@@ -140,6 +142,16 @@ def not_carried(part: Homogeneity, whole: Homogeneity) -> str:
         return (f"{has}, which its readings are too few to tell, unlike the whole map. It is left "
                 "out.")
     return ""
+
+
+def of_other_size(of_map: Homogeneity, of_magnet: Homogeneity) -> str:
+    """Say that the mean field of a map is not that of the magnet, or nothing."""
+    far = 0.1  # blocks of another grade are a few per cent off
+    factor = of_map.mean_T / of_magnet.mean_T
+    if abs(factor - 1) <= far + 3 * of_map.mean_sd_T / of_magnet.mean_T:
+        return ""
+    return (f"The mean field of the map is {decimals(factor)} times that of the magnet: is it a "
+            "map of this magnet, in m and T?")
 
 
 def _check_within(readings: Readings, model: HomogeneityModel) -> None:

@@ -337,7 +337,7 @@ def factor_in_words(factor: float, likeness: float = 1.0) -> str:
     if abs(likeness) < UNLIKE:
         return ("The readings are not like the field expected of the magnet, by whatever "
                 "factor: look at the names of their components, at their axes, and at the places "
-                "and their unit (mm for m?) in the file first.")
+                "and their unit (mm for m?, places and readings exchanged?) in the file first.")
     if abs(factor - 1) < factor_off:
         return ""
     known = f" ({words})" if (words := known_factor(factor)) else ""

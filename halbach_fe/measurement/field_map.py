@@ -34,8 +34,14 @@ from numpy.typing import ArrayLike, NDArray
 from halbach_fe.core import untrusted
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, plain
-from halbach_fe.core.errors import HalbachWarning, MeasurementError, OutputError, must_be
-from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
+from halbach_fe.core.errors import (
+    HalbachError,
+    HalbachWarning,
+    MeasurementError,
+    OutputError,
+    must_be,
+)
+from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes, refuse_other_table
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
 from halbach_fe.measurement.tables import (
@@ -46,7 +52,7 @@ from halbach_fe.measurement.tables import (
     look_like_clock,
     write_csv,
 )
-from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T
+from halbach_fe.study.types import COMPONENTS, MAX_LENGTH_M, MAX_SIGMA_T, MIN_SIGMA_T, look_like_mm
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 FIELD_COLUMNS = ("Bx_T", "By_T", "Bz_T")
@@ -66,6 +72,10 @@ FOREIGN = ("A table with other columns, other separators or no header is convert
 MAX_FIELD_T = 10.0
 """Largest flux density in T that is accepted. No permanent magnet reaches it; a larger value is
 probably in mT or G."""
+
+PLACEHOLDERS = 0.1
+"""Share of rows below which values too large are those of single rows, and no matter of the unit:
+no map of a magnet has so few strong readings, and 9999 stands for none."""
 
 COPIES = 0.1
 """Share of rows from which rows that are alike in all numbers are copies, and no chance."""
@@ -107,12 +117,13 @@ def field_map(
     array([0.4 , 0.39])
     """
     try:
-        points, given = plain(points_m), plain(B_T)
+        points, given = plain(points_m), plain(B_T, components)
     except (TypeError, ValueError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
-    if points.shape != (len(points), 3) or given.shape != (len(points), len(components)) or (
+    count = points.shape[0] if points.ndim else 0
+    if points.shape != (count, 3) or given.shape != (count, len(components)) or (
             len(set(columns)) != len(components)):
         raise MeasurementError(must_be(
             "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
@@ -133,7 +144,11 @@ def field_map(
         attrs=dict(attributes or {}))
     data["B_T"].attrs["units"] = "T"
     if sigma_T is not None:
-        sigma = plain(sigma_T)
+        try:
+            sigma = plain(sigma_T, components)
+        except (TypeError, ValueError) as error:
+            raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
+                                           f"what is none: {error}")) from None
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
@@ -154,12 +169,43 @@ def taking_arrays(function: Function) -> Function:
     @wraps(function)
     def of_map_or_arrays(*arguments: Any, **options: Any) -> Any:
         match arguments:
-            case magnet, points_m, B_T, *others if np.ndim(B_T):  # no session
+            case magnet, points_m, B_T, *others if not isinstance(
+                    points_m, xr.Dataset | Mapping) and _is_array(B_T):
                 data = field_map(points_m, B_T, options.pop("sigma_T", None))
+                _refuse_exchanged(magnet, data)
                 return function(magnet, data, *others, **options)
         return function(*arguments, **options)
 
     return cast(Function, of_map_or_arrays)
+
+
+def _is_array(value: object) -> bool:
+    """Return whether an argument is an array of readings, and no session."""
+    return not isinstance(value, xr.Dataset) and bool(np.ndim(cast(ArrayLike, value)))
+
+
+def _refuse_exchanged(magnet: Any, data: xr.Dataset) -> None:
+    """Refuse positions and readings that are each other's: at the readings, taken as positions, the
+    magnet's field is what was given as positions. Asked only where the field has a closed form.
+    """
+    near = 0.3  # part of what is given; fields of magnets that are built are closer to nominal ones
+    points, values = points_of(data), data["B_T"].values
+    if not getattr(magnet, "is_vacuum", False) or not np.isfinite(values).all():
+        return
+
+    def off(places: Floats, given: Floats) -> float:
+        try:
+            return float(np.linalg.norm(magnet.field_T(places) - given) / np.linalg.norm(given))
+        except HalbachError:  # not in air
+            return np.inf
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        exchanged = points.any() and off(values, points) < near and not off(points, values) < near
+    if exchanged:
+        raise MeasurementError(must_be(
+            "points_m and B_T", "the map", "given in this order",
+            "positions that are the field of the magnet at the readings", "Exchange them."))
 
 
 def undirected(data: xr.Dataset) -> xr.Dataset:
@@ -263,7 +309,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     Raises
     ------
     OutputError
-        If the suffix is unknown, or the file cannot be written.
+        If the suffix is unknown, the file cannot be written, or another table would be lost.
 
     Examples
     --------
@@ -278,6 +324,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))
+    refuse_other_table(path, (*FIELD_COLUMNS, TOTAL_COLUMN, UNDIRECTED_COLUMN))
     with atomic(path) as temporary:
         writers[path.suffix](data, temporary)
 
@@ -662,6 +709,13 @@ def check_magnitudes(data: xr.Dataset) -> None:
         values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
     by_component = np.nan_to_num(np.abs(values)).max(axis=0).reshape(-1)
     largest = float(by_component.max())
+    beyond = np.flatnonzero((np.nan_to_num(np.abs(values)) > MAX_FIELD_T).reshape(
+        len(values), -1).any(axis=1))
+    if 0 < len(beyond) < PLACEHOLDERS * len(values):
+        raise MeasurementError(must_be(
+            f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
+            f"{largest:g}, one of {len(beyond)} of {len(values)} rows that are not",
+            "If the meter had no reading there, leave the cell empty, or remove the row."))
     if largest > MAX_FIELD_T:
         unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
                                ("millitesla", "mT", 1e-3))
@@ -684,6 +738,23 @@ def check_magnitudes(data: xr.Dataset) -> None:
                 raise MeasurementError(must_be(
                     "sigma", where, f"from {MIN_SIGMA_T:g} to {MAX_SIGMA_T:g} T", f"{extreme:g}",
                     "Correct it, or instrument.flux_density_unit_T of the study."))
+
+
+def doubt_of_metres(data: xr.Dataset) -> str:
+    """Return a sentence if the points of a map lie where few magnets have a field, else nothing."""
+    points = points_of(data)
+    if not look_like_mm(points).any():
+        return ""
+    distance = float(np.linalg.norm(points, axis=1).max())
+    return (f"The points lie up to {distance:.3g} m from the origin, where few magnets of "
+            "permanent blocks have a field. Are they in mm?")
+
+
+def warn_of_millimetres(data: xr.Dataset) -> None:
+    """Warn, where no study tells how large the magnet is, of points that are rather in mm."""
+    if doubt := doubt_of_metres(data):
+        warnings.warn(f"{doubt} Then convert the map by halbach-fe import-map with --length-unit "
+                      "mm.", HalbachWarning, stacklevel=2)
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:

@@ -35,6 +35,7 @@ from halbach_fe.measurement.field_map import (
     points_of,
     refuse_total_field,
     refuse_undirected,
+    warn_of_millimetres,
 )
 from halbach_fe.measurement.harmonic_field import (
     NO_FIT,
@@ -537,14 +538,17 @@ def _rms(residual: Floats) -> Floats:
 
 
 def _order(data: xr.Dataset) -> str:
-    """Return what tells when each reading was taken, see `MapCheck.order`.
+    """Return what tells when each reading was taken, see `MapCheck.order`."""
+    return "time_s" if "time_s" in data else order_of(data)
+
+
+def order_of(data: xr.Dataset) -> str:
+    """Return "rows" if the rows go the way of a stage, or "none".
 
     A stage goes along lines or circles, or on short ways. In maps in a random order, or sorted by
     their readings, 1 to 24 % of the rows were on lines, and in scans 80 to 99 %; the next row was
     as far as any other, and in scans a third to a sixth of that.
     """
-    if "time_s" in data:
-        return "time_s"
     points = points_of(data)
     if len(points) < 2:
         return "rows"
@@ -714,6 +718,7 @@ def _checkable(data: xr.Dataset) -> xr.Dataset:
     refuse_undirected(data)
     refuse_total_field(data, "Maxwell's check")
     check_magnitudes(data)
+    warn_of_millimetres(data)
     return data
 
 

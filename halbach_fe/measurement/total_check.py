@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD
-from halbach_fe.measurement.field_map import TOTAL_COLUMN, check_magnitudes, checked_map, points_of
+from halbach_fe.measurement.field_map import (
+    TOTAL_COLUMN,
+    check_magnitudes,
+    checked_map,
+    points_of,
+    warn_of_millimetres,
+)
 from halbach_fe.measurement.suspect_rows import broken_rows, quadratic_residual, rough_rows
 
 FEWEST_REPEATS = 3
@@ -70,6 +76,7 @@ def check_total(data: xr.Dataset) -> TotalCheck:
     fewest_rows = 30  # rows from which a row can be compared with a function through its neighbours
     data = checked_map(data, "`data`")
     check_magnitudes(data)
+    warn_of_millimetres(data)
     points, total = points_of(data), np.asarray(data[TOTAL_COLUMN].values, float)
     if not total.any():
         raise MeasurementError(must_be("|B|", "map", "that of a magnet", "zero at all points",

@@ -30,6 +30,9 @@ from halbach_fe.report.words import counted, in_a_row
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study, differences, magnet_description
 
+WITHOUT_PAGE = ("halbach-fe field",)
+"""Commands whose results are tables alone, for other programs."""
+
 ORDER = ("design", "solve", "verify", "demagnetization", "forces", "tolerance", "plan", "sort",
          "cad", "simulate-measurement", "check", "register", "prior", "infer", "multipoles",
          "homogeneity", "diagnose", "shim", "shim-tray")
@@ -178,6 +181,10 @@ def _chapter(results: Results, label: str) -> Chapter:
             raise refused("results with their page", f"whose {said.page} is none")
         pages.append(Page(str(path), said, _picture(results, path.parent, said)))
     if not pages:
+        if record.command in WITHOUT_PAGE:
+            raise OutputError(must_be("DIR", "the report", "results with a page",
+                                      f"{results.folder}, of `{record.command}`, which writes "
+                                      "tables alone", "Leave it out."))
         raise refused("results with a page", f"which has no {PAGE_RECORD}")
     return Chapter(results.folder, label, record, tuple(pages), tuple(results.changed()))
 

@@ -18,6 +18,7 @@ from halbach_fe.measurement.map_check import (
     MapCheck,
     Reach,
     inner,
+    order_of,
     oriented,
 )
 from halbach_fe.measurement.map_join import JoinedMaps, MapPose
@@ -431,6 +432,29 @@ OF_SORTED_ROWS = (
 """What is said of a map whose rows may have lost their order."""
 
 
+def doubt_of_times(data: xr.Dataset) -> str:
+    """Return a sentence if the clock of a map jumped, or its times are rather not of these rows."""
+    if "time_s" not in data:
+        return ""
+    times = np.asarray(data["time_s"].values, float)
+    if order_of(data.isel(point=np.argsort(times, kind="stable"))) == "none":
+        return ("In the order of time_s the probe went to and fro at random: if that is not so, "
+                "these times are not of these rows, and say nothing of a drift or a lag, which "
+                "then count as noise. Correct them, or leave time_s out.")
+    steps = np.diff(times)
+    if not 0 < np.sum(steps < 0) <= CLOCK_SETS * len(times):
+        return ""
+    row = int(np.argmax(steps < 0))
+    return (f"After row {row + 1} time_s falls by {-steps[row]:.6g} s: what changes during the "
+            "scan is judged in the order of time_s, not of the rows. If the clock was set back "
+            "there, or passed midnight, correct the times.")
+
+
+CLOCK_SETS = 0.01
+"""Part of the rows after which a clock may be set back; rows that are sorted by their places have
+more falling times."""
+
+
 def page(data: xr.Dataset, check: MapCheck) -> Page:
     """Return the page of the check of a map, and the maps that are made of it."""
     points, found, rows = points_of(data), sentences(check), residual_table(check)
@@ -443,6 +467,8 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
             if check.uneven is not None else "Noise is about as large everywhere")
     if "time_s" not in data and is_sorted(points):
         found.append(OF_SORTED_ROWS)
+    if doubt := doubt_of_times(data):
+        found.append(doubt)
     return Page(
         "check", TITLE, None, answer(check), check_summary(data, check), [
             Section([*([Items(found)] if found else []), Text(

@@ -192,9 +192,9 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     """Return B (..., 3) in T of the nominal array at points (..., 3) in m, see `Magnet.field_T`."""
     try:
         points = plain(points_m)
-    except (TypeError, ValueError):  # text, or rows of different lengths
+    except (TypeError, ValueError) as error:  # text, or rows of different lengths
         raise StudyError(must_be("points_m", magnet.name, "x, y, z in m: an array (..., 3)",
-                                 f"a {type(points_m).__name__} that is none")) from None
+                                 f"a {type(points_m).__name__} that is none: {error}")) from None
     if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
         missing = points.ndim and points.shape[-1] == 3
         raise StudyError(must_be("points_m", magnet.name, "finite x, y, z in m: an array (..., 3)",
@@ -323,8 +323,8 @@ def _moments_part(
             for chosen, route in ((few, "azimuthal_modes"), (~few, "moments"))]
         return _join_parts(magnet, points, parts)
     if session.counter is not None:
-        if not magnet.iron_is_axisymmetric:
-            session.counter.batches.append((session.purpose, sizes_of_iron(magnet, estimate)))
+        if sizes := sizes_of_iron(magnet, estimate):
+            session.counter.batches.append((session.purpose, sizes))
         zero = np.zeros((len(points), 3))
         return ElementFields(np.nan, zero, zero, magnet.blocks, _refuse_column, zero)
     solved = solve_separate(magnet, session, estimate)

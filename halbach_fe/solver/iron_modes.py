@@ -113,8 +113,12 @@ def check_bodies(bodies: Sequence[IronRectangle]) -> None:
         across = min(a.outer_radius_m, b.outer_radius_m) - max(a.inner_radius_m, b.inner_radius_m)
         along = min(a.z_max_m, b.z_max_m) - max(a.z_min_m, b.z_min_m)
         if min(across, along) > ONE_LINE_M:
-            raise StudyError(must_be("Iron", "the magnet", "bodies that do not overlap",
-                                     f"{a} and {b}", "Split them into separate rectangles."))
+            said = " and ".join(
+                f"one from r = {1e3 * body.inner_radius_m:.6g} to "
+                f"{1e3 * body.outer_radius_m:.6g} mm and z = {1e3 * body.z_min_m:.6g} to "
+                f"{1e3 * body.z_max_m:.6g} mm" for body in (a, b))
+            raise StudyError(must_be("`iron.bodies`", "the magnet", "bodies that do not overlap",
+                                     said, "Move them apart, or let them touch."))
 
 
 def grid_lines(bodies: Sequence[IronRectangle], resolution: Resolution) -> tuple[Floats, Floats]:

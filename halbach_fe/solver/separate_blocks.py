@@ -30,7 +30,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     solve_iron,
 )
 from halbach_fe.solver.exact_block_field import external_field, field_on_circles, unit_fields
-from halbach_fe.solver.iron_modes import IronRectangle, Resolution
+from halbach_fe.solver.iron_modes import IronRectangle, Resolution, check_bodies
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.magnet import External
 
@@ -184,9 +184,20 @@ def _solve_iron(
 
 
 def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
-    """Return the expected sizes of the runs for iron that is not rotationally symmetric."""
+    """Return the expected sizes of the runs for iron; none if it is rotationally symmetric.
+
+    Raises
+    ------
+    StudyError
+        If bodies overlap.
+    """
+    if magnet.iron_is_axisymmetric:
+        check_bodies(iron_rectangles(magnet))
+        return []
+    from halbach_fe.geo.iron_bodies import check_apart  # imports Gmsh
     from halbach_fe.solver.iron_bodies import COARSER, size_of
 
+    check_apart(magnet.name, magnet.iron)
     rough = estimate or _permeable(magnet.blocks)
     return [size_of(magnet, coarseness) for coarseness in (1.0, *(COARSER,) * rough)]
 

@@ -243,6 +243,13 @@ class NoiseRegion(StudyModel):
             raise ValueError(f"z_min_m ({self.z_min_m}) must be below z_max_m ({self.z_max_m})")
         return self
 
+    def holds(self, other: NoiseRegion) -> bool:
+        """Return whether all readings of another region lie in this one."""
+        (low, high), (least, most) = (
+            (-math.inf if one.z_min_m is None else one.z_min_m,
+             math.inf if one.z_max_m is None else one.z_max_m) for one in (self, other))
+        return low <= least and most <= high and {*other.components} <= {*self.components}
+
 
 class NoiseSettings(StudyModel):
     """Standard deviation of the readings, and of their positions.
@@ -261,6 +268,12 @@ class NoiseSettings(StudyModel):
     def _consistent(self) -> NoiseSettings:
         if not self.regions and self.position_sd_m is None:
             raise ValueError("give regions, position_sd_m, or both")
+        for number, region in enumerate(self.regions):
+            if before := next((one for one in self.regions[:number] if one.holds(region)), None):
+                raise ValueError(
+                    f"the first region that holds a reading counts, and '{before.name}', which "
+                    f"comes first, holds all of '{region.name}'; put the narrower one first, or "
+                    "leave one out")
         if self.position_sd_m is not None and len(self.position_sd_m) not in (1, 3):
             raise ValueError(f"position_sd_m must be one value or three, for x, y and z, not "
                              f"{len(self.position_sd_m)}")

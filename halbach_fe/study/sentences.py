@@ -137,6 +137,8 @@ def hint(key: str, error: ErrorDetails) -> str:
     value, kind = error.get("input"), error["type"]
     if key.endswith(".curve"):
         return CURVE
+    if key.endswith(".free_blocks") and isinstance(value, str):
+        return "Write the name of the table as its key `file`: free_blocks = { file = \"...\" }."
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if kind != "tuple_type":
         return (wrong_unit(key, value, error.get("ctx", {})) or "Correct the value."

@@ -8,6 +8,7 @@ from functools import partial
 
 import magpylib
 import numpy as np
+import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -142,6 +143,47 @@ def test_a_study_that_somebody_wrote_is_not_replaced(tmp_path):
             "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
             "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]}), tmp_path / "b.toml")
     assert table.read_text() == "mine"
+
+
+class Quantity:
+    """A number with a unit, as pint and astropy have."""
+
+    magnitude = 30.0
+
+
+RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
+
+
+@pytest.mark.parametrize(("call", "said"), [
+    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": "30 mm"}), "inner_radius_m.*number"),
+    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "finite number"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame[["z", "y", "x"]]), "z, y, x in place of"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(Quantity()), "unit of their own"),
+    (lambda frame: hf.field_map(frame, frame[["y", "x", "z"]]), "y, x, z in place of x, y, z"),
+    (lambda frame: hf.field_map(frame, frame[["x", "y"]].rename(columns="B{}_T".format),
+                                components=["y", "x"]), "Bx_T, By_T in place of y, x"),
+    (lambda frame: hf.field_map(3.0, 3.0), "of shapes"),
+    (lambda frame: hf.to_magpylib(hf.halbach_ring(**RING).study), "must be a Magnet"),
+    (lambda frame: hf.write_study("ring.toml", hf.halbach_ring(**RING)), "be a Magnet"),
+    (lambda frame: hf.field_map(frame, frame, "50 uT"), "sigma_T.*numbers in T"),
+    (lambda frame: hf.infer(hf.halbach_ring(**RING), hf.Session.temporary(),
+                            hf.field_map(frame, frame)), "must be a Session; instead")])
+def test_arrays_that_say_what_they_are(call, said):
+    """Columns by name and numbers with units are not read as if they were plain."""
+    frame = pandas.DataFrame([[0.0, 0.001, 0.0], [0.0, 0.0, 0.001]], columns=["x", "y", "z"])
+    assert np.isfinite(hf.halbach_ring(**RING).field_T(frame)).all()
+    with pytest.raises(hf.HalbachError, match=said):
+        call(frame)
+
+
+def test_positions_and_readings_that_are_exchanged(generator):
+    ring = hf.halbach_ring(order=1, blocks=8, inner_radius_m=0.03, outer_radius_m=0.05,
+                           length_m=0.06)
+    points = generator.uniform(-0.015, 0.015, (40, 3))
+    field = ring.field_T(points) + 5e-5 * generator.standard_normal((40, 3))
+    with pytest.raises(hf.HalbachError, match="given in this order"):
+        hf.infer(ring, field, points, sigma_T=5e-5)
+    assert hf.infer(ring, points, field, sigma_T=5e-5).disagreement == ""
 
 
 def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator):

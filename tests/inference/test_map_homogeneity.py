@@ -157,6 +157,16 @@ def test_a_map_of_the_magnitude(generator, tmp_path, errors):
     assert "may turn too much there for |B| to be harmonic" in found.map_remarks[0]
 
 
+def test_a_map_of_another_magnet(generator, tmp_path, errors):
+    data = measured(generator, errors)
+    magnet, session = build_magnet(study()), Session.open(tmp_path)
+    other = data.assign(B_T=0.5 * data["B_T"])
+    found = homogeneity(magnet, session, REGION, data=other)
+    assert re.search(r"is 0\.[45]\d* times that of the magnet", " ".join(found.map_remarks))
+    assert "times that of the magnet" not in " ".join(
+        homogeneity(magnet, session, REGION, data=data).map_remarks)
+
+
 def test_a_fit_that_cannot_be_relied_on(generator, tmp_path, errors):
     """Noise of a tenth shows what harmonics of higher degrees than the fit's do."""
     magnet = build_magnet(study(0.1 * NOISE_T))

@@ -68,6 +68,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     (HEADER + "10,0,0,0.1±0.01,0±0.01,0±0.01\n" * 2, "sigma_Bx"),
     ("r[mm],theta[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,270,40,0.1\n", "exchange theta and phi"),
     ("r[mm],angle[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,270,40,0.1\n", "from the z axis theta"),
+    ("r[mm],latitude[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,40,40,0.1\n", "of 90 degrees less it"),
     ("r[mm],theta[deg],phi[deg],Br[T],Bphi[T]\n8,30,0,0.1,0\n", "Btheta, without which Br and"),
     ("r[mm],theta[deg],phi[deg],Br[T],Btheta[T],Bphi[T],sigma_Br[T]\n8,30,0,0.1,0,0,1e-4\n",
      "one for all components"),

@@ -174,6 +174,12 @@ def test_workbooks_and_the_command(tmp_path, capsys):
     book.save(tmp_path / "map.xlsx")
     assert main(["import-map", str(tmp_path / "map.xlsx"), "-o", str(tmp_path / "map.csv")]) == 0
     assert "0.001,0.002,0.003,0.1005" in (tmp_path / "map.csv").read_text()
+    assert "only the sheet" not in capsys.readouterr().err
+    book.create_sheet("other").append([1])
+    book.save(tmp_path / "two.xlsx")
+    assert main(["import-map", str(tmp_path / "two.xlsx"), "-o", str(tmp_path / "two.csv")]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "only the sheet 'Sheet' is read, not 'other'" in said
     raw = (tmp_path / "map.xlsx").read_bytes()
     (tmp_path / "map.xlsx").write_bytes(raw[:-200])
     capsys.readouterr()

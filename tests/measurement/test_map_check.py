@@ -21,6 +21,7 @@ from halbach_fe.measurement.field_map import (
     readings_sha256,
     write_map,
 )
+from halbach_fe.measurement.formats.files import export_map
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
@@ -29,6 +30,7 @@ from halbach_fe.measurement.suspect_rows import broken_rows, rough_rows, stands_
 from halbach_fe.report.map_check import (
     OPEN_SIGN,
     answer,
+    doubt_of_times,
     inner,
     oriented,
     sentences,
@@ -622,6 +624,29 @@ def test_the_stage_moves_in_the_order_of_times(generator):
     assert is_sorted(points[order])
     np.testing.assert_array_equal(motion(points[order], time[order]), motion(points)[order])
     assert (motion(points[order]) != motion(points)[order]).any()  # the control: without times
+
+
+def test_times_that_are_not_those_of_the_rows(generator):
+    """A clock that was set back, and times at random, are told of; rows sorted anew are not."""
+    to_and_fro = GRID.reshape(5, 7, 9, 3).copy()
+    to_and_fro[:, 1::2] = to_and_fro[:, 1::2, ::-1]
+    points, time = to_and_fro.reshape(-1, 3), np.arange(len(GRID), dtype=float)
+
+    def said(times, rows=slice(None)):
+        return doubt_of_times(field_map(points, points).assign(
+            time_s=("point", times)).isel(point=rows))
+
+    assert "After row 100 time_s falls by 86399 s" in said(np.where(time < 100, time, time - 86400))
+    assert "not of these rows" in said(generator.permutation(time))
+    assert said(time) == said(time, np.lexsort(points[:, ::-1].T)) == said(time - 1e3) == ""
+
+
+def test_points_that_are_rather_in_millimetres(tmp_path):
+    for write in (lambda data: check_map(data), lambda data: export_map(
+            data, "csv", tmp_path / "map.csv")):
+        with pytest.warns(HalbachWarning, match="Are they in mm"):
+            write(field_map(300 * GRID, 0.1 + GRID))
+        write(field_map(GRID, 0.1 + GRID))  # the control: warnings are errors
 
 
 def test_a_change_during_the_scan_must_predict_lines(generator):

@@ -11,6 +11,8 @@ import pytest
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geo.iron_bodies import Sizes
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.response.resource_estimate import estimate_solve
+from halbach_fe.response.solution import study_observation
 from halbach_fe.solver import iron_bodies
 from halbach_fe.solver.formulation_choice import (
     Route,
@@ -199,6 +201,22 @@ def test_overlaps_with_blocks_are_refused(body):
     with pytest.raises(StudyError, match="block cube and body 1 of iron overlap"):
         build_magnet(study_with(body))
     build_magnet(study_with(body | {"centre_m": [0.1, 0.0, 0.0]}))
+
+
+@pytest.mark.parametrize(("first", "second"), [
+    ({"kind": "box", "size_m": [0.02, 0.02, 0.02], "centre_m": [0.05, 0.0, 0.0]}, SPHERE | {
+        "centre_m": [0.05, 0.01, 0.025]}),
+    ({"kind": "tube", "inner_radius_m": 0.06, "outer_radius_m": 0.08, "length_m": 0.02},
+     {"kind": "tube", "inner_radius_m": 0.07, "outer_radius_m": 0.09, "length_m": 0.04})])
+def test_a_dry_run_refuses_bodies_that_overlap(first, second):
+    def estimate(*bodies):
+        magnet = build_magnet(study_with(*bodies))
+        return estimate_solve(magnet, study_observation(magnet), 1)
+
+    with pytest.raises(StudyError, match="bodies that do not overlap"):
+        estimate(first, second)
+    apart = [0.15, 0.0, 0.0] if first["kind"] == "box" else [0.0, 0.0, 0.03]
+    assert estimate(first, second | {"centre_m": apart}).seconds > 0
 
 
 def test_other_refusals(session, monkeypatch):

@@ -82,6 +82,7 @@ def test_every_kind_of_error_has_a_sentence():
      "`iron.bodies[0].kind` of study must be one of 'tube', 'prism', 'box', 'sphere', 'stl'; "
      "instead received 'tub'. "
      "Did you mean 'tube'?"),
+    ({"array": {"free_blocks": "blocks.csv"}}, "free_blocks = { file ="),
     ({"array": []}, "`array` of study must be a table of keys; instead received a list of 0."),
     ({"array__blocks_per_ring": 16.5}, "a whole number; instead received 16.5."),
     ({"array__blocks_per_ring": 10**30}, "less than or equal to 512; instead"),

@@ -115,6 +115,8 @@ HOT = DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955e3, "temperature_C":
      "`noise.regions[0].components[0]`"),
     ({"noise": {"regions": [{"name": "all", "components": [], "sigma_T": 1e-4}]}},
      "`noise.regions[0].components`"),
+    ({"noise": {"regions": [{"name": "all", "sigma_T": 1e-4}, {
+        "name": "fringe", "z_min_m": 0.1, "sigma_T": 1e-3}]}}, "holds all of 'fringe'"),
     ({"noise": {}}, "give regions, position_sd_m, or both"),
     ({"noise": {"position_sd_m": -1e-4}}, "`noise.position_sd_m[0]`"),
     ({"noise": {"position_sd_m": 0.1}}, "less than or equal to 0.01"),

@@ -15,9 +15,10 @@ from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
     check_readings,
-    points_of,
+    doubt_of_metres,
     read_map,
     warn_of_left_out,
+    warn_of_millimetres,
     write_map,
 )
 from halbach_fe.measurement.formats import (
@@ -34,7 +35,7 @@ from halbach_fe.measurement.formats.grid import Grid, grid_of, implied_format, r
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of, text_of_table
 from halbach_fe.measurement.formats.units import unit_symbol
-from halbach_fe.study.types import COMPONENTS, look_like_mm
+from halbach_fe.study.types import COMPONENTS
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
     FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read,
@@ -108,14 +109,12 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
 
 def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
     """Return the file, with a remark if its points lie where few magnets have a field."""
-    points = points_of(file.data)
-    if not look_like_mm(points).any():
+    doubt = doubt_of_metres(file.data)
+    if not doubt:
         return file
-    distance = float(np.linalg.norm(points, axis=1).max())
-    remark = (f"The points lie up to {distance:.3g} m from the origin, where few magnets of "
-              "permanent blocks have a field. Are they in mm? Then give --length-unit mm"
-              + ("; and --origin-m is in m." if declared.origin_m is not None
-                 else "; and --at is in m." if declared.at else "."))
+    remark = f"{doubt} Then give --length-unit mm" + (
+        "; and --origin-m is in m." if declared.origin_m is not None
+        else "; and --at is in m." if declared.at else ".")
     return replace(file, imported=replace(
         file.imported, remarks=(*file.imported.remarks, remark)))
 
@@ -201,6 +200,7 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
     if path.suffix not in SUFFIXES.get(name, (path.suffix,)):
         raise OutputError(must_be("suffix", f"output {path}", " or ".join(SUFFIXES[name]),
                                   f"'{path.suffix}'"))
+    warn_of_millimetres(data)
     others = {suffix for each in ("vtu", "openpmd") for suffix in SUFFIXES[each]}
     if name not in SUFFIXES and path.suffix in others:
         raise OutputError(must_be("suffix", f"output {path}", f"one of text, as {name} is",

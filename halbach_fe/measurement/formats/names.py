@@ -165,6 +165,11 @@ def with_polar(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
                  for key, column in zip(keys, columns, strict=True))
 
 
+def is_latitude(column: ColumnName) -> bool:
+    """Return whether the name of a column is that of an angle from the plane z = 0."""
+    return _key(split_unit(column.text)[0]) in ("latitude", "lat", "elevation")
+
+
 def is_clock(column: ColumnName) -> bool:
     """Return whether the name of a column says that it holds times of day as numbers."""
     return _key(column.text) == "hhmmss"

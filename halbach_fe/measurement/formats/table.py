@@ -458,6 +458,11 @@ def _missing(
     missing: list[str] = []
     if (hint := _of_field(used, columns)) is not None:
         return [hint]
+    latitude = [column.text for column in columns if names.is_latitude(column)]
+    if latitude and not {"x", "y", "z", "theta"} & set(used):
+        return [f"the angle from the z axis: '{latitude[0]}' counts from the plane z = 0 (replace "
+                "it by a column theta of 90 degrees less it, beside r and phi; a component along "
+                "growing latitude is -Btheta)"]
     spherical = "theta" in used
     wanted = ("r", "theta", "phi") if spherical else (
         "r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
