@@ -52,10 +52,11 @@ def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
         return opened.load()
 
 
-def sheet_text(raw: bytes) -> bytes:
-    """Return the first sheet of an Excel workbook (.xlsx) that has cells as CSV in UTF-8.
+def sheet_text(raw: bytes) -> tuple[bytes, str, list[str]]:
+    """Return a sheet of an Excel workbook (.xlsx) as CSV in UTF-8, its name, and those of others.
 
-    Formulas have the values that the workbook was saved with.
+    It is the first one with two rows of numbers, else the first with cells; the others are all
+    that have such rows too. Formulas have the values that the workbook was saved with.
 
     Raises
     ------
@@ -76,16 +77,28 @@ def sheet_text(raw: bytes) -> bytes:
             if sum(part.file_size for part in packed.infolist()) > max_sheet:
                 raise ValueError(f"it unpacks to more than {max_sheet} bytes")
         book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
+        first: tuple[bytes, str] | None = None
+        found: tuple[bytes, str] | None = None
+        others = []
         for sheet in book.worksheets:
-            rows = [["" if cell is None else str(cell) for cell in row]
-                    for row in sheet.iter_rows(values_only=True)]
+            values = list(sheet.iter_rows(values_only=True))
+            rows = [["" if cell is None else str(cell) for cell in row] for row in values]
             width = max((n for row in rows for n, cell in enumerate(row, 1) if cell), default=0)
-            if width:
-                text = io.StringIO()
-                csv.writer(text, lineterminator="\n").writerows(
-                    [*row, *[""] * width][:width] for row in rows if any(row))
-                return text.getvalue().encode()
-    raise ValueError("it has no sheet with cells")
+            if not width:
+                continue
+            of_numbers = sum(sum(isinstance(cell, int | float) for cell in row) > 1
+                             for row in values) > 1
+            if of_numbers and found:
+                others.append(sheet.title)
+                continue
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows(
+                [*row, *[""] * width][:width] for row in rows if any(row))
+            first = first or (text.getvalue().encode(), sheet.title)
+            found = found or ((text.getvalue().encode(), sheet.title) if of_numbers else None)
+    if first is None:
+        raise ValueError("it has no sheet with cells")
+    return *(found or first), others
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

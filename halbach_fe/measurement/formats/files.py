@@ -112,8 +112,12 @@ def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
     if not look_like_mm(points).any():
         return file
     distance = float(np.linalg.norm(points, axis=1).max())
+    stated = file.format in READERS and not declared.length_unit
     remark = (f"The points lie up to {distance:.3g} m from the origin, where few magnets of "
-              "permanent blocks have a field. Are they in mm? Then give --length-unit mm"
+              "permanent blocks have a field. " + (
+                  f"Is {file.imported.length_units[0]}, the unit that the file states, right? "
+                  "--columns can name another, as in x[mm]" if stated else
+                  "Are they in mm? Then give --length-unit mm")
               + ("; and --origin-m is in m." if declared.origin_m is not None
                  else "; and --at is in m." if declared.at else "."))
     return replace(file, imported=replace(
