@@ -150,7 +150,8 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
     if unread := _unread(table, free):
         warnings.warn(f"Of {where} these are not read: {', '.join(unread)}. "
                       f"{'Free' if free else 'Measured'} blocks have no such quantity, or it "
-                      "follows from the others; --columns can name it otherwise.", HalbachWarning, stacklevel=2)
+                      "follows from the others; --columns can name it otherwise.", HalbachWarning,
+                      stacklevel=2)
     if free:
         return _free_blocks(table, declared)
     digest = hashlib.sha256(raw).hexdigest()
