@@ -240,14 +240,15 @@ def scalar_potential_column(
 
 
 def cross_section(
-    shapes: dict[str, tuple[occ.Face, float]], laws: dict[str, float | tuple[np.ndarray, np.ndarray]],
+    shapes: dict[str, tuple[occ.Face, float]],
+    laws: dict[str, float | tuple[np.ndarray, np.ndarray]],
     remanence: dict[str, tuple[float, float]], points: np.ndarray, far: float = 5.0,
     order: int = 3,
 ) -> np.ndarray:
     """B (n, 2) in T at points (n, 2) in m by the energy of the vector potential, to 1e-9.
 
-    ``shapes`` are faces with their largest element in m; ``laws`` a relative permeability, or B in T
-    and H in A/m, by name, 1 for the others and for air.
+    ``shapes`` are faces with their largest element in m; ``laws`` a relative permeability, or B in
+    T and H in A/m, by name, 1 for the others and for air.
     """
     mu_0 = 4e-7 * np.pi
     world = occ.Circle((0, 0), far).Face()
@@ -257,8 +258,8 @@ def cross_section(
         face.faces.name, face.maxh = name, size
         world = world - face
     world.faces.name = "air"
-    mesh = ngs.Mesh(occ.OCCGeometry(occ.Glue([*(face for face, _ in shapes.values()), world]), dim=2)
-                    .GenerateMesh(maxh=far / 3, grading=0.25))
+    glued = occ.Glue([*(face for face, _ in shapes.values()), world])
+    mesh = ngs.Mesh(occ.OCCGeometry(glued, dim=2).GenerateMesh(maxh=far / 3, grading=0.25))
     mesh.Curve(order)
     space = ngs.H1(mesh, order=order, dirichlet="far")
     slope = ngs.grad(space.TrialFunction())
