@@ -117,7 +117,8 @@ def field_map(
         raise MeasurementError(must_be(
             "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
             f"components out of {', '.join(COMPONENTS)}",
-            f"{points.shape} and {given.shape}, for {', '.join(map(str, components))}"))
+            f"{points.shape} and {given.shape}, for {', '.join(map(str, components))}",
+            "State which components are given, as in components=['x', 'y']."))
 
     def of_all(values: ArrayLike) -> Floats:
         """Return values of the components that are given (n, 3), NaN of the others."""
@@ -149,13 +150,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def taking_arrays(function: Function) -> Function:
     """Decorate a function of a magnet and a map, which then takes arrays for the map too: positions
-    (n, 3) in m, readings (n, 3) in T, and ``sigma_T``, as `field_map` does.
+    (n, 3) in m, readings (n, 3) in T, ``sigma_T`` and ``components``, as `field_map` does.
     """
     @wraps(function)
     def of_map_or_arrays(*arguments: Any, **options: Any) -> Any:
         match arguments:
             case magnet, points_m, B_T, *others if np.ndim(B_T):  # no session
-                data = field_map(points_m, B_T, options.pop("sigma_T", None))
+                data = field_map(points_m, B_T, options.pop("sigma_T", None),
+                                 components=options.pop("components", COMPONENTS))
                 return function(magnet, data, *others, **options)
         return function(*arguments, **options)
 
