@@ -251,11 +251,11 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def coordinates(text: str) -> dict[str, float]:
-    """Parse coordinates such as ``x=0,y=0``."""
+    """Parse coordinates such as ``x=0,y=0`` or ``r=0.01,z=0``."""
     values: dict[str, float] = {}
     for part in text.split(","):
         axis, _, value = part.partition("=")
-        if axis.strip() not in AXES:
+        if axis.strip() not in (*AXES, "r"):
             raise argparse.ArgumentTypeError(f"must be like x=0,y=0, not {text}")
         if axis.strip() in values:
             raise argparse.ArgumentTypeError(f"must give {axis.strip()} once, not {text}")
@@ -409,7 +409,8 @@ MAP_FORMAT = together(
            help="component of the field in a column B; abs if it is |B|, as of an NMR teslameter; "
            "unknown, if nobody knows it, for halbach-fe register to find"),
     option("--at", type=coordinates, default={}, metavar="AXIS=M,...",
-           help="constant coordinates in m that the file does not contain, for example x=0,y=0"),
+           help="constant coordinates in m that the file does not contain, for example x=0,y=0 or "
+           "r=0.01,z=0"),
     option("--origin-m", type=point, metavar="X,Y,Z",
            help="position in m of the file's origin, along the magnet's axes"),
     TABLE_FORMAT)

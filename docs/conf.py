@@ -31,6 +31,7 @@ napoleon_use_ivar = True  # an attribute whose default is a function is not docu
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_css_files = ["formulas.css"]
+html_show_copyright = False
 html_theme = "furo"
 html_title = f"halbach-fe {release}"
 # words of shapes are no cross-references; without execution no kernel tells a cell's language

@@ -57,6 +57,8 @@ on long text."""
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d{1,4})?", re.ASCII)
 """Decimal numbers as programs print them, including Fortran's exponent letter D."""
+WITHOUT_LETTER = re.compile(r"([-+]?\d*\.\d+)([-+]\d{3})", re.ASCII)
+"""A number of Fortran whose exponent of three digits leaves no place for the letter."""
 
 
 def decimals(value: float, digits: int = 3) -> str:
@@ -88,6 +90,8 @@ def parse_number(cell: str) -> float:
         If the cell holds no number, or an infinite one. ``1_000`` and digits of other scripts are
         refused as well, although Python's `float` accepts them.
     """
+    if len(cell) <= MAX_CELL and (without := WITHOUT_LETTER.fullmatch(cell)):
+        cell = f"{without[1]}e{without[2]}"
     if len(cell) > MAX_CELL or not NUMBER.fullmatch(cell):
         raise ValueError(cell)
     value = float(cell.replace("D", "e").replace("d", "e"))

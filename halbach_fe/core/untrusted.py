@@ -25,7 +25,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.core.errors import MAX_QUOTED, ExtraMissingError, HalbachWarning, printable
+from halbach_fe.core.errors import ExtraMissingError
 
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""
@@ -52,10 +52,11 @@ def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
         return opened.load()
 
 
-def sheet_text(raw: bytes) -> bytes:
-    """Return the first sheet of an Excel workbook (.xlsx) that has cells as CSV in UTF-8.
+def sheet_text(raw: bytes) -> tuple[bytes, str, list[str]]:
+    """Return a sheet of an Excel workbook (.xlsx) as CSV in UTF-8, its name, and those of others.
 
-    Formulas have the values that the workbook was saved with.
+    It is the first one with two rows of numbers, else the first with cells; the others are all
+    that have such rows too. Formulas have the values that the workbook was saved with.
 
     Raises
     ------
@@ -76,23 +77,28 @@ def sheet_text(raw: bytes) -> bytes:
             if sum(part.file_size for part in packed.infolist()) > max_sheet:
                 raise ValueError(f"it unpacks to more than {max_sheet} bytes")
         book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
-        full = [(sheet.title, rows) for sheet in book.worksheets if any(map(any, (rows := [
-            ["" if cell is None else str(cell) for cell in row]
-            for row in sheet.iter_rows(values_only=True)])))]
-    if not full:
+        first: tuple[bytes, str] | None = None
+        found: tuple[bytes, str] | None = None
+        others = []
+        for sheet in book.worksheets:
+            values = list(sheet.iter_rows(values_only=True))
+            rows = [["" if cell is None else str(cell) for cell in row] for row in values]
+            width = max((n for row in rows for n, cell in enumerate(row, 1) if cell), default=0)
+            if not width:
+                continue
+            of_numbers = sum(sum(isinstance(cell, int | float) for cell in row) > 1
+                             for row in values) > 1
+            if of_numbers and found:
+                others.append(sheet.title)
+                continue
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows(
+                [*row, *[""] * width][:width] for row in rows if any(row))
+            first = first or (text.getvalue().encode(), sheet.title)
+            found = found or ((text.getvalue().encode(), sheet.title) if of_numbers else None)
+    if first is None:
         raise ValueError("it has no sheet with cells")
-    (read, rows), *others = full
-    if others:
-        names = printable(", ".join(f"'{name}'" for name, _ in others), MAX_QUOTED)
-        title = printable(repr(read), MAX_QUOTED)
-        warnings.warn(f"Of the workbook only the sheet {title} is read, not {names}: "
-                      "move the one that is meant to the front, or save it as CSV.",
-                      HalbachWarning, stacklevel=2)
-    width = max(n for row in rows for n, cell in enumerate(row, 1) if cell)
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(
-        [*row, *[""] * width][:width] for row in rows if any(row))
-    return text.getvalue().encode()
+    return *(found or first), others
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -128,7 +128,8 @@ def field_map(
         raise MeasurementError(must_be(
             "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
             f"components out of {', '.join(COMPONENTS)}",
-            f"{points.shape} and {given.shape}, for {', '.join(map(str, components))}"))
+            f"{points.shape} and {given.shape}, for {', '.join(map(str, components))}",
+            "State which components are given, as in components=['x', 'y']."))
 
     def of_all(values: ArrayLike) -> Floats:
         """Return values of the components that are given (n, 3), NaN of the others."""
@@ -164,14 +165,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def taking_arrays(function: Function) -> Function:
     """Decorate a function of a magnet and a map, which then takes arrays for the map too: positions
-    (n, 3) in m, readings (n, 3) in T, and ``sigma_T``, as `field_map` does.
+    (n, 3) in m, readings (n, 3) in T, ``sigma_T`` and ``components``, as `field_map` does.
     """
     @wraps(function)
     def of_map_or_arrays(*arguments: Any, **options: Any) -> Any:
         match arguments:
             case magnet, points_m, B_T, *others if not isinstance(
-                    points_m, xr.Dataset | Mapping) and _is_array(B_T):
-                data = field_map(points_m, B_T, options.pop("sigma_T", None))
+                    points_m, xr.Dataset | Mapping) and _is_array(B_T):  # no session
+                data = field_map(points_m, B_T, options.pop("sigma_T", None),
+                                 components=options.pop("components", COMPONENTS))
                 _refuse_exchanged(magnet, data)
                 return function(magnet, data, *others, **options)
         return function(*arguments, **options)
@@ -740,14 +742,19 @@ def check_magnitudes(data: xr.Dataset) -> None:
                     "Correct it, or instrument.flux_density_unit_T of the study."))
 
 
-def doubt_of_metres(data: xr.Dataset) -> str:
-    """Return a sentence if the points of a map lie where few magnets have a field, else nothing."""
+def doubt_of_metres(data: xr.Dataset, unit: str = "") -> str:
+    """Return a sentence if the points of a map lie where few magnets have a field, else nothing.
+
+    ``unit`` is that which the file states.
+    """
     points = points_of(data)
     if not look_like_mm(points).any():
         return ""
     distance = float(np.linalg.norm(points, axis=1).max())
     return (f"The points lie up to {distance:.3g} m from the origin, where few magnets of "
-            "permanent blocks have a field. Are they in mm?")
+            "permanent blocks have a field. " + (
+                f"Is {unit}, the unit that the file states, right?" if unit else
+                "Are they in mm?"))
 
 
 def warn_of_millimetres(data: xr.Dataset) -> None:

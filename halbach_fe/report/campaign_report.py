@@ -161,7 +161,8 @@ class Campaign:
         trust = (
             "No: they do not all fit together, as is said below." if self.doubts else
             f"{self._verdict(left)}: they are of {self._studies}, and no file "
-            "was changed since. How far each can be trusted stands with it below.")
+            f"was changed since.{self._trust_of_update()} How far each can be trusted stands with "
+            "it below.")
         last = self._next()
         step = last.step if last else "Nothing that the results name is left to do."
         if loses:
@@ -223,6 +224,12 @@ class Campaign:
             return "No, for the reasons that stand below. But they belong together"
         names = in_a_row([f"folder {each}" for each in left])
         return f"Not {names}, for the reasons that stand below. The others, yes"
+
+    def _trust_of_update(self) -> str:
+        """Say in a sentence why the last update can be trusted; empty if it cannot."""
+        said = [answer.trust.removeprefix("Yes. ").partition(". ")[0].rstrip(".")
+                for _, answer in self._used("infer")[-1:] if answer.sound]
+        return "".join(f" Of the measured magnet: {one[:1].lower()}{one[1:]}." for one in said)
 
     def _newest(self) -> list[str]:
         """Return the last answer about the measured magnet that may be used, and before it that of

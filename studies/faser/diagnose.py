@@ -85,6 +85,8 @@ class Hypothesis:
 
 TERMINAL_COLUMNS = ("a profile of", "odds", "fringe", "homogeneous")
 """Columns of the table of hypotheses that fit a terminal of 80 characters."""
+ANSWER = 2
+"""Number of sentences, of where the profile lies and what that explains, above that table."""
 
 SHOWN_SHARE = 1e-3
 """Probability down to which it is shown in per cent."""
@@ -391,10 +393,12 @@ def run(arguments: argparse.Namespace) -> int:
         if not arguments.quick:
             common.say("comparing what the column may hold")
             fitted = columns_of(best, data)
-        rows = hypothesis_table(answers, published)
+        found, rows = (sentences(best, answers, fitted, published),
+                       hypothesis_table(answers, published))
+        for sentence in found[:ANSWER]:
+            common.say(sentence)
         common.print_table([{name: row[name] for name in TERMINAL_COLUMNS} for row in rows],
                            "Median relative error of B_x at held-out readings")
-        found = sentences(best, answers, fitted, published)
         for name, page in (("registration", registration.page(read_study(STUDY), data, poses)),
                            ("inferred", page_beside_the_paper(best.update, published, ()))):
             command = page.answer.command.replace("DIR/", f"DIR/{name}/").replace(
@@ -441,7 +445,7 @@ def run(arguments: argparse.Namespace) -> int:
                            "Where the profile lies in the cross-section")},
         files=dict.fromkeys(("profile.json", "measured.csv")), stored=False, stem="profile"),
         folder)
-    for sentence in found + left:
+    for sentence in found[ANSWER:] + left:
         common.say(sentence)
     common.say(f"Report: {folder / 'profile.html'}")
     return 0

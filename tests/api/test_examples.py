@@ -130,6 +130,8 @@ def test_missing_sections_and_parameters_are_seen():
 def test_the_functions_are_all_there():
     assert len(FUNCTIONS) >= 16
     assert set(hf.__all__) <= set(dir(hf))
+    assert len(set(dir(hf))) == len(dir(hf))
+    assert "importlib" not in dir(hf)
     with pytest.raises(AttributeError, match="no attribute"):
         _ = hf.nothing_like_it
 

@@ -200,6 +200,12 @@ def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator
     result = hf.infer(magnet, points, readings, sigma_T=2e-5)
     of_a_map = hf.infer(magnet, hf.field_map(points, readings, sigma_T=2e-5))
     assert np.array_equal(result.posterior.mean, of_a_map.posterior.mean)
+    two = {"components": ["x", "y"], "sigma_T": 2e-5}
+    of_two = hf.infer(magnet, points, readings[:, :2], **two)
+    assert np.array_equal(of_two.posterior.mean, hf.infer(magnet, hf.field_map(
+        points, readings[:, :2], **two)).posterior.mean)
+    with pytest.raises(hf.HalbachError, match=r"as in components=\['x', 'y'\]"):
+        hf.infer(magnet, points, readings[:, :2])
     with pytest.raises(hf.HalbachError, match=r"shapes \(n, 3\).*received \(119, 3\) and"):
         hf.explain(magnet, points[1:], readings, sigma_T=2e-5)
     sizes = np.linalg.norm(result.posterior.mean.reshape(-1, 3), axis=1) / np.linalg.norm(

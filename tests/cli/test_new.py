@@ -230,3 +230,19 @@ def test_new_study_can_be_measured(tmp_path, options):
     readings = observe(study, points, np.ones_like(points, bool))
     hidden = held_out_readings(study, readings)
     assert 0 < hidden.sum() < len(hidden) / 1.9
+
+
+def test_prisms_whose_outlines_begin_at_their_tip(tmp_path):
+    """Their origin is no middle of the block: the farthest corner is no size of a mesh."""
+    (tmp_path / "wedges.csv").write_text(
+        "name,shape,x_m,y_m,z_m,rotation_z_deg,size_z_m,outline_m,remanence_T\n" + "".join(
+            f"w{n},prism,0.02,0,0,{angle},0.03,0 0; 0.03 -0.008; 0.03 0.008,1.2\n".replace(
+                ",0.02,0,", f",{0.02 * np.cos(np.radians(angle)):.6f},"
+                f"{0.02 * np.sin(np.radians(angle)):.6f},")
+            for n, angle in enumerate((0, 90, 180, 270))))
+    study = tmp_path / "study.toml"
+    assert main(["new", str(study), "--free-blocks", str(tmp_path / "wedges.csv")]) == 0
+    magnet = build_magnet(read_study(study))
+    assert len(magnet.blocks) == 4
+    assert magnet.blocks[0].contains(np.array([[0.045, 0.0, 0.0], [0.015, 0.0, 0.0]])).tolist() == [
+        True, False]

@@ -120,6 +120,15 @@ def fluka(free=True):
     return text
 
 
+def around(degrees):
+    """Return points of a circle of 10 mm at z = 20 mm, and B there if Bx and By are Br and Bphi."""
+    angle = np.radians(degrees)
+    radial, azimuthal = FIELD[:, 0], FIELD[:, 1]
+    return (np.column_stack([0.01 * np.cos(angle), 0.01 * np.sin(angle), 0.02 + 0 * angle]),
+            np.column_stack([radial * np.cos(angle) - azimuthal * np.sin(angle),
+                             radial * np.sin(angle) + azimuthal * np.cos(angle), np.nan * angle]))
+
+
 MM_T_OPTIONS = {"length_unit": "mm", "field_unit": "T"}
 SIX = ("x", "y", "z", "Bx", "By", "Bz")
 BARE = ("--columns x,y,z,Bx,By,Bz", "--length-unit", "--field-unit")
@@ -374,6 +383,44 @@ FILES = [
             "Bz [T]\n" + table(",", [spherical()[one] for one in (0, 2, 1)] + [*FIELD.T]), {
                 "columns": ("r[mm]", "phi[deg]", "theta[deg]", "Bx[T]", "By[T]", "Bz[T]")},
             ("exchange theta and phi",)),
+    Foreign("Spanish names", "Posición x (mm);Posición y (mm);Posición z (mm);Campo Bx (G);"
+            "Campo By (G);Campo Bz (G)\n" + table(";", mm_T(1e3, 1e4))),
+    Foreign("French names, another word for each axis", "Abscisse x (mm);Ordonnée y (mm);"
+            "Cote z (mm);Composante x (mT);Composante y (mT);Composante z (mT)\n" + table(
+                ";", mm_T(1e3, 1e3))),
+    Foreign("Russian names and units", "X, мм;Y, мм;Z, мм;"
+            "Bx, мТл;By, мТл;Bz, мТл\n" + table(
+                ";", mm_T(1e3, 1e3))),
+    Foreign("marks of TeX", "$x$ [mm],$y$ [mm],$z$ [mm],$B_x$ [T],$B_{y}$ [T],$B_z$ [T]\n"
+            + table(",")),
+    Foreign("lowered letters", "x / mm;y / mm;z / mm;B\u2093 / T;B\u1d67 / T;B_z / T\n"
+            + table(";")),
+    Foreign("powers of ten", "x (10^-3 m),y (10**-3 m),z (10⁻³ m),Bx (10^-4 T),"
+            "By (10^{-4} T),Bz (10⁻⁴ T)\n" + table(",", mm_T(1e3, 1e4))),
+    Foreign("channels of a three-axis meter", "Pos X(mm)\tPos Y(mm)\tPos Z(mm)\tCh X (kG)\t"
+            "Ch Y (kG)\tCh Z (kG)\tVector (kG)\n" + table("\t", [*mm_T(1e3, 10), 10 * LENGTH])),
+    Foreign("field sampler, smoothed", "X (m)\tY (m)\tZ (m)\t|B| smoothed (T)\tB smoothed x (T)\t"
+            "B smoothed y (T)\tB smoothed z (T)\n" + table("\t", [*M_T[:3], LENGTH, *FIELD.T])),
+    Foreign("axes of a fluxgate, quoted decimal commas", '"Format",de-DE\n\n"Time [ms]",'
+            '"X-Axis [T]","Y-Axis [T]","Z-Axis [T]"\n' + "".join(
+                f"{n},{b}\n" for n, b in enumerate(",".join(
+                    f'"{value:.9E}"'.replace(".", ",") for value in row) for row in FIELD)),
+            {"decimal_comma": True, "positions": True}, ("--decimal-comma",)),
+    Foreign("Ansys Maxwell, components of a vector", "Grid Output Min: [-10mm -10mm -20mm]\n"
+            'X, Y, Z, Vector data "<Bx,By,Bz>"\n' + CARTESIAN,
+            {"length_unit": "m", "field_unit": "T"}, (*UNITS, "Bx, By, Bz")),
+    Foreign("MATLAB, a matrix in a script", "% x y z in mm, B in T\nB = [\n" + table(" ", end=";")
+            + "];\n", {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("Fortran, exponents of three digits", "x[m] y[m] z[m] Bx[T] By[T] Bz[T]\n" + table(
+        " ", M_T).replace(" 0 ", " 0.12345-103 ")),
+    Foreign("columns that are no component", "x[mm],y[mm],z[mm],By[T],Bx raw[T],Bz raw[T]\n"
+            + table(",", [*mm_T()[:3], *FIELD.T[[1, 0, 2]]]), {
+                "columns": ("x", "y", "z", "By", "Bx", "Bz")},
+            ("whether 'Bx raw[T]' and 'Bz raw[T]' are Bx and Bz",)),
+    Foreign("a circle of angles", "angle (deg),Br (mT),Bt (mT)\n" + table(",", [
+        8 * np.arange(45.0), 1e3 * FIELD[:, 0], 1e3 * FIELD[:, 1]]), {
+            "columns": ("phi[deg]", "Br", "Bphi"), "at": {"r": 0.01, "z": 0.02}},
+        ("--at r=0.01,z=0.01",), *around(8 * np.arange(45.0))),
     Foreign("the middle twice", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
             + "0,0,0,0.1,1e-6,0.05\n", points=np.vstack([POINTS, [[0, 0, 0]]]),
             field=np.vstack([FIELD, [[0.1, 1e-6, 0.05]]])),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import nullcontext
 
 import numpy as np
@@ -11,7 +12,16 @@ from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
-from tests.measurement.foreign_files import FIELD, FILES, LENGTH, POINTS, Foreign, mm_T, table
+from tests.measurement.foreign_files import (
+    FIELD,
+    FILES,
+    LENGTH,
+    POINTS,
+    TRIPLE,
+    Foreign,
+    mm_T,
+    table,
+)
 
 ROUNDED = 2e-6
 """Largest error in T: FLUKA's fixed columns and MATLAB's text hold four to eight digits, all others
@@ -74,6 +84,13 @@ def test_what_people_have(tmp_path, case: Foreign):
      "one for all components"),
     ("3 -1 0 1\n3 -1 0 1\n3 -2 0 2\n" + "0.1 0.2 0.3\n" * 9, "ASTRA.*from its three files"),
     ("3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + "0 0.1 0\n" * 45, "OPAL.*skip-lines 4"),
+    ("2 0.02\n2 -0.01 0.01\n2 -0.01 0.01\n1\n" + "0.1\n" * 27, "TraceWin.*x changes fastest"),
+    ("x[m] y[m] z[m] mf.Bx[T]\n" + "0 0 1 0.1+0i\n" * 2, r"real\(mf.Bx\)"),
+    ("x_mm,y_mm,z_mm,component,B_mT\n0,0,0,x,1\n0,0,0,y,2\n", "pivot table"),
+    ("x[mm],-1,0,1\ny[mm],0,0,0\nBx[T],1,2,3\n", "a row of its own, make it a column"),
+    ("\n".join(" ".join(str(n * m % 7) for m in range(40)) for n in range(6)), "row of its own"),
+    ("x[mm],y[mm],z[mm],dB0[ppm]\n0,0,0,12\n", r"\(1 \+ ppm / 1e6\) times"),
+    ("z,z,z,z,z,Bx\n" + "0,0,0,0,0,1\n" * 2, "'z' or 'z' or 'z' or 2 more"),
     (",-10,0,10\n-10,1,2,3\n0,1,2,3\n10,1,2,3\n", "matrix .* a row x, y, B"),
     ('[{"x": 0, "y": 0, "z": 0, "Bx": 0.1}]', "x, y, z, Bx, By, Bz of numbers for each point"),
 ], ids=str)
@@ -120,6 +137,29 @@ def test_magnitudes(tmp_path, text, asked, stated):
     found = import_map(path, DeclaredFormat(**stated)).data
     np.testing.assert_allclose(found["Babs_T"], LENGTH, atol=ROUNDED)
     np.testing.assert_allclose(points_of(found), POINTS, atol=1e-8)
+
+
+@pytest.mark.parametrize("header", [
+    "x[mm],y[mm],z[mm],Bx1[mT],By1[mT],Bz1[mT],Bx2[mT],By2[mT],Bz2[mT]",
+    "x[mm],y[mm],z[mm],X error[mT],Y error[mT],Z error[mT],a,b,c",
+    "X offset[mm],Y offset[mm],Z offset[mm],Bx[mT],By[mT],Bz[mT],a,b,c"])
+def test_axes_in_names_of_other_columns(tmp_path, header):
+    """Negative controls: two probes, deviations and offsets are no positions or components."""
+    path = tmp_path / "file.txt"
+    path.write_text(f"{header}\n1,2,3,4,5,6,7,8,9\n2,2,3,4,5,6,7,8,9\n")
+    with pytest.raises(MeasurementError, match="does not say"):
+        import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize(("unit", "stated", "advice"), [
+    ("m", {}, r"Is m, the unit.*x\[mm\]"), ("", {"length_unit": "m"}, "give --length-unit mm")])
+def test_points_far_away_say_what_can_be_followed(tmp_path, unit, stated, advice):
+    path = tmp_path / "file.txt"
+    path.write_text(f"x[{unit}],y[{unit}],z[{unit}],Bx[T],By[T],Bz[T]\n" + table(","))
+    found = import_map(path, DeclaredFormat(**stated))
+    assert re.search(advice, found.imported.remarks[-1])
+    followed = {"columns": TRIPLE} if unit else {"length_unit": "mm"}
+    assert same(import_map(path, DeclaredFormat(**followed)).data)
 
 
 def test_number_of_files():

@@ -9,6 +9,8 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.measurement.block_table import read_blocks
 from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.files import import_map
 from halbach_fe.study.free_blocks_file import read_free_blocks
 
 MU_0 = 4e-7 * np.pi
@@ -136,6 +138,21 @@ def test_an_option_that_would_have_no_effect_is_refused(tmp_path, text, declared
         imported(tmp_path, text, **declared)
 
 
+def test_free_blocks_without_names_and_with_edges_of_own_names(tmp_path):
+    """The warning names the columns; the units of the header hold beside --columns."""
+    text = ("x [mm],y [mm],z [mm],a [mm],b [mm],c [cm],Jx [T],Jy [T],Jz [mT]\n"
+            "10,-20,5,10,20,3,0,1.3,0\n30,20,5,10,20,3,0,1.2,100\n")
+    shape = {"fixed": {"shape": "cuboid"}}
+    with (pytest.raises(MeasurementError, match="needs size_x_m"),
+          pytest.warns(HalbachWarning, match=r"a \[mm\], b \[mm\], c \[cm\].*--columns can name")):
+        imported(tmp_path, text, **shape)
+    found = imported(tmp_path, text, columns=(
+        "at_x", "at_y", "at_z", "size_x", "size_y", "size_z", *(
+            f"polarization_{axis}" for axis in "xyz")), **shape)
+    assert (found.name, found.x_m, found.size_z_m) == (("1", "2"), (0.01, 0.03), (0.03, 0.03))
+    assert found.remanence_z_T == (0.0, 0.1)
+
+
 def test_columns_that_are_not_read_are_named(tmp_path):
     row = "Br [mT];{}\nb;cuboid;0;0;0;0;0;0;10;20;30;1300;{}\n"
     with pytest.warns(HalbachWarning, match="are not read: colour, temperature, volume. Free"):
@@ -174,14 +191,37 @@ def test_workbooks_and_the_command(tmp_path, capsys):
     book.save(tmp_path / "map.xlsx")
     assert main(["import-map", str(tmp_path / "map.xlsx"), "-o", str(tmp_path / "map.csv")]) == 0
     assert "0.001,0.002,0.003,0.1005" in (tmp_path / "map.csv").read_text()
-    assert "only the sheet" not in capsys.readouterr().err
-    book.create_sheet("other").append([1])
+    assert "the sheet" not in capsys.readouterr().err
+    other = book.create_sheet("other")
+    for row in ([1, 2], [3, 4]):
+        other.append(row)
     book.save(tmp_path / "two.xlsx")
     assert main(["import-map", str(tmp_path / "two.xlsx"), "-o", str(tmp_path / "two.csv")]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "only the sheet 'Sheet' is read, not 'other'" in said
+    assert "the sheet 'Sheet' is read; 'other' would have to be saved as CSV" in said
     raw = (tmp_path / "map.xlsx").read_bytes()
     (tmp_path / "map.xlsx").write_bytes(raw[:-200])
     capsys.readouterr()
     assert main(["import-map", str(tmp_path / "map.xlsx"), "-o", str(tmp_path / "no.csv")]) == 4
     assert "Save the sheet as CSV" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_sheet_with_the_numbers_is_read(tmp_path):
+    """A cover sheet is passed over; of two sheets with numbers the one that is read is named."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["Scan of magnet", 7])
+    sheet = book.create_sheet("Data")
+    for row in (["Hall scan"], ["x", "y", "z", "Bx"], ["mm", "mm", "mm", "mT"], [1, 2, 3, 100.5],
+                [1, 2, 4, 101]):
+        sheet.append(row)
+    path = tmp_path / "map.xlsx"
+    book.save(path)
+    found = import_map(path, DeclaredFormat()).data
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.1005, 0.101])
+    other = book.create_sheet("Other")
+    for row in ([1, 2], [3, 4]):
+        other.append(row)
+    book.save(path)
+    with pytest.warns(HalbachWarning, match="sheet 'Data' is read; 'Other' would have to be saved"):
+        assert import_map(path, DeclaredFormat()).data.equals(found)

@@ -484,6 +484,11 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert "Not to be trusted as it is: folder inferred." in alone.said
     assert alone.trust.startswith("Not folder inferred, for the reasons that stand below. The "
                                   "others, yes: they are of one study, and no file")
+    assert "Of the measured magnet" not in alone.trust
+    results(home / "sound", "infer", reads=[study, home / "map.csv"], answer=Answer(
+        "Like what?", "Good.", "Yes. Model and readings agree: chi² is 1. More.", "", ""))
+    assert "Of the measured magnet: model and readings agree: chi² is 1. How" in found_in(
+        home, "sound").answer.trust
     bad = found_in(home, "inferred").answer.trust
     assert bad.startswith("No, for the reasons that stand below. But they belong together: they")
     results(home / "better", "infer", another(instrument={"translation_m": [1e-3, 0, 0]}),

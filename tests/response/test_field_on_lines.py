@@ -6,6 +6,7 @@ import csv
 import json
 
 import magpylib
+import netgen.occ as occ
 import numpy as np
 import pytest
 from scipy.integrate import simpson
@@ -18,6 +19,7 @@ from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed
+from tests.oracles.ngsolve_model import cross_section
 
 MU_0 = 4e-7 * np.pi
 SIZE, PLACES, STRENGTH = 0.02, ((0.0, 0.03, 0.0), (0.0, -0.03, 0.0)), ((0, 1.3, 0), (0.2, 1.2, 0.1))
@@ -247,6 +249,47 @@ def test_inside_iron_of_a_cross_section(law):
         np.testing.assert_allclose(mu, 100.0, rtol=1e-9)
         np.testing.assert_allclose(strength_sd, found.sd[0] / 100, rtol=1e-9)
     np.testing.assert_allclose(found.root[0, ..., 0], stronger - field, rtol=0.03, atol=2e-5)
+
+
+@pytest.mark.parametrize(("inner", "line", "strongest"), [
+    (0.0, ([0.003, -0.0113, 0.0], [0.001, 0.0113, 0.0]), 0.52),
+    (0.0105, ([0.0112, -0.0035, 0.0], [0.0112, 0.0035, 0.0]), 1.97)])
+def test_bars_inside_iron_that_saturates(inner, line, strongest):
+    """Against NGSolve's curved elements of order 3: in a rod, and in the wall of a tube that is
+    saturated, at elements of 4 mm. Measured: the rms error is 0.33 and 0.70 of the rms bar of B, 84
+    and 67 % of the components are within their bars; of H 0.28, 0.53, 90 and 83 %.
+
+    Negative control: linear iron misses the bars.
+    """
+    shape = {"kind": "tube", "inner_radius_m": inner, "outer_radius_m": 0.012}
+    magnet = flat_magnet(iron={"bodies": [shape], "curve": {"kind": "steel", "name": "aisi_1010"}})
+    found = on_line(magnet, *line, 41)
+    assert set(found.in_block[0]) == {"iron 1"}
+    body = occ.Circle((0, 0), 0.012).Face()
+    if inner:
+        body = body - occ.Circle((0, 0), inner).Face()
+    shapes = {"iron": (body, 0.0015)} | {name: (occ.MoveTo(-SIZE / 2, y - SIZE / 2).Rectangle(
+        SIZE, SIZE).Face(), 0.004) for name, y in (("a", 0.03), ("b", -0.03))}
+    curve, steps = magnet.iron[0].law.reluctivity, np.linspace(0, 4, 4001)
+    remanence = {"a": (0, 1.3), "b": (0.2, 1.2)}
+
+    def by(law):
+        return cross_section(shapes, {"iron": law}, remanence, found.lines.points[0, :, :2])
+
+    expected = by((steps, steps * curve.coefficient(steps**2)))
+    size = np.linalg.norm(expected, axis=1, keepdims=True)
+    assert size.max() == pytest.approx(strongest, rel=0.01)
+    strength = MU_0 * curve.coefficient(size**2) * expected
+    for value, bar, right in (
+            (found.mean, found.error, expected),
+            (MU_0 * found.strength[0], found.strength_error, strength)):
+        error, bar = value[0, :, :2] - right, bar[0, :, :2]
+        assert np.mean(np.abs(error) <= bar) > 0.6
+        assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(bar**2))
+        assert bar.max() < 0.2 * np.abs(right).max()
+    if inner:
+        linear = by(1000.0) - expected
+        assert np.sqrt(np.mean(linear**2)) > 10 * np.sqrt(np.mean(found.error[0]**2))
 
 
 def test_integrals():

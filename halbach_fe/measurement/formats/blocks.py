@@ -149,7 +149,8 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
     if unread := _unread(table, free):
         warnings.warn(f"Of {where} these are not read: {', '.join(unread)}. "
                       f"{'Free' if free else 'Measured'} blocks have no such quantity, or it "
-                      "follows from the others.", HalbachWarning, stacklevel=2)
+                      "follows from the others; --columns can name it otherwise.", HalbachWarning,
+                      stacklevel=2)
     if free:
         return _free_blocks(table, declared)
     digest = hashlib.sha256(raw).hexdigest()
@@ -176,6 +177,9 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
                    if text != "-" and not name]:
         raise MeasurementError(must_be("--columns", where, f"made of {', '.join(QUANTITIES)} and -",
                                        f"'{unknown[0]}'"))
+    if declared.columns and start >= 0 and len(rows[start][1]) == len(header):
+        header = [(name, said or names.split_unit(own)[1].strip())  # the unit of the table holds
+                  for (name, said), own in zip(header, rows[start][1], strict=True)]
     body = [row for row in rows[start + 1:] if not row[2]]
     for number, row, _ in body:
         if len(row) != len(header):
@@ -258,7 +262,7 @@ def _strength(table: _Table) -> str:
 def _missing(table: _Table, free: bool) -> list[str]:
     """Return what the table does not say."""
     missing = []
-    if "serial" not in table:
+    if "serial" not in table and not free:
         missing.append("the serial or name of each block (a column serial)")
     strength = _strength(table)
     if not strength and "material" not in table:
@@ -359,8 +363,9 @@ def _whole(cell: str, name: str, line: int, table: _Table) -> int:
 
 def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
     """Return the table of free blocks."""
+    numbers = [str(number) for number, _ in enumerate(table.lines, 1)]  # names, if there are none
     columns: dict[str, list[object]] = {"name": [
-        re.sub(r"[^A-Za-z0-9_-]", "-", cell) for cell in table.cells["serial"]]}
+        re.sub(r"[^A-Za-z0-9_-]", "-", cell) for cell in table.cells.get("serial", numbers)]}
     for name in ("type", "shape", "material"):
         if name in table:
             columns[name] = [cell or None for cell in table.cells[name]]

@@ -47,7 +47,7 @@ from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
 
 MARKED = re.compile(r"(?i)^(variables\s*=|[;*$]\s)\s*|\s\*$")
 """What stands before a header: of Tecplot, of MAD-X, and of comments in other programs."""
-VECTOR = re.compile(r"(?i)vector data\b.*\bB_Vector\b.*")
+VECTOR = re.compile(r"(?i)vector data\W*b(_vector|x)?\b")
 SCALAR = re.compile(r"(?i)scalar data\b.*\bMag_?B\b.*")
 RECOGNIZED = 2
 """Smallest number of recognized names in a header. Fewer may be words of a sentence."""
@@ -140,9 +140,10 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
 
 
 def _refuse_grid_above(first: Sequence[Line], where: str) -> None:
-    """Raise MeasurementError for maps of OPAL and ASTRA whose first lines are the axes of a grid.
+    """Raise MeasurementError for maps whose first lines are the axes of a grid.
 
-    Those of ASTRA are a number of coordinates and the coordinates.
+    Those of ASTRA are a number of coordinates and the coordinates, those of TraceWin a number of
+    steps and the first and last coordinate, of z the last alone, and a factor.
     """
     axes = [line[:MAX_HEADER].split() for _, line in first]
     if axes and axes[0] and axes[0][0].startswith("3DMagnetoStatic"):
@@ -150,13 +151,16 @@ def _refuse_grid_above(first: Sequence[Line], where: str) -> None:
             "content", where, "rows with positions", "a map of OPAL, whose grid stands above them",
             "Add --skip-lines 4, --columns Bx[T],By[T],Bz[T] with its unit, and --positions TABLE: "
             "x, y and z of every row, in the order that its first line states."))
-    if len(axes) == 4 and len(axes[3]) != len(axes[0]) and all(
-            len(axis) > 2 and axis[0] == str(len(axis) - 1) and _rises(axis[1:])
-            for axis in axes[:3]):
+    astra = len(axes) == 4 and len(axes[3]) != len(axes[0]) and all(
+        len(axis) > 2 and axis[0] == str(len(axis) - 1) and _rises(axis[1:]) for axis in axes[:3])
+    tracewin = [len(axis) for axis in axes] == [2, 3, 3, 1] and all(
+        axis[0].isdigit() and _rises(axis[1:]) for axis in axes[:3])
+    if astra or tracewin:
         raise MeasurementError(must_be(
-            "content", where, "rows with positions", "a map of ASTRA, of one component on the grid "
-            "of its first three lines", "Write a table with a row x, y, z, Bx, By, Bz for every "
-            "point from its three files; each of their lines runs along x."))
+            "content", where, "rows with positions", f"a map of {'ASTRA' if astra else 'TraceWin'},"
+            " of one component on the grid of its first three lines", "Write a table with a row "
+            "x, y, z, Bx, By, Bz for every point from its three files, in which x changes fastest "
+            "and z slowest."))
 
 
 def _rises(cells: Sequence[str]) -> bool:
@@ -323,7 +327,7 @@ def _header(
     plain: tuple[ColumnName, ...] = ()
     for number, line in reversed(preface):
         for cells in map(_with_vector, _splits(line, delimiter)):
-            columns = tuple(names.parse(cell) for cell in cells)
+            columns = names.with_axes([names.parse(cell) for cell in cells])
             known = sum(bool(column.quantity) for column in columns)
             if len(cells) == count and not below and names.is_units(cells):
                 below = cells
@@ -353,8 +357,9 @@ def _splits(line: str, delimiter: str | None) -> list[list[str]]:
 
 def _with_vector(cells: list[str]) -> list[str]:
     """Return names in which a last one of a vector, as of Ansys Maxwell, is that of components."""
-    if cells and VECTOR.fullmatch(cells[-1][:MAX_LINE]):
-        return [*cells[:-1], *names.FIELDS[:3]]
+    vector = next((n for n, cell in enumerate(cells) if VECTOR.match(cell[:MAX_LINE])), None)
+    if vector is not None:
+        return [*cells[:vector], *names.FIELDS[:3]]
     if cells and SCALAR.fullmatch(cells[-1][:MAX_LINE]):
         return [*cells[:-1], names.TOTAL]
     return cells

@@ -109,10 +109,12 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
 
 def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
     """Return the file, with a remark if its points lie where few magnets have a field."""
-    doubt = doubt_of_metres(file.data)
+    stated = file.format in READERS and not declared.length_unit
+    doubt = doubt_of_metres(file.data, file.imported.length_units[0] if stated else "")
     if not doubt:
         return file
-    remark = f"{doubt} Then give --length-unit mm" + (
+    remark = f"{doubt} " + (
+        "--columns can name another, as in x[mm]" if stated else "Then give --length-unit mm") + (
         "; and --origin-m is in m." if declared.origin_m is not None
         else "; and --at is in m." if declared.at else ".")
     return replace(file, imported=replace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -37,7 +38,7 @@ ALIASES = {name.lower(): name for name in KNOWN} | {
     "xpos": "x", "ypos": "y", "zpos": "z", "posx": "x", "posy": "y", "posz": "z",
     "rho": "r", "radius": "r", "theta": "phi", "azimuth": "phi", "angle": "phi",
     "|b|": TOTAL, "bmod": TOTAL, "modb": TOTAL, "bnorm": TOTAL, "normb": TOTAL, "bmag": TOTAL,
-    "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL,
+    "btot": TOTAL, "btotal": TOTAL, "b0abs": TOTAL, "magb": TOTAL,
     "brho": "Br", "btheta": "Bphi", "field": "B", "fluxdensity": "B", "magneticfield": "B",
     "magneticfieldreading": "B", "fieldreading": "B", "b0": "B", "nmrfield": TOTAL} | {
     spelling.format(axis): name for axis, name in zip("xyz", FIELDS[:3], strict=True)
@@ -64,12 +65,19 @@ TEMPERATURES = frozenset(("c", "degc", "celsius", "k", "kelvin", "f", "degf"))
 NOISE_WORDS = frozenset((
     "sigma", "σ", "sd", "std", "stdev", "stddev", "err", "error", "unc", "uncertainty", "noise"))
 """Words in the name of a column that say that it is a standard deviation."""
+TWO_WORDS = re.compile(r"(?:std|standard)[\s_.]+dev(?:iation)?\b\.?")
+NO_AXIS = NOISE_WORDS | {"offset", "shift", "step", "size"}
+"""Words of a name that is no position or component, though an axis is among them."""
 GLUED = re.compile(r"(?:sigma|σ|std|stdev|err|error|unc|noise|delta|d|u)(b|b[xyzr]|bphi)"
                    r"|(b|b[xyzr]|bphi)(?:sigma|std|stdev|err|error|unc|noise)")
 """Names that join such a word and a component without a space: dBx, sigmaBx, Bxerr."""
 OF_FIELD = re.compile(r"\((B\w{0,4})\)")
 """The component in brackets in sigma(Bx)."""
 
+AXIS = re.compile(r"(?i)(?<![^\W\d_])b?([xyz])(?![^\W\d_])")
+"""An axis among the words of a name, as in Campo X, B smoothed x or Ch-Y."""
+TEX = str.maketrans({"\u1d67": "y"} | dict.fromkeys("$\\{}"))
+"""Marks of TeX in names, and the letter that stands for a lowered y, which Unicode lacks."""
 MAX_NAME = 60
 BRACKETS = re.compile(r"(.*?)\s*[\[(<]([^\[\]()<>]*)[\])>]\s*")
 PREFIX = re.compile(r"[a-z]\w*\.")  # of mf.Bx; -mf.Bx keeps its sign and is not recognized as Bx
@@ -102,6 +110,7 @@ def parse(text: str, stated: bool = False) -> ColumnName:
     if len(text) > MAX_NAME:
         return ColumnName(f"{text[:MAX_NAME]}...")
     base, unit = split_unit(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
+    base = unicodedata.normalize("NFKC", base.translate(TEX))  # lowered letters become plain ones
     key = _key(base)
     quantity = _measured(key, unit_symbol(unit)) or _other_quantity(base, key, unit.strip()) or (
         key if stated and key in STATED else "")
@@ -146,7 +155,7 @@ def noise_of(base: str, key: str) -> str | None:
     """
     if glued := GLUED.fullmatch(key):
         return ALIASES[glued[1] or glued[2]]
-    words = re.split(r"[\s_]+", base.lower().strip())
+    words = re.split(r"[\s_]+", TWO_WORDS.sub("std", base.lower().strip()))
     rest = [word for word in words if word not in NOISE_WORDS]
     if len(rest) == len(words):
         return None
@@ -168,6 +177,31 @@ def with_polar(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
 def is_latitude(column: ColumnName) -> bool:
     """Return whether the name of a column is that of an angle from the plane z = 0."""
     return _key(split_unit(column.text)[0]) in ("latitude", "lat", "elevation")
+
+
+def with_axes(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
+    """Return the columns, of which unknown ones are known by an axis among their words.
+
+    Those in a unit of length are positions, those in one of the field components, in whatever
+    language the words are: Posición x (mm). There must be one for each of x, y and z, and no known
+    column of the kind.
+    """
+    known = {column.quantity for column in columns}
+    renamed = list(columns)
+    for kind, quantities in (("length", POSITIONS), ("field", (*FIELDS, "B"))):
+        found = []
+        for index, column in enumerate(columns):
+            base, unit = split_unit(column.text)
+            axes = AXIS.findall(base)
+            of_kind = not column.quantity and kind_of(unit_symbol(unit)) == kind
+            if of_kind and len(axes) == 1 and not NO_AXIS & set(
+                    re.split(r"[\s_]+", base.lower())):
+                found.append((axes[0].lower(), index, unit))
+        if sorted(axis for axis, *_ in found) == ["x", "y", "z"] and not known & set(quantities):
+            for axis, index, unit in found:
+                renamed[index] = replace(columns[index], unit=unit, quantity=(
+                    axis if kind == "length" else f"B{axis}"))
+    return tuple(renamed)
 
 
 def is_clock(column: ColumnName) -> bool:

@@ -15,6 +15,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import in_a_row
 from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected, with_total_field
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
@@ -31,6 +32,7 @@ MAX_NUMBER = 1e30
 """Largest number that is accepted, in any unit. Larger values are placeholders for missing data, or
 would overflow."""
 NMR = "1 MHz of protons in water is a field of 0.0234872 T: Babs[0.0234872 T]"
+PPM = "ppm of a mean field are no field: write a column of (1 + ppm / 1e6) times that mean"
 PLACEHOLDER = "Where nothing was read, write nan."
 MOST_RAD = 4 * np.pi
 """Largest angle of a position, two turns: larger ones are in degrees."""
@@ -116,6 +118,7 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         other, or if the values are too large for a map of a permanent magnet.
     """
     columns = _with_times(_columns(table, declared), table)
+    _refuse_rows_of_components(table)
     missing: list[str] = []
     used = _used(columns, table, declared, missing)
     missing += _missing(used, columns, table, declared)
@@ -174,8 +177,8 @@ def _in_si(used: dict[str, int], unit_of: dict[str, str], table: ForeignTable) -
             line, cell = min(table.texts[column].values())
             raise MeasurementError(must_be(f"{name} in line {line}", table.where, "a number",
                                            f"'{cell[:40]}'", comma_hint(cell) or (
-                    PLACEHOLDER if name.startswith("B") else "If the line is no reading, remove "
-                    "it, or begin it with #.")))
+                    f"{f'{PLACEHOLDER} ' if name.startswith('B') else ''}If the line is no "
+                    f"reading, remove it, or begin it with #.")))
         _refuse_placeholder(table.values[:, column], name, table.where)
         si[name] = units.in_si(table.values[:, column], unit_of[name])
     return si
@@ -192,6 +195,22 @@ def _refuse_placeholder(values: Floats, name: str, where: str) -> None:
         raise MeasurementError(must_be(
             f"{name} of reading {row + 1}", where, f"a reading, below {MAX_NUMBER:g}",
             f"{values[row]:g}, which looks like a placeholder", PLACEHOLDER))
+
+
+def _refuse_rows_of_components(table: ForeignTable) -> None:
+    """Raise MeasurementError for a table that has each component of a reading in a row of its own.
+
+    A column of it holds the names of the components.
+    """
+    for column, cells in table.texts.items():
+        found = {cell.strip().lower() for _, cell in cells.values()}
+        if len(cells) == len(table.values) and len(found) > 1 and (
+                found <= {"x", "y", "z"} or found <= {"bx", "by", "bz", "babs", "|b|"}):
+            raise MeasurementError(must_be(
+                f"column {table.columns[column].text or column + 1}", table.where,
+                "absent, and each component a column of its own", "the name of a component in each "
+                "row", "Write one row for each point, in a spreadsheet by a pivot table, or by "
+                "pivot_table of pandas."))
 
 
 def _noise(
@@ -302,7 +321,12 @@ def _remarks(
     table: ForeignTable, declared: DeclaredFormat
 ) -> list[str]:
     """Return sentences about columns that were recognized though the user did not state them."""
-    said = ["The columns of H were read as B = mu_0 H, as it is in air."] if any(
+    plain = [names.parse(column.text) for column in columns]
+    by_axis = [one.text for one, other in zip(plain, names.with_axes(plain), strict=True)
+               if one != other]
+    said = [f"{_quoted(by_axis)} were read as positions or components, by their axes and units."
+            ] if by_axis and not declared.columns else []
+    said += ["The columns of H were read as B = mu_0 H, as it is in air."] if any(
         unit.rpartition(" ")[2] in units.H_FIELDS for unit in unit_of.values()) else []
     noise = [name for name in names.NOISE if name in used]
     own = any(column.text in ("sigma_T", "sigma_Bx_T", "sigma_By_T", "sigma_Bz_T")
@@ -403,6 +427,7 @@ def _used(
     Quantities of several columns are added to the descriptions in ``missing``.
     """
     used: dict[str, int] = {}
+    again: dict[str, list[str]] = {}
     for index, column in enumerate(columns):
         if not column.quantity:
             continue
@@ -412,11 +437,13 @@ def _used(
                 f"angles, '{columns[used['phi']].text}' and '{column.text}'",
                 "Name the angle from the z axis theta, and that about it phi, in --columns."))
         if column.quantity in used:
-            missing.append(f"its one column {column.quantity}: '"
-                           f"{columns[used[column.quantity]].text}' or '{column.text}' (--columns, "
-                           "- to ignore a column)")
+            again.setdefault(column.quantity, [columns[used[column.quantity]].text]).append(
+                column.text)
             continue
         used[column.quantity] = index
+    missing += [f"its one column {name}: {' or '.join(map(repr, texts[:3]))}"
+                f"{f' or {len(texts) - 3} more' if len(texts) > 3 else ''} (--columns, - to "
+                "ignore a column)" for name, texts in again.items()]
     components = [name for name in names.FIELDS if name in used]
     if declared.component and used:
         name = f"B{'z' if declared.component == UNKNOWN else declared.component}"  # Bx, Babs
@@ -451,7 +478,10 @@ def _missing(
                 + ("; if there are no positions, --columns Bx,By,Bz and --positions TABLE"
                    if len(columns) == len(COMPONENTS) else "")
                 + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
-                   if _is_matrix(table.values) else "") + ")"] + [
+                   if _is_matrix(table.values) else
+                   "; if every quantity has a row of its own, make it a column, in a spreadsheet "
+                   "by Paste Special, Transpose, or by numpy.transpose"
+                   if _is_transposed(table) else "") + ")"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
@@ -477,13 +507,17 @@ def _missing(
         missing.append("which component B is (--component x, y or z), whether it is |B| "
                        "(--component abs), or that nobody knows (--component unknown: halbach-fe "
                        "register then tries all three)")
+    elif (unread := _unread_components(used, columns, declared)):
+        missing.append(unread)
     elif not {*names.FIELDS, names.TOTAL} & set(used):
         others = [column.text for column in columns if column.text and not column.quantity]
         missing.append("which columns are Bx, By or Bz, Babs for |B|, or B for a component that "
                        "nobody knows, with --component unknown (--columns"
                        + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
                           if others else "")
-                       + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "") + ")")
+                       + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "")
+                       + (f"; {PPM}" if any("ppm" in text.lower() for text in others) else "")
+                       + ")")
     whole = ["Br", *(["Btheta"] if spherical else []), "Bphi"]
     half = [name for name in whole if name not in used]
     if half and half != whole:
@@ -494,12 +528,39 @@ def _missing(
     return missing
 
 
+def _unread_components(
+    used: dict[str, int], columns: Sequence[ColumnName], declared: DeclaredFormat
+) -> str:
+    """Return what to do where unknown columns in a unit of the field may be the components that the
+    known ones lack; empty if there are no such, or if the user names the columns.
+    """
+    lacking = [name for name in names.FIELDS[:3] if name not in used]
+    unknown = [column.text for column in columns if not column.quantity and units.kind_of(
+        units.unit_symbol(names.split_unit(column.text)[1])) == "field"]
+    if declared.columns or not 0 < len(lacking) < len(COMPONENTS) or len(unknown) != len(lacking):
+        return ""
+    return (f"whether {_quoted(unknown)} {'is' if len(lacking) == 1 else 'are'} "
+            f"{in_a_row(lacking)} (--columns; - ignores a column)")
+
+
+def _quoted(texts: Sequence[str]) -> str:
+    return in_a_row([f"'{text}'" for text in texts])
+
+
 def _is_matrix(values: Floats) -> bool:
     """Return whether the first row and column of numbers (n, m) grow or fall all along."""
     fewest = 3  # cells of an axis
     return min(values.shape) >= fewest and all(
         np.all(steps > 0) or np.all(steps < 0)
         for steps in (np.diff(values[0, 1:]), np.diff(values[1:, 0])))
+
+
+def _is_transposed(table: ForeignTable) -> bool:
+    """Return whether the rows may be quantities: they are few, or begin with the names of some."""
+    few = 12  # quantities of a reading
+    named = [names.parse(cell).quantity for _, cell in table.texts.get(0, {}).values()]
+    rows, columns = table.values.shape
+    return sum(map(bool, named)) > 1 or (rows <= few and columns > 2 * few)
 
 
 def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None:
@@ -520,8 +581,10 @@ def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None
 
 def _by_option(absent: Sequence[str]) -> str:
     """Return the options that provide absent coordinates."""
-    if "r" in absent or "phi" in absent:
+    if "phi" in absent:
         return "--columns"
+    if "r" in absent:
+        return f"--at {','.join(f'{name}=0.01' for name in absent)} in m, or --columns"
     if len(absent) == len(COMPONENTS):
         return "--positions TABLE with a row x, y, z for each reading, or --columns"
     return f"--at {','.join(f'{name}=0' for name in absent)} in m, or --columns"

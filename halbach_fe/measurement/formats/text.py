@@ -5,15 +5,16 @@ from __future__ import annotations
 import codecs
 import csv
 import re
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be, printable
 from halbach_fe.core.files import workbook_in
-from halbach_fe.core.numbers import MAX_CELL
+from halbach_fe.core.numbers import MAX_CELL, in_a_row
 from halbach_fe.core.numbers import parse_number as number_in
 from halbach_fe.measurement.formats.declared import DELIMITERS, DeclaredFormat
 
@@ -40,6 +41,9 @@ RUN_TOGETHER = re.compile(r"(\.\d+(?:[eEdD][-+]\d+)?)(?=[-+]\d*\.\d)")
 """A number that another one follows without a blank, as in columns of fixed width."""
 IN_LISTS = frozenset("0123456789+-.,;eE*^|[]{}() \t")
 """Characters of rows of numbers in the brackets of lists or between bars."""
+ENDED = re.compile(r"[^;]*[^;\s][ \t,]+[^;]*[^;\s][ \t,]+[^;]*[^;\s];\s*")
+"""A row of three cells or more that a semicolon ends."""
+COMPLEX = re.compile(r"[-+]?[\d.]+([eE][-+]?\d+)?[-+][\d.]+([eE][-+]?\d+)?\s*\*?[ij]")
 MAX_COMMENTS = 2000
 """Largest number of characters of comments that are kept."""
 
@@ -93,6 +97,8 @@ def _refuse_binary(raw: bytes, where: str) -> None:
 
 def undecorated(line: str) -> str:
     """Return a row of numbers without the brackets, bars and stars that some programs print."""
+    if ENDED.fullmatch(line[:MAX_COMMENTS]):  # as rows of a matrix in MATLAB
+        line = line.rstrip(" \t;")
     starred = line.strip().startswith("* ") and line.rstrip().endswith(" *")
     listed = any(mark in line for mark in "|[]{}") and IN_LISTS.issuperset(line)
     if len(line) > MAX_COMMENTS or not (starred or listed):
@@ -102,7 +108,9 @@ def undecorated(line: str) -> str:
 
 
 def text_of_table(raw: bytes, where: str) -> bytes:
-    """Return the content of a file, of a workbook its first sheet as CSV.
+    """Return the content of a file, of a workbook its first sheet with rows of numbers as CSV.
+
+    If others have such rows too, a warning says which was read.
 
     Raises
     ------
@@ -112,11 +120,16 @@ def text_of_table(raw: bytes, where: str) -> bytes:
     if workbook_in(raw) is None:
         return raw
     try:
-        return untrusted.sheet_text(raw)
+        text, sheet, others = untrusted.sheet_text(raw)
     except ValueError as error:
         raise MeasurementError(must_be(
             "content", where, "an Excel workbook that is whole", f"'{error}'",
             "Save the sheet as CSV.")) from None
+    if others:
+        names = in_a_row([f"'{printable(other, 60)}'" for other in others[:5]])
+        warnings.warn(f"Of {where} the sheet '{printable(sheet, 60)}' is read; {names} would have "
+                      "to be saved as CSV.", HalbachWarning, stacklevel=2)
+    return text
 
 
 def is_comment(line: str) -> bool:
@@ -255,4 +268,6 @@ def comma_hint(cell: str) -> str:
                 "sigma_Bx.")
     if re.fullmatch(r"[-+]?[\d.]*\d([eE][-+]?\d+)?\s*[^\W\d_]{1,5}", cell):
         return "Write the number alone, and its unit in the header, as in Bx[mT]."
+    if COMPLEX.fullmatch(cell):
+        return "Write real parts alone, in COMSOL as real(mf.Bx)."
     return ""

@@ -53,7 +53,9 @@ WORDS = {
     "n/am": "T", "n/(am)": "T", "m3": "m^3", "cm3": "cm^3", "cc": "cm^3", "ml": "cm^3",
     "mm3": "mm^3", "am2": "Am^2", "j/t": "Am^2", "mam2": "mAm^2", "emu": "emu",
     "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad",
-    "radians": "rad"}
+    "radians": "rad", "м": "m", "см": "cm", "мм": "mm", "мкм": "um", "тл": "T", "мтл": "mT",
+    "мктл": "uT", "гс": "G", "кгс": "kG", "米": "m", "厘米": "cm", "毫米": "mm", "特斯拉": "T",
+    "毫特": "mT", "毫特斯拉": "mT", "高斯": "G"}
 EXACT = {"T": "T", "mT": "mT", "uT": "uT", "µT": "uT", "μT": "uT", "nT": "nT", "G": "G",
          "kG": "kG", "mG": "mG"}
 
@@ -61,6 +63,9 @@ MARKS = re.compile(r"[\s.*·⋅^_{}]|\*\*")
 """What spellings of one unit differ in: V.s/m^2, V*s/m2, Vs/m²."""
 SCALED = re.compile(r"(\d{1,20}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,2})?)\s*[*x·]?\s*([^\d\s].*)")
 """A factor before a unit."""
+POWER = re.compile(r"10(?:\^|\*\*)\{?([-+]?\d{1,2})\}?|10([⁻⁺]?[⁰¹²³⁴⁵⁶⁷⁸⁹]{1,2})")
+"""A power of ten as a factor: 10^-4, 10⁻⁴."""
+RAISED = str.maketrans("⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹", "-+0123456789")
 
 SILENT = re.compile(r"(?i)-?|lengu|fluxu|[-+]?[\d.]+(e[-+]?\d+)?")
 """Texts in the place of a unit that state none: Opera's LENGU and FLUXU, a dash, or a factor."""
@@ -76,6 +81,8 @@ def unit_symbol(text: str) -> str:
     text = text.strip()
     if len(text) > max_unit:
         return ""
+    if power := POWER.match(text):
+        text = f"1e{power[1] or power[2].translate(RAISED)}{text[power.end():]}"
     if scaled := SCALED.fullmatch(text):
         unit, factor = unit_symbol(scaled[2]), float(scaled[1])
         return f"{factor:.12g} {unit}" if unit and unit not in ANGLES and factor > 0 else ""
