@@ -13,6 +13,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.campaign import as_read
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import row_order_note, sensor_positions
 from halbach_fe.measurement.scan_lines import goes_both_ways, motion
@@ -86,6 +87,23 @@ def test_the_way_of_a_stage():
     np.testing.assert_array_equal(motion(twice), np.repeat(way, 2, axis=0))
     line = np.array([[0.0, 0, z] for z in (0, 1, 2, 4, 5, 6, 10, 14, 15)])  # steps of many lengths
     np.testing.assert_array_equal(motion(line)[1:], np.tile([0.0, 0, 1], (8, 1)))
+
+
+def test_times_tell_the_way_of_a_table_that_was_sorted(session, generator):
+    """The update, and whether a lag is offered, are those of the rows as they were read."""
+    study = STUDY.with_(instrument={"lag_m": LAG_M})
+    data = map_of(SERPENTINE, LAG_M, generator)
+    data = data.assign_coords(time_s=("point", 2.0 * np.arange(len(SERPENTINE))))
+    table = data.isel(point=np.lexsort(SERPENTINE.T[::-1]))  # every line along z
+    assert Campaign.of(STUDY, table).places(LAG, STUDY)
+    mean = [infer(build_magnet(study), one, session).magnetizations["posterior_mean"].values
+            for one in (data, table, table.drop_vars("time_s"))]
+    np.testing.assert_allclose(mean[1], mean[0], atol=1e-9)
+    assert np.abs(mean[2] - mean[0]).max() > 1e-4  # the control: without the times
+    assert Campaign.of(STUDY, table.drop_vars("time_s")).places(LAG, STUDY) == []
+    # times that start again on every second line say nothing of the order
+    joined = data.assign_coords(time_s=("point", np.arange(len(SERPENTINE)) % (len(BODY) // 2)))
+    np.testing.assert_array_equal(as_read(joined)["B_T"].values, data["B_T"].values)
 
 
 def circles(angles, radii, heights, to_and_fro):
