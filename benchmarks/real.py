@@ -49,11 +49,15 @@ def overlap(note: Note) -> None:
         _do("check", *maps, "-o", Path(temporary) / "joined")
         found = json.loads((Path(temporary) / "joined" / "joined.json").read_text("utf-8"))
     (pose,) = found["poses"]
-    note("real.overlap_z_mm", 1e3 * pose["shift_m"][2], "mm",
+    note("real.overlap_z_mm", -1e3 * pose["shift_m"][2], "mm",
+         f"by which the second map's middle lies before its place on the first one's stage, "
          f"± {1e3 * pose['shift_sd_m'][2]:.3f}; one gain and 810 readings of the overlap alone "
          "say 252.460 ± 0.002; asked: within 0.05")
     note("real.joined_chi2", max(one["chi2"] for one in found["overlaps"]), "ratio",
-         "per reading of the overlap, predicted by the other map; asked: 0.8 to 1.2")
+         "per reading of the overlap, predicted by the other map; asked: 0.8 to 1.2. Left out: "
+         + "; ".join(f"{one['points']} rows of {one['name']} at {one['axis']} = "
+                     f"{1e3 * one['place_m']:.1f} mm, off by {1e3 * one['off_m']:.2f} mm"
+                     for one in found["displaced"]))
 
 
 def mri(note: Note) -> None:
@@ -180,6 +184,11 @@ def _note_second(note: Note, name: str, raw: str, checked: Path, both: Path) -> 
     note(f"{name}.overlap_chi2", overlap["chi2"], "per reading",
          f"{overlap['readings']} held-out readings of {raw} within the first map, by an update "
          "with the first map only")
+    for one in summary["regions_left_out"]:
+        note(f"{name}.left_out_over_floor_{one['name']}", one["over_noise"], "ratio",
+             f"{one['readings']} readings of the whole map, predicted by the update with the other "
+             f"one, over the noise that is stated: {1e6 * one['rms_T']:.0f} µT, chi² per reading "
+             f"{one['chi2']:.2g}; asked: 2 at most")
     floor = json.loads((checked / "check.json").read_text())["floor_rms_T"]
     rows, readings, mean = _held_out(both, "fringe")
     note(f"{name}.second_map_floor_mT", 1e3 * floor, "mT",
