@@ -31,6 +31,7 @@ from halbach_fe.measurement.joined_probe import (
     GAIN,
     PLACED_SD,
     TERMS,
+    TURN_RAD,
     JoinedModel,
     Pose,
     PosedCharges,
@@ -349,7 +350,7 @@ class Checked:
 
 def join_maps(
     maps: Mapping[str, xr.Dataset], say: Callable[[str], None] = lambda _: None,
-    progress: Progress | None = None,
+    progress: Progress | None = None, turn_rad: float = TURN_RAD,
 ) -> JoinedMaps:
     """Find where maps of one magnet lie to each other, without a model of the magnet.
 
@@ -361,6 +362,10 @@ def join_maps(
         Called with a description of each step before it starts.
     progress : callable, optional
         Called with the numbers of finished and of all parts of a step.
+    turn_rad : float, optional
+        Prior standard deviation of the turns of the stages against each other, from right angles.
+        Of one stage that was shifted between the maps it is some 0.001: overlaps at the end of
+        long maps hardly tell such a turn from a shift.
 
     Returns
     -------
@@ -393,7 +398,7 @@ def join_maps(
         check = check_map(data, say, progress)
         _refuse_disobedient(name, check)
         checked.append(Checked.of(name, data, check))
-    return join_checked(checked, Pace(say, progress))
+    return join_checked(checked, Pace(say, progress), turn_rad)
 
 
 def _refuse_disobedient(name: str, check: MapCheck) -> None:
@@ -412,7 +417,9 @@ def _refuse_disobedient(name: str, check: MapCheck) -> None:
             "that are not what they say."))
 
 
-def join_checked(maps: Sequence[Checked], pace: Pace) -> JoinedMaps:
+def join_checked(
+    maps: Sequence[Checked], pace: Pace, turn_rad: float = TURN_RAD
+) -> JoinedMaps:
     """Join maps that were checked, see `join_maps`."""
     pace.say("searching the places where the maps overlap")
     places = _places(maps)
@@ -420,10 +427,13 @@ def join_checked(maps: Sequence[Checked], pace: Pace) -> JoinedMaps:
             for one, (_, sign) in zip(maps, places, strict=True)]
     pace.say("fitting one field and all poses")
     poses = [pose for pose, _ in places]
-    joined = _Joined.of(maps, poses, pace)
+    if turn_rad < TURN_RAD:
+        poses = _as_stated(maps, poses)
+    joined = _Joined.of(maps, poses, pace, turn_rad)
     if displaced := joined.displaced():
         pace.say("fitting without rows of which the stage was elsewhere")
-        joined = _Joined.of([one.without(displaced) for one in maps], poses, pace)
+        joined = _Joined.of([one.without(displaced) for one in maps], poses, pace,
+                            turn_rad)
     terms, joined = joined.with_terms()
     overlaps = joined.overlaps()
     result = replace(joined.result([sign for _, sign in places], terms, overlaps),
@@ -688,7 +698,9 @@ class _Joined:
     width2: float
 
     @classmethod
-    def of(cls, maps: Sequence[Checked], starts: Sequence[Pose], pace: Pace) -> _Joined:
+    def of(
+        cls, maps: Sequence[Checked], starts: Sequence[Pose], pace: Pace, turn_rad: float
+    ) -> _Joined:
         """Fit the poses, and what the probes have in common by the checks of the single maps."""
         scans, chosen = [], []
         for number, one in enumerate(maps):
@@ -703,7 +715,7 @@ class _Joined:
         rows = np.concatenate(chosen)
 
         charges = Charges.around(*_around(maps, scans, starts))
-        model = JoinedModel(charges, [scan.model(charges) for scan in scans], starts)
+        model = JoinedModel(charges, [scan.model(charges) for scan in scans], starts, turn_rad)
         best = model.with_terms(_kept(maps, model))
         at = best.perfect()
         fit = best.fit(at, rows)
@@ -834,6 +846,8 @@ class _Joined:
         known = (whole @ vectors * share) @ (whole @ vectors).T / self.at.sigma**2
         by_prior, scale = np.ones(len(there)), np.ones(len(there))
         by_prior[places], scale[places] = 1 / START_OFF**2, wider
+        stated = places[self.model.any_sd[places] < np.tile(PLACED_SD[:6], len(places) // 6)]
+        by_prior[stated] = 1.0  # where a turn is known, the fit starts from there
         found = np.linalg.inv(known / np.outer(scale, scale) + np.diag(by_prior))
         sd = self.model.prior_sd[places]
         found = found[np.ix_(places, places)] * np.outer(sd, sd)
@@ -957,6 +971,17 @@ class _Joined:
                      else np.full((len(one.points), 3), one.check.noise_T))
             squares.append(sigma**2 @ (self.model.pose(self.at, number).turn**2).T)
         return np.asarray(np.sqrt(np.vstack(squares)))
+
+
+def _as_stated(maps: Sequence[Checked], poses: Sequence[Pose]) -> list[Pose]:
+    """Return poses that are turned by right angles only, with the overlaps where they are."""
+    found = []
+    for number, (one, pose) in enumerate(zip(maps, poses, strict=True)):
+        shared = _within_others(maps, poses, number, one.points)
+        middle = one.points[shared if shared.any() else slice(None)].mean(axis=0)
+        turn = np.round(pose.turn)
+        found.append(Pose(turn, pose.places(middle) - turn @ middle))
+    return found
 
 
 def _within_others(

@@ -222,6 +222,15 @@ def test_a_plane_that_the_stage_came_to_from_the_other_side(generator):
         assert not joined_of(control).displaced
 
 
+def test_a_shuffled_map_is_refused(generator):
+    """By its own check, and with a sentence that names it; as it was read, it is accepted."""
+    maps, _, _ = campaign(0, maps=2)
+    shuffled = maps["part1"].copy(deep=True)
+    shuffled["B_T"].values[:] = generator.permutation(shuffled["B_T"].values)
+    with pytest.raises(MeasurementError, match=r"'part1'.*obeys Maxwell's equations.*shuffled"):
+        join_maps({"part1": shuffled, "part0": maps["part0"]})
+
+
 def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     """The command, from files to the page; a map that fails its own check is refused."""
     maps, _, _ = campaign(1, maps=2)
@@ -250,6 +259,7 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     assert "<h2>Pictures</h2>" not in page  # it has none
     assert (out / "part1" / "check.json").exists()
     assert main(["check", str(tmp_path / "part0.csv"), str(tmp_path / "part0.csv")]) == 2
+    assert main(["check", str(tmp_path / "part0.csv"), "--turn-rad", "0.001"]) == 2
     with pytest.raises(StudyError, match="two maps or more"):
         join_maps({"part0": maps["part0"]})
     check = as_checked(maps)[0].check
@@ -344,6 +354,26 @@ def test_a_turn_about_a_far_dipole_is_not_determined(monkeypatch):
     monkeypatch.setattr(map_join, "FEIGNED", 0.0)
     joined = join_checked(maps, QUIET)
     assert np.abs(errors(joined, poses) / np.sqrt(np.diag(joined.covariance))).max() > 4
+
+
+def test_what_is_known_of_the_turn_of_a_stage(generator):
+    """It bounds the turn about a far pole, and with it the shift; the stage stood within it. The
+    control, a statement that is wrong, is contradicted by the readings.
+    """
+    maps, poses = coarse_maps(5, 1)
+    free, known = join_checked(maps, QUIET), join_checked(maps, QUIET, 0.01)
+    assert (known.poses[0].rotation_sd_rad < 0.0101).all()
+    assert (known.poses[0].shift_sd_m.max() < 0.2 * free.poses[0].shift_sd_m.max())
+    assert known.agree
+    assert known.poses[0].determined.all()
+    assert np.abs(over_bars(known, poses)).max() < 4
+    _, poses, magnet = campaign(0, maps=2)
+    maps = {"part0": read(magnet, poses[0], generator),
+            "part1": read(magnet, (poses[0][0] * Rotation.from_rotvec([0.01, 0, 0]), poses[1][1]),
+                          generator)}
+    assert joined_of(maps).agree
+    with pytest.raises(MeasurementError, match="noise explains"):
+        join_checked(as_checked(maps), QUIET, 1e-4)
 
 
 def test_two_far_dipoles_determine_a_pose():
