@@ -43,10 +43,13 @@ def emphatic(note: Note) -> None:
 
 
 def overlap(note: Note) -> None:
-    """Note where the second map of the dipole lies by the first one, without a magnet."""
-    maps = [_made("emphatic").joinpath(f"{name}.csv") for name in ("body", "fringe")]
+    """Note where the second map of the dipole lies by the first one, without a magnet.
+
+    One stage made both, and was shifted between them.
+    """
+    maps = [_made("emphatic", f"{name}.csv") / f"{name}.csv" for name in ("body", "fringe")]
     with tempfile.TemporaryDirectory() as temporary:
-        _do("check", *maps, "-o", Path(temporary) / "joined")
+        _do("check", *maps, "--turn-rad", "0.001", "-o", Path(temporary) / "joined")
         found = json.loads((Path(temporary) / "joined" / "joined.json").read_text("utf-8"))
     (pose,) = found["poses"]
     note("real.overlap_z_mm", -1e3 * pose["shift_m"][2], "mm",
@@ -108,12 +111,13 @@ def _do(*arguments: str | Path) -> None:
         raise HalbachError(f"halbach-fe {arguments[0]} failed; its message is above.")
 
 
-def _made(name: str) -> Path:
-    """Make a study of the Makefile from its raw maps to its page; return the folder of results.
+def _made(name: str, target: str = "measured/report.html") -> Path:
+    """Make a study of the Makefile from its raw maps to its page, or a part of it; return the
+    folder of results.
 
     What is up to date is not made again: remove the folder to measure anew.
     """
-    subprocess.run(["make", f"results/{name}/measured/report.html"], cwd=ROOT, check=True)
+    subprocess.run(["make", f"results/{name}/{target}"], cwd=ROOT, check=True)
     return ROOT / "results" / name
 
 

@@ -28,7 +28,7 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
-from halbach_fe.measurement.scan_lines import motion
+from halbach_fe.measurement.scan_lines import follows_times
 from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
@@ -174,7 +174,7 @@ def maps_of(
     if isinstance(data, xr.Dataset):
         middle = _middle(study, data)
         _refuse_copies(ONLY_MAP, data, study)
-        data = as_read(data)
+        refuse_unordered(ONLY_MAP, data, study)
         found = [Map(ONLY_MAP, data, study, middle, middle, ONLY_MAP, ONLY_MAP, ONLY_MAP)]
     else:
         found = []
@@ -182,9 +182,9 @@ def maps_of(
             own = study.of_map(number)
             middle = _middle(own, data[one.name])
             _refuse_copies(one.name, data[one.name], own)
-            found.append(Map(one.name, as_read(data[one.name]), own, middle, middle,
-                             one.probe or one.name, one.stage or one.name, one.name,
-                             one.stage_shift_sd_m))
+            refuse_unordered(one.name, data[one.name], own)
+            found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
+                             one.stage or one.name, one.name, one.stage_shift_sd_m))
         _refuse_repeated(found)
         _refuse_mixed_probes(found)
     if validation_map is not None:
@@ -192,28 +192,28 @@ def maps_of(
         own = study_for_validation_map(study.with_(maps=()), validation_map)
         first = found[0]
         _refuse_copies(VALIDATION_MAP, validation_map, own)
+        refuse_unordered(VALIDATION_MAP, validation_map, own)
         shared = not study.maps  # with the only map; among several it has an instrument of its own
         middle = _middle(own, validation_map)
         found.append(Map(
-            VALIDATION_MAP, as_read(validation_map), own, middle, middle, *(
+            VALIDATION_MAP, validation_map, own, middle, middle, *(
                 (first.probe, first.pose, first.offsets) if shared else (VALIDATION_MAP,) * 3),
             is_validation=True))
     return with_pivots(found)
 
 
-def as_read(data: xr.Dataset) -> xr.Dataset:
-    """Return a map in the order in which its rows were read, if it has times that tell it.
+def refuse_unordered(name: str, data: xr.Dataset, study: Study) -> None:
+    """Raise a MeasurementError if a study has a lag, and a map's rows are not as they were read.
 
-    A lag is along the way of the stage, which a table that was sorted does not show. Times that
-    start again in every scan of a joined table, by which the stage would jump, order nothing.
+    A lag is along the way of the stage, from row to row.
     """
-    if "time_s" not in data:
-        return data
-    points, time = points_of(data), data["time_s"].values
-    order = np.argsort(time, kind="stable")
-    moved, as_given = (np.count_nonzero(motion(one).any(axis=1))
-                       for one in (points[order], points))
-    return data.isel(point=order) if moved > as_given / 2 else data
+    if not study.instrument.lag_m or "time_s" not in data or follows_times(
+            points_of(data), data["time_s"].values):
+        return
+    raise MeasurementError(must_be(
+        f"rows of `{name}`", f"study {study.name}", "in the order of the column time_s, since the "
+        "study states a lag of the readings behind the stage (instrument.lag_m)",
+        "rows between which the stage moved otherwise", "Sort the table by time_s."))
 
 
 def check_maps(study: Study, data: object) -> xr.Dataset | dict[str, xr.Dataset]:

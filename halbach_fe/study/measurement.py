@@ -49,8 +49,8 @@ class Instrument(StudyModel):
     ``1 + z_scale`` and lowers y by the sag of the arm, which grows with the square of the distance
     from the map's smallest z and is ``arm_sag_m`` at its largest z. It displaces every point by
     ``lag_m`` against the step from the row before, but for the first of a line or circle: rows are
-    in the order of the scan, which a column time_s may state. T rotates by the rotation vector
-    ``rotation_rad`` about the origin, then translates by ``translation_m``.
+    in the order of the scan. T rotates by the rotation vector ``rotation_rad`` about the origin,
+    then translates by ``translation_m``.
 
     Readings. With B' the components of B along the rotated axes, the reading of component i is
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
