@@ -189,10 +189,11 @@ def _note_second(note: Note, name: str, raw: str, checked: Path, both: Path) -> 
          f"{overlap['readings']} held-out readings of {raw} within the first map, by an update "
          "with the first map only")
     for one in summary["regions_left_out"]:
-        note(f"{name}.left_out_over_floor_{one['name']}", one["over_noise"], "ratio",
-             f"{one['readings']} readings of the whole map, predicted by the update with the other "
-             f"one, over the noise that is stated: {1e6 * one['rms_T']:.0f} µT, chi² per reading "
-             f"{one['chi2']:.2g}; asked: 2 at most")
+        own = json.loads((checked.parent / one["name"] / "check.json").read_text())
+        note(f"{name}.left_out_over_floor_{one['name']}",
+             one["rms_T"] / own["floor_rms_T"], "ratio", f"{one['readings']} readings of the whole map, predicted by the update with the other "
+             f"one to {1e6 * one['rms_T']:.0f} µT; {one['over_noise']:.2g} times the noise that is "
+             f"stated, chi² per reading {one['chi2']:.2g}; asked: 2 at most")
     floor = json.loads((checked / "check.json").read_text())["floor_rms_T"]
     rows, readings, mean = _held_out(both, "fringe")
     note(f"{name}.second_map_floor_mT", 1e3 * floor, "mT",
