@@ -104,8 +104,11 @@ results/mri4all/measured/report.html: results/mri4all/registered/registration.ht
 results/mri4all/diagnosed/diagnosis.html: results/mri4all/measured/report.html
 	.venv/bin/halbach-fe diagnose results/mri4all/registered/study.registered.toml -o $(@D) \
 	    --measurements results/mri4all/check/corrected_map.csv --check results/mri4all/check/check.json
-results/emphatic/measured.html: results/emphatic/measured/report.html
-	.venv/bin/halbach-fe report $(addprefix results/emphatic/,body fringe registered measured) -o $@
+# One stage was shifted between both maps: where they overlap, they test it without a magnet.
+results/emphatic/joined/joined.html: results/emphatic/body.csv results/emphatic/fringe.csv
+	.venv/bin/halbach-fe check $^ --turn-rad 0.001 -o $(@D)
+results/emphatic/measured.html: results/emphatic/measured/report.html results/emphatic/joined/joined.html
+	.venv/bin/halbach-fe report $(addprefix results/emphatic/,joined registered measured) -o $@
 results/mri4all/measured.html: results/mri4all/diagnosed/diagnosis.html
 	.venv/bin/halbach-fe report $(addprefix results/mri4all/,check registered measured diagnosed) -o $@
 

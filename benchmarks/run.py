@@ -69,11 +69,12 @@ def main() -> None:
     results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
 
     def note(name: str, value: float, unit: str, against: str) -> None:
+        rounded = float(f"{value:.{6 if unit == 'mm' else 3}g}")  # a place of 252 mm, to 1 µm
         results[name] = {
-            "value": float(f"{value:.3g}"), "unit": unit, "compared_with": against,
+            "value": rounded, "unit": unit, "compared_with": against,
             "date": datetime.date.today().isoformat(),
             "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
-        common.say(f"{name} = {value:.3g} {unit}")
+        common.say(f"{name} = {rounded:g} {unit}")
 
     for part in chosen:
         PARTS[part](note)

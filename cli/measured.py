@@ -65,6 +65,9 @@ if TYPE_CHECKING:
     option("others", type=input_file, metavar="MAP", nargs="*",
            help="other maps of the same magnet, to be joined with the first one"),
     option("-o", "--output", type=path, metavar="DIR", help="folder for the page and its files"),
+    option("--turn-rad", metavar="SD", type=within(positive_number, 0, math.pi / 2),
+           help="prior standard deviation of the turns of several maps against each other "
+           "(default: 0.05); of one stage that was only shifted it is some 0.001"),
     JSON, map_format("MAP"))
 def check(arguments: argparse.Namespace) -> int:
     """Check a field map against Maxwell's equations, before any magnet.
@@ -90,6 +93,10 @@ def check(arguments: argparse.Namespace) -> int:
     from halbach_fe.report import map_check
 
     files = [arguments.map, *arguments.others]
+    if arguments.turn_rad and not arguments.others:
+        raise CommandLineError(must_be(
+            "--turn-rad", "the command line", "left out for a single map", "given",
+            "It is of maps that are joined."))
     if arguments.others:
         arguments.listed_maps = _by_name(files)
     maps = [common.read_one(arguments, file) for file in files]
@@ -98,10 +105,12 @@ def check(arguments: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
     with common.progress_bar("checking") as show:
         if arguments.others:
+            from halbach_fe.measurement.joined_probe import TURN_RAD
             from halbach_fe.measurement.map_join import join_maps
 
             named = dict(zip(arguments.listed_maps, maps, strict=True))
-            page = map_check.joined_page(named, join_maps(named, say, show))
+            page = map_check.joined_page(named, join_maps(
+                named, say, show, arguments.turn_rad or TURN_RAD))
         elif is_total_field(maps[0]):
             from halbach_fe.measurement.total_check import check_total
 

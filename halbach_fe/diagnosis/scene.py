@@ -33,6 +33,7 @@ from halbach_fe.measurement.instrument import (
     probe_points,
     sensor_matrix,
 )
+from halbach_fe.measurement.scan_lines import follows_times
 from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS
 from halbach_fe.study.model import Study
 
@@ -80,7 +81,8 @@ class ScannedMap:
     def can_have(self, effect: Effect, place: Place, study: Study) -> bool:
         """Tell whether the map can show an effect, and be corrected for it.
 
-        |B| has one sensor, without axes; a planar Hall effect needs all components.
+        |B| has one sensor, without axes; a planar Hall effect needs all components, and a lag rows
+        in the order in which they were read.
         """
         if not effect.can_show(self.points):
             return False
@@ -89,6 +91,8 @@ class ScannedMap:
         try:
             for values in np.diag([parameter.sd for parameter in effect.parameters]).tolist():
                 instrument = effect.apply(study, place, values).instrument
+                if instrument.lag_m and not follows_times(self.points, self.time):
+                    return False
                 if self.is_total:
                     check_total_field(instrument)
                 else:

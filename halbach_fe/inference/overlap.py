@@ -16,12 +16,13 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.readings import Readings
-from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, LeftOut, Overlap
+from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, LeftOut, Overlap, Stretch
 from halbach_fe.measurement.scan_lines import point_spacing
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import Rows
 from halbach_fe.stats.noise import NoiseCovariance
+from halbach_fe.study.types import COMPONENTS
 
 NEAR = 0.87
 """Distance from the nearest point of another map, in units of that map's spacing, up to which maps
@@ -29,6 +30,12 @@ overlap: half the diagonal of a cell of its grid."""
 
 END = 0.15
 """Part of the length of a single map that is left out at each end."""
+
+ENOUGH = 20
+"""Fewest readings that are left out, and that are left: chi-squared of 20 has a sd of a third."""
+
+STRETCHES = 7
+"""Number of parts of a map that was left out, along its longest axis, that are told apart."""
 
 
 def overlaps(
@@ -89,13 +96,11 @@ def left_out(
     that with these terms fitted to the map itself.
     """
     found = []
-    # fewest readings that are left out, and that are left: chi-squared of 20 has a sd of a third
-    enough = 20
     # largest number of readings that are compared: chi-squared of 4 000 is known to 2 %
     most = 4000
     for name, chosen in _regions(readings).items():
         rows, index = np.flatnonzero(readings.training & ~chosen), np.flatnonzero(chosen)
-        if min(len(rows), len(index)) < enough:
+        if min(len(rows), len(index)) < ENOUGH:
             continue
         index = index[::-(-len(index) // most)]
         updated = linear_gaussian.update(
@@ -107,9 +112,26 @@ def left_out(
             len(rows), response.shape[1])], axis=0)
         fitted = linear_gaussian.update(response, residual[index], noise, updated).distribution
         off = off - response[:, own] @ (fitted.mean - updated.mean)[own]
-        found.append(LeftOut(name, len(index), float(np.sqrt(np.mean(off**2))),
-                             float(np.sqrt(np.mean(noise.sd**2))), float(np.mean(white**2))))
+        found.append(LeftOut(name, len(index), _rms(off), _rms(noise.sd), float(np.mean(white**2)),
+                             _stretches(readings.observation.places[index], off, noise.sd)))
     return tuple(found)
+
+
+def _stretches(places: Floats, off: Floats, noise: Floats) -> tuple[Stretch, ...]:
+    """Return how far readings (n,) at places (n, 3) in m are off, along their longest axis."""
+    axis = int(np.argmax(np.ptp(places, axis=0)))
+    along = places[:, axis]
+    limits = np.linspace(along.min(), along.max(), STRETCHES + 1)[1:-1]
+    owner = np.searchsorted(limits, along)
+    return tuple(
+        Stretch(COMPONENTS[axis], float(along[rows].min()), float(along[rows].max()), len(rows),
+                _rms(off[rows]), _rms(noise[rows]))
+        for rows in (np.flatnonzero(owner == number) for number in range(STRETCHES))
+        if len(rows) >= ENOUGH)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _regions(readings: Readings) -> dict[str, NDArray[np.bool_]]:

@@ -31,6 +31,7 @@ from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration, StagePose
 from halbach_fe.inference.pose_search import coarse_poses
 from halbach_fe.inference.pose_space import right_angles
+from halbach_fe.measurement.campaign import refuse_unordered
 from halbach_fe.measurement.field_map import checked_map, directed, is_undirected, taking_arrays
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
@@ -108,6 +109,7 @@ def register(
     array([0.   , 0.   , 0.001])
     """
     data = checked_map(data, "`data`")
+    refuse_unordered("data", data, magnet.study)
     prior = pose or PosePrior()
     probe = probe or ProbePrior.of(magnet.study.instrument_sd)
 

@@ -76,6 +76,9 @@ TOO_FAR = 1.3
 """chi-squared per held-out reading, with the covariance of the predictions, up to which there is no
 word however many readings there are: error bars are then too small by a seventh."""
 
+WELL_KNOWN = 2.0
+"""rms of what was left out, in units of its noise, up to which the magnet is known there."""
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -243,6 +246,40 @@ class Overlap:
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """How readings that were left out are predicted where they lie between two planes.
+
+    Attributes
+    ----------
+    axis : str
+        Of the magnet, along which the readings that were left out are longest.
+    from_m, to_m : float
+        Of the readings there, along this axis.
+    readings : int
+    rms_T, noise_T : float
+        As those of `LeftOut`.
+    """
+
+    axis: str
+    from_m: float
+    to_m: float
+    readings: int
+    rms_T: float
+    noise_T: float
+
+    @property
+    def over_noise(self) -> float:
+        """The rms difference in units of the noise."""
+        return self.rms_T / self.noise_T
+
+    @property
+    def where(self) -> str:
+        """The place in words."""
+        low, high = (f"{1e3 * each:.0f}".replace("-", "−") for each in (self.from_m, self.to_m))
+        return f"{self.axis} = {low} to {high} mm"
+
+
+@dataclass(frozen=True)
 class LeftOut:
     """How an update that has not seen a whole map, or the ends of the only one, predicts it.
 
@@ -257,6 +294,8 @@ class LeftOut:
         Rms of noise and solver error of these readings.
     chi2 : float
         Chi-squared per reading, by the covariance of prediction, noise and instruments.
+    stretches : tuple of Stretch
+        The same along the magnet or across it.
     """
 
     name: str
@@ -264,6 +303,7 @@ class LeftOut:
     rms_T: float
     noise_T: float
     chi2: float
+    stretches: tuple[Stretch, ...] = ()
 
     @property
     def over_noise(self) -> float:
@@ -271,12 +311,21 @@ class LeftOut:
         return self.rms_T / self.noise_T
 
     @property
+    def worst(self) -> Stretch | None:
+        """Where the prediction is farthest off, if it is farther off there than twice the noise."""
+        worst = max(self.stretches, key=lambda one: one.over_noise, default=None)
+        return worst if worst is not None and worst.over_noise > WELL_KNOWN else None
+
+    @property
     def in_words(self) -> str:
         """What was left out, and how well it is predicted."""
         what = (f"Map {self.name}, left out, is predicted by the others" if self.name else
                 "The ends of the map, left out, are predicted by its middle")
+        where = "" if self.worst is None else (
+            f", the worst {decimals(self.worst.over_noise, 2)} times at {self.worst.where} of the "
+            "magnet")
         return (f"{what} to {decimals(self.over_noise, 2)} times its noise (chi² per reading "
-                f"{decimals(self.chi2, 2)})")
+                f"{decimals(self.chi2, 2)}{where})")
 
     @property
     def disagreement(self) -> str:
@@ -620,15 +669,12 @@ class InferenceResult(ShownInNotebook):
 
         It holds for whatever is computed from the posterior.
         """
-        # rms of a map that was left out, in units of its noise, up to which its magnet is known
-        # there.
-        well = 2.0
         if self.disagreement:
             return Reservation()
         if self.held_back:
             measured = self.measured_blocks is not None
             return Reservation(f"Only in part. {held_back_in_words(self.held_back, measured)}")
-        wide = [one for one in self.regions_left_out if one.name and one.over_noise > well]
+        wide = [one for one in self.regions_left_out if one.name and one.over_noise > WELL_KNOWN]
         if wide:
             return Reservation(f"Only in part. {wide[0].in_words}: where no map lies, the magnet "
                                "is known no better than its error bars say.")

@@ -262,8 +262,9 @@ def inference_summary(update: InferenceResult) -> dict[str, object]:
                           else update.magnetic_axis.summary()),
         "overlaps": [asdict(each) | {"disagreement": each.disagreement}
                      for each in update.overlaps],
-        "regions_left_out": [asdict(each) | {"over_noise": each.over_noise,
-                                             "disagreement": each.disagreement}
-                             for each in update.regions_left_out],
+        "regions_left_out": [asdict(each) | {
+            "over_noise": each.over_noise, "disagreement": each.disagreement,
+            "stretches": [asdict(one) | {"over_noise": one.over_noise} for one in each.stretches]}
+            for each in update.regions_left_out],
         "scores": [asdict(score) for score in update.scores],
     }

@@ -28,6 +28,7 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, turn_of
 from halbach_fe.measurement.observation import study_for_validation_map
+from halbach_fe.measurement.scan_lines import follows_times
 from halbach_fe.study.maps import InstrumentSd
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import MIN_SIGMA_T
@@ -173,6 +174,7 @@ def maps_of(
     if isinstance(data, xr.Dataset):
         middle = _middle(study, data)
         _refuse_copies(ONLY_MAP, data, study)
+        refuse_unordered(ONLY_MAP, data, study)
         found = [Map(ONLY_MAP, data, study, middle, middle, ONLY_MAP, ONLY_MAP, ONLY_MAP)]
     else:
         found = []
@@ -180,6 +182,7 @@ def maps_of(
             own = study.of_map(number)
             middle = _middle(own, data[one.name])
             _refuse_copies(one.name, data[one.name], own)
+            refuse_unordered(one.name, data[one.name], own)
             found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
                              one.stage or one.name, one.name, one.stage_shift_sd_m))
         _refuse_repeated(found)
@@ -189,6 +192,7 @@ def maps_of(
         own = study_for_validation_map(study.with_(maps=()), validation_map)
         first = found[0]
         _refuse_copies(VALIDATION_MAP, validation_map, own)
+        refuse_unordered(VALIDATION_MAP, validation_map, own)
         shared = not study.maps  # with the only map; among several it has an instrument of its own
         middle = _middle(own, validation_map)
         found.append(Map(
@@ -196,6 +200,20 @@ def maps_of(
                 (first.probe, first.pose, first.offsets) if shared else (VALIDATION_MAP,) * 3),
             is_validation=True))
     return with_pivots(found)
+
+
+def refuse_unordered(name: str, data: xr.Dataset, study: Study) -> None:
+    """Raise a MeasurementError if a study has a lag, and a map's rows are not as they were read.
+
+    A lag is along the way of the stage, from row to row.
+    """
+    if not study.instrument.lag_m or "time_s" not in data or follows_times(
+            points_of(data), data["time_s"].values):
+        return
+    raise MeasurementError(must_be(
+        f"rows of `{name}`", f"study {study.name}", "in the order of the column time_s, since the "
+        "study states a lag of the readings behind the stage (instrument.lag_m)",
+        "rows between which the stage moved otherwise", "Sort the table by time_s."))
 
 
 def check_maps(study: Study, data: object) -> xr.Dataset | dict[str, xr.Dataset]:

@@ -255,8 +255,8 @@ def row_order_note(study: Study) -> str:
         ("a lag behind the stage (lag_m)", any(one.lag_m for one in instruments)),
         ("a memory of the reading before", any(one.memory for one in instruments))) if there]
     return (f"The study has {' and '.join(named)}. It counts on rows in the order in which they "
-            "were read: a table that was sorted or joined makes it wrong. A column time_s states "
-            "the order for a memory, not for a lag." if named else "")
+            "were read: a table that was sorted or joined makes it wrong. By a "
+            "column time_s a wrong order is seen." if named else "")
 
 
 def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:

@@ -37,6 +37,9 @@ PLACED_SD = (*(0.05,) * 3, *(0.05,) * 3, 0.02)
 """Prior standard deviations of these from where the fit starts, in m, rad and 1: shifts are open,
 and axes that a stage states are not turned by more than some degrees."""
 
+TURN_RAD = PLACED_SD[TURN.start]
+"""That of a turn, if nothing else is said of the stages."""
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -124,7 +127,8 @@ class JoinedModel(ProbeModel):
     """
 
     def __init__(
-        self, charges: Charges, maps: Sequence[ProbeModel], starts: Sequence[Pose]
+        self, charges: Charges, maps: Sequence[ProbeModel], starts: Sequence[Pose],
+        turn_rad: float = TURN_RAD,
     ) -> None:
         self.charges, self.maps, self.starts = charges, maps, starts
         self.middles = [(one.points.max(axis=0) + one.points.min(axis=0)) / 2 for one in maps]
@@ -133,8 +137,10 @@ class JoinedModel(ProbeModel):
         self.field = np.vstack([one.field for one in maps])
         self.scatter = np.concatenate([one.scatter for one in maps])
         self.weights = weights_of(self.scatter)
+        placed = np.array(PLACED_SD)
+        placed[TURN] = turn_rad
         self.any_sd = np.concatenate([maps[0].any_sd, *(one.any_sd for one in maps),
-                                      *(PLACED_SD,) * len(maps)])
+                                      *(placed,) * len(maps)])
         self.prior_sd = self.any_sd
         self.ends = np.cumsum([0, *(len(one.points) for one in maps)])
         self._last = []

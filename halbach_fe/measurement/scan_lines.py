@@ -102,6 +102,19 @@ def motion(points: Floats, time: Floats | None = None) -> Floats:
     return np.asarray((way * on_a_line[:, None])[np.cumsum(new) - 1])
 
 
+def follows_times(points: Floats, time: Floats) -> bool:
+    """Tell whether the stage came to points (n, 3) along their rows, by the times (n,) of these.
+
+    Times that start again in every scan of a joined table, by which a stage would jump, say
+    nothing of that.
+    """
+    few = 0.05  # share of rows between which the way differs, as where two have the same time
+    by_time, by_row = motion(points, time), motion(points)
+    if by_time.any(axis=1).sum() <= by_row.any(axis=1).sum() / 2:
+        return True
+    return bool(np.mean(np.linalg.norm(by_time - by_row, axis=1) > 1 - STRAIGHT) <= few)
+
+
 def goes_both_ways(points: Floats) -> bool:
     """Tell whether many of a map's points (n, 3) were come to against the way to the nearest point
     of another line.

@@ -113,6 +113,15 @@ def left_out_table(result: InferenceResult) -> list[dict[str, str]]:
         "chi²/reading": decimals(each.chi2)} for each in result.regions_left_out]
 
 
+def stretch_table(result: InferenceResult) -> list[dict[str, str]]:
+    """Return rows of text: the same along what was left out."""
+    return [{
+        "left out": each.name or "ends of the map", "in the magnet": one.where,
+        "readings": str(one.readings), "rms difference": f"{decimals(1e3 * one.rms_T)} mT",
+        "over noise": decimals(one.over_noise)}
+        for each in result.regions_left_out for one in each.stretches]
+
+
 def maps_figure(result: InferenceResult) -> Figure:
     """Draw where the maps lie in the magnet."""
     figure = figure_of(3.6)
@@ -438,7 +447,8 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
             "predicted by an update with all others. Held-out lines between other lines say "
             "nothing of that. The rms difference is that with the pose and the probe that only "
             "this map has fitted to it; chi² is 1 on average if the error bars hold.",
-            Table(left_out)],
+            Table(left_out), "And where it lies, along its longest axis:",
+            Table(stretch_table(result))],
             "Where nobody measured"),
         Section([] if not poses else ["In the magnet's axes, as the update found it.",
                                       Table(poses)], "Where the maps lie"),

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.registration import register
+from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import row_order_note, sensor_positions
-from halbach_fe.measurement.scan_lines import goes_both_ways, motion
+from halbach_fe.measurement.scan_lines import follows_times, goes_both_ways, motion
 from halbach_fe.report.diagnosis import page as page_of_diagnosis
 from halbach_fe.report.inference import page as page_of_update
 from halbach_fe.study.measurement import Instrument
@@ -86,6 +89,31 @@ def test_the_way_of_a_stage():
     np.testing.assert_array_equal(motion(twice), np.repeat(way, 2, axis=0))
     line = np.array([[0.0, 0, z] for z in (0, 1, 2, 4, 5, 6, 10, 14, 15)])  # steps of many lengths
     np.testing.assert_array_equal(motion(line)[1:], np.tile([0.0, 0, 1], (8, 1)))
+
+
+def test_times_tell_that_a_table_was_sorted(session, generator):
+    """Its rows are in no order for a lag: a study that states one refuses it, and says what to do,
+    and none is offered.
+    """
+    study = STUDY.with_(instrument={"lag_m": LAG_M})
+    data = map_of(SERPENTINE, LAG_M, generator)
+    data = data.assign_coords(time_s=("point", 2.0 * np.arange(len(SERPENTINE))))
+    order = np.lexsort(SERPENTINE.T[::-1])  # every line upwards along z
+    table = data.isel(point=order)
+    with pytest.raises(MeasurementError, match=r"rows of `map`.*Sort the table by time_s"):
+        infer(build_magnet(study), table, session)
+    with pytest.raises(MeasurementError, match="Sort the table by time_s"):
+        register(build_magnet(study), table, session)
+    back = table.isel(point=np.argsort(table["time_s"].values))
+    maps_of(study, back)  # as the sentence says
+    maps_of(STUDY, table)
+    maps_of(study, table.drop_vars("time_s"))
+    assert Campaign.of(STUDY, back).places(LAG, STUDY)
+    # control: rows of a serpentine whose times are those of lines in one sense
+    other = data.assign_coords(time_s=("point", np.argsort(order).astype(float)))
+    assert Campaign.of(STUDY, other).places(LAG, STUDY) == []
+    # times that start again on every second line say nothing of the order
+    assert follows_times(SERPENTINE, np.arange(len(SERPENTINE)) % (len(SERPENTINE) // 2))
 
 
 def circles(angles, radii, heights, to_and_fro):

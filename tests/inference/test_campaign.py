@@ -250,6 +250,19 @@ def test_the_ends_of_a_single_map_are_left_out(generator, tmp_path, stretch):
         result.disagreement)
     summary = inference_summary(result)["regions_left_out"]
     assert summary[0]["over_noise"] == pytest.approx(left.rms_T / left.noise_T)
+    ends = left.stretches
+    assert {one.axis for one in ends} == {"z"}
+    assert sum(one.readings for one in ends) == left.readings
+    assert sum(one.readings * one.rms_T**2 for one in ends) == pytest.approx(
+        left.readings * left.rms_T**2)
+    assert summary[0]["stretches"][0]["over_noise"] == pytest.approx(ends[0].over_noise)
+    if right:
+        assert left.worst is None
+        assert "the worst" not in left.in_words
+    else:  # the field is steepest where the magnet ends, at 45 mm
+        assert left.worst is not None
+        assert min(abs(abs(end) - 0.045) for end in (left.worst.from_m, left.worst.to_m)) < 0.02
+        assert f"times at {left.worst.where} of the magnet" in left.in_words
 
 
 def test_a_sensor_out_of_place_in_one_map_only(generator):

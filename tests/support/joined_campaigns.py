@@ -61,11 +61,11 @@ def campaign(
 
 def read(
     magnet: magpylib.Collection, pose: Pose, generator: np.random.Generator,
-    noise: float = NOISE_T, gain: float = 1.0,
+    noise: float = NOISE_T, gain: float = 1.0, were: Floats = POINTS,
 ) -> xr.Dataset:
-    """The map that a stage with a pose makes of a magnet."""
+    """The map that a stage with a pose makes of a magnet; its points were somewhere."""
     matrix = pose[0].as_matrix()
-    field = gain * magnet.getB(POINTS @ matrix.T + pose[1]) @ matrix
+    field = gain * magnet.getB(were @ matrix.T + pose[1]) @ matrix
     return field_map(POINTS, field + noise * generator.standard_normal(field.shape))
 
 

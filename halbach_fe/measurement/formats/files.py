@@ -109,8 +109,9 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
 
 def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
     """Return the file, with a remark if its points lie where few magnets have a field."""
-    stated = file.format in READERS and not declared.length_unit
-    doubt = doubt_of_metres(file.data, file.imported.length_units[0] if stated else "")
+    units = file.imported.length_units
+    stated = units[0] if units and file.format in READERS and not declared.length_unit else ""
+    doubt = doubt_of_metres(file.data, stated)
     if not doubt:
         return file
     remark = f"{doubt} " + (
