@@ -109,10 +109,11 @@ def follows_times(points: Floats, time: Floats) -> bool:
     nothing of that.
     """
     few = 0.05  # share of rows between which the way differs, as where two have the same time
+    other_way = 0.5  # length of the difference of two unit vectors, which are then 30 deg apart
     by_time, by_row = motion(points, time), motion(points)
     if by_time.any(axis=1).sum() <= by_row.any(axis=1).sum() / 2:
         return True
-    return bool(np.mean(np.linalg.norm(by_time - by_row, axis=1) > 1 - STRAIGHT) <= few)
+    return bool(np.mean(np.linalg.norm(by_time - by_row, axis=1) > other_way) <= few)
 
 
 def goes_both_ways(points: Floats) -> bool:
