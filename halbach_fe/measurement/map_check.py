@@ -36,14 +36,7 @@ from halbach_fe.measurement.field_map import (
     refuse_total_field,
     refuse_undirected,
 )
-from halbach_fe.measurement.harmonic_field import (
-    NO_FIT,
-    Charges,
-    FewCharges,
-    FreeField,
-    HarmonicFit,
-    spacing_of,
-)
+from halbach_fe.measurement.harmonic_field import NO_FIT, Charges, HarmonicFit, spacing_of
 from halbach_fe.measurement.probe_in_field import (
     FEW_ITERATIONS,
     GAINS,
@@ -436,9 +429,10 @@ def check_map(
     lines = scan_lines(scan.points)
     rows = _Rows(lines, usable, usable & some_lines(lines, usable))
     _begin(pace, 2, "comparing the orientations of the probe")
-    matrix, alike = _orientation(scan.of(rows.train), pace)
+    some = _thinned(scan.of(rows.train))
+    matrix, alike = _orientation(some, pace)
     _begin(pace, 3, "fitting the field and the instrument")
-    fitted = _first_fit(scan.turned(matrix), rows, pace)
+    fitted = _first_fit(scan.turned(matrix), some.turned(matrix), rows, pace)
     _begin(pace, 4, "asking every part of the map for each error of the instrument")
     fitted, terms = _stated(fitted, rows.train, pace)
     _begin(pace, 5, "fitting all scan lines")
@@ -496,10 +490,9 @@ def _remaining(
         model.noise_left(whole.at, chosen, whole.width2), least_left))
     scatter = scatter_of(
         model.charges.gradient(points[chosen], whole.at.amplitudes)[:, sensors], left)
-    fields = FreeField(model.charges.fields(points[chosen])[:, sensors].reshape(
-        -1, len(model.charges)), 0.0)
-    given = scan.field[chosen][:, sensors]
-    as_given = fields.most_probable(given.ravel(), whole.fit.number)
+    given, even = scan.field[chosen][:, sensors], model.even()
+    fields = even.free(even.start(NO_FIT), chosen, 0.0)
+    as_given = fields.most_probable(given.ravel())
 
     def by_column(values: Floats) -> Floats:
         """Return the size of what sensors show, in the columns of the map."""
@@ -633,7 +626,7 @@ class _Fitted:
         for number in range(WEIGHTINGS):
             model, fit = fitted.model.weighted(fitted.at, rows, fitted.width2), fitted.fit
             if not number:  # the width of the prior, now that the instrument is no noise
-                fit = model.fit(fitted.at, rows, fit.number)
+                fit = model.fit(fitted.at, rows)
             fitted = _Fitted(model, fit_probe(model, rows, fit, fitted.at, FEW_ITERATIONS), fit)
         return fitted
 
@@ -670,16 +663,32 @@ class _Rows:
         """Chosen rows that are not held out."""
         return self.chosen & ~self.held_out
 
+    @property
+    def few(self) -> NDArray[np.bool_]:
+        """The rows of some of these lines, about `SOME_POINTS`."""
+        found = self.train
+        number = np.unique(self.lines[found], return_inverse=True)[1].ravel()
+        found[found] = some_lines(number, np.ones(len(number), bool), SOME_POINTS)
+        return found
 
-def _first_fit(scan: Scan, rows: _Rows, pace: Pace) -> _Fitted:
-    """Return the fit of the field and of all parameters of the instrument."""
-    gap, sensors, fit = _gap(scan.of(rows.train), pace)
+
+def _first_fit(scan: Scan, some: ProbeModel, rows: _Rows, pace: Pace) -> _Fitted:
+    """Return the fit of the field and of all parameters of the instrument to a few lines.
+
+    The combinations of charges are those that all chosen rows determine. ``some`` points of the
+    scan tell what the fit starts from, and where the charges are.
+    """
+    few = rows.few
+    gap, probe, fit = _gap(scan.of(few), some, pace)
     # around all rows, of which those that are not fitted are read too
-    charges = Charges.around(_read_at(scan.points[rows.usable], sensors), gap)
+    charges = Charges.around(_read_at(scan.points[rows.usable], probe.sensors_m), gap)
     model = scan.model(charges)
-    free = model.free(model.start(NO_FIT), rows.chosen, 0.0)
-    model = scan.model(FewCharges(charges.places, charges.scale, free.determined(fit.penalty)))
-    return _Fitted(model, fit_probe(model, rows.train, fit), fit).weighted(rows.train)
+    start = replace(model.start(NO_FIT), instrument=probe.instrument)
+    model = model.few(start, rows.chosen, fit.penalty)
+    pace.advance(len(GAPS) + 2, len(GAPS) + 3)
+    fit = model.fit(start, few)
+    start = replace(start, amplitudes=fit.amplitudes, sigma=fit.sigma)
+    return _Fitted(model, fit_probe(model, few, fit, start), fit).weighted(few)
 
 
 def _without_spikes(
@@ -780,8 +789,19 @@ def _named(matrix: Floats) -> tuple[str, str, str]:
     return names[0], names[1], names[2]
 
 
+def _thinned(scan: Scan) -> ProbeModel:
+    """Return the model of at most `SOME_POINTS` throughout a scan.
+
+    Its charges are neither near nor far: those of a map near edges of magnets, fitted by far ones,
+    gave sensors 10 mm off.
+    """
+    some = scan.of(np.linspace(0, len(scan.points) - 1, min(
+        len(scan.points), SOME_POINTS)).astype(int))
+    return some.model(Charges.around(some.points, GAPS[-2] * point_spacing(scan.points)))
+
+
 def _orientation(
-    scan: Scan, pace: Pace
+    given: ProbeModel, pace: Pace
 ) -> tuple[Floats, tuple[tuple[str, str, str], ...]]:
     """Return the matrix of the orientation, and others that fit as well.
 
@@ -792,13 +812,10 @@ def _orientation(
     # The same in a linear instrument, from which orientations are no longer tried: errors of usual
     # sizes are not quite linear.
     nearly_alike = 300.0
-    if np.isnan(scan.field).any():  # a component by itself has no axes
+    if len(given.sensors) < len(COMPONENTS):  # a component by itself has no axes
         return np.eye(3), ()
-    spacing = point_spacing(scan.points)
-    scan = scan.of(_some_points(scan.points))
-    given, every = scan.model(Charges.around(scan.points, GAPS[-2] * spacing)), np.ones(
-        len(scan.points), bool)
-    perfect, matrices = given.start(NO_FIT), _orientations()
+    every, matrices = np.ones(len(given.points), bool), _orientations()
+    perfect = given.start(NO_FIT)
     free = given.free(perfect, every, 0.0)
     fits = [free.most_probable(given.turned(matrix).target(perfect, every))
             for matrix in matrices]
@@ -833,19 +850,17 @@ def _linear_against(model: ProbeModel, fit: HarmonicFit) -> float:
         1 - told.sums @ instrument / readings) / 2) + instrument @ instrument / 2)
 
 
-def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
-    """Return the distance in m of the charges, where the sensors are, and the fit of the field.
+def _gap(scan: Scan, some: ProbeModel, pace: Pace) -> tuple[float, ProbeFit, HarmonicFit]:
+    """Return the distance in m of the charges, the instrument, and the fit of the field.
 
-    The distance is that from where sensors at (3, 3) in m read the field. The instrument is
-    perfect, or is first fitted with some points and charges that are neither near nor far: those of
-    a map near edges of magnets, fitted by far charges, gave sensors 10 mm off. Charges are tried
-    from far to near, which are more, until the evidence of the readings falls.
+    The distance is that from where sensors read the field. The instrument is perfect, or is first
+    fitted to ``some`` points. Charges are tried from far to near, which are more, until the
+    evidence of the readings falls.
     """
-    spacing, some = point_spacing(scan.points), scan.of(_some_points(scan.points))
-    start = some.model(Charges.around(some.points, GAPS[-2] * spacing))
+    spacing, perfect = point_spacing(scan.points), some.start(NO_FIT)
     every = np.ones(len(some.points), bool)
-    perfect = start.fit(start.start(NO_FIT), every)
-    probe, every = fit_probe(start, every, perfect), np.ones(len(scan.points), bool)
+    first = some.fit(perfect, every)
+    probe, every = fit_probe(some, every, first), np.ones(len(scan.points), bool)
     found: list[tuple[float, float, ProbeFit, HarmonicFit]] = []
 
     def evidence(gap: float, probe: ProbeFit) -> float:
@@ -853,7 +868,7 @@ def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
         fit = scan.model(charges).fit(probe, every)
         found.append((fit.log_evidence - float(probe.instrument @ probe.instrument) / 2, gap,
                       probe, fit))
-        pace.advance(len(found), len(GAPS) + 1)
+        pace.advance(len(found), len(GAPS) + 3)
         return found[-1][0]
 
     last, read_at = -np.inf, _read_at(scan.points, probe.sensors_m)
@@ -864,15 +879,10 @@ def _gap(scan: Scan, pace: Pace) -> tuple[float, Floats, HarmonicFit]:
             if now < last:
                 break
             last = now
-    evidence(max(found, key=lambda each: each[0])[1], start.start(perfect))
-    pace.advance(len(GAPS) + 1, len(GAPS) + 1)
+    evidence(max(found, key=lambda each: each[0])[1], some.start(first))
+    pace.advance(len(GAPS) + 1, len(GAPS) + 3)
     _, gap, probe, fit = max(found, key=lambda each: each[0])
-    return gap * spacing, probe.sensors_m, fit
-
-
-def _some_points(points: Floats) -> Ints:
-    """Return the numbers of at most `SOME_POINTS` of points (n, 3) throughout the scan."""
-    return np.linspace(0, len(points) - 1, min(len(points), SOME_POINTS)).astype(int)
+    return gap * spacing, probe, fit
 
 
 def _read_at(points: Floats, sensors: Floats) -> Floats:
