@@ -140,6 +140,7 @@ class ProbeModel:
     """
 
     sensors: tuple[int, ...] = (0, 1, 2)
+    is_settled: bool = False
 
     def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
                  directions: Floats, scatter: Floats) -> None:
@@ -212,6 +213,12 @@ class ProbeModel:
         other.charges = FewCharges(self.charges.places, self.charges.scale, vectors)
         other._last = [other.charges, rows, at.instrument * self.prior_sd, self.weights,
                        FreeField(design.by_amplitude @ vectors, 0.0)]
+        return other
+
+    def settled(self) -> Self:
+        """Return a model whose instrument is known: fits of it change the field alone."""
+        other = copy(self)
+        other.is_settled = True
         return other
 
     def even(self) -> Self:
@@ -287,7 +294,7 @@ class ProbeModel:
     def by_parameter(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the weighted derivatives (n, s, p) in T by the parameters / `PRIOR_SD`."""
         found = np.zeros((int(rows.sum()), len(self.sensors), len(PRIOR_SD)))
-        if not self.prior_sd.any():
+        if self.is_settled or not self.prior_sd.any():
             return found
         for number, sensor in enumerate(self.sensors):
             places, reads = self.read_by(at, rows, sensor)
@@ -520,6 +527,8 @@ class State:
 
     def step(self, design: Floats, inverse: Floats) -> Floats:
         """Return the step (p,) of the instrument, see `normal`."""
+        if self.model.is_settled:
+            return np.zeros(len(inverse))
         return np.asarray(inverse @ (
             design.T @ self.left - self.at.sigma**2 * self.at.instrument))
 
