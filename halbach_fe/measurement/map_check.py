@@ -85,6 +85,10 @@ GAPS = (1.0, 1.5, 2.0, 2.5, 4.0)
 """Distances of the charges from the region that are tried, in units of the points' spacing. The
 last one is tried always, the others if the charges are near each other, see `TOO_FAR_APART`."""
 
+FIRST_FIT_PARTS = 3 * (len(GAPS) + 1)
+"""Parts of the first fit, for the time left: all fits by charges at some distance take about as
+long as the search of combinations of charges, and as the fit with an instrument."""
+
 TOO_FAR_APART = 0.8
 """Distance of charges from each other, relative to that from the region, from which their field is
 rough. In a bore of 46 mm that was mapped to 18 mm in steps of 5 mm, 5.5 mm at a distance of 7.5 mm
@@ -99,7 +103,7 @@ ROUNDS = 2
 """Number of times that parameters are chosen: weights and linearization are those of the choice
 before."""
 
-NOT_FOLLOWED = 2.0
+NOT_FOLLOWED = 1.5
 """Ratio of the scatter of a tenth of the readings to that of most from which charges do not follow
 the field there. Noise that is the same everywhere makes it 1.2."""
 
@@ -694,10 +698,12 @@ def _first_fit(scan: Scan, some: ProbeModel, rows: _Rows, pace: Pace) -> _Fitted
     model = scan.model(charges)
     start = replace(model.start(NO_FIT), instrument=probe.instrument)
     model = model.few(start, rows.chosen, fit.penalty)
-    pace.advance(len(GAPS) + 2, len(GAPS) + 3)
+    pace.advance(2 * FIRST_FIT_PARTS // 3, FIRST_FIT_PARTS)
     fit = model.fit(start, few)
     start = replace(start, amplitudes=fit.amplitudes, sigma=fit.sigma)
-    return _Fitted(model, fit_probe(model, few, fit, start), fit).weighted(few)
+    fitted = _Fitted(model, fit_probe(model, few, fit, start), fit).weighted(few)
+    pace.advance(FIRST_FIT_PARTS, FIRST_FIT_PARTS)
+    return fitted
 
 
 def _without_spikes(
@@ -877,7 +883,7 @@ def _gap(scan: Scan, some: ProbeModel, pace: Pace) -> tuple[float, ProbeFit, Har
         fit = scan.model(charges).fit(probe, every)
         found.append((fit.log_evidence - float(probe.instrument @ probe.instrument) / 2, gap,
                       probe, fit))
-        pace.advance(len(found), len(GAPS) + 3)
+        pace.advance(len(found), FIRST_FIT_PARTS)
         return found[-1][0]
 
     last, read_at = -np.inf, _read_at(scan.points, probe.sensors_m)
@@ -889,7 +895,7 @@ def _gap(scan: Scan, some: ProbeModel, pace: Pace) -> tuple[float, ProbeFit, Har
                 break
             last = now
     evidence(max(found, key=lambda each: each[0])[1], some.start(first))
-    pace.advance(len(GAPS) + 1, len(GAPS) + 3)
+    pace.advance(FIRST_FIT_PARTS // 3, FIRST_FIT_PARTS)
     _, gap, probe, fit = max(found, key=lambda each: each[0])
     return gap * spacing, probe, fit
 
@@ -985,24 +991,26 @@ def _stated(
         start = fitted if number == 0 else fitted.weighted(region)
         asked.append(_asked(start, region, lambda done, of, before=number: pace.advance(
             before * of + done, len(regions) * of)))
-    shown = [sum(map(_agrees, terms, *(other for _, other in asked))) for _, terms in asked]
-    best = int(np.argmax(shown))  # the first of those that show as much, the largest
+    supported = [np.array([term.found and (number == 0 or _is_supported(term, others))
+                           for term, *others in zip(terms, *(
+                               other for _, other in asked[:number] + asked[number + 1:]),
+                               strict=True)]) for number, (_, terms) in enumerate(asked)]
+    best = int(np.argmax([each.sum() for each in supported]))  # the largest that shows as much
     if best == 0:
         return asked[0]
     (whole, _), (inner, terms) = asked[0], asked[best]
-    model = whole.model.with_terms(inner.model.prior_sd > 0)
-    settled = replace(whole, model=model.settled(), at=replace(
-        inner.at, amplitudes=whole.at.amplitudes))
+    model = whole.model.with_terms(inner.model.prior_sd > 0).settled()
+    settled = replace(whole, model=model, at=replace(inner.at, amplitudes=whole.at.amplitudes))
     return settled.weighted(rows), tuple(
-        replace(term, predictive=term.predictive and (not term.found or _agrees(term, *others)))
-        for term, *others in zip(terms, *(other for _, other in asked), strict=True))
+        replace(term, predictive=term.predictive and (not term.found or bool(stated)))
+        for term, stated in zip(terms, supported[best], strict=True))
 
 
-def _agrees(term: InstrumentTerm, *others: InstrumentTerm) -> bool:
-    """Tell whether a term is found that no other region of the map contradicts."""
-    return term.found and all(
-        abs(term.value - other.value) <= SEEN * np.hypot(term.sd, other.sd) or not other.determined
-        for other in others)
+def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
+    """Tell whether no other region of the map contradicts a term, and one of them sees it too."""
+    told = [other for other in others if other.determined]
+    return any(abs(other.value) > SEEN * other.sd for other in told) and all(
+        abs(term.value - other.value) <= SEEN * np.hypot(term.sd, other.sd) for other in told)
 
 
 def _asked(

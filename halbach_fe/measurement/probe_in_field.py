@@ -164,7 +164,8 @@ class ProbeModel:
     def turned(self, matrix: Floats) -> Self:
         """Return a model of the components that a matrix (3, 3) makes of the readings."""
         other = copy(self)
-        other.field = self.field @ matrix.T
+        if len(self.sensors) == len(COMPONENTS):  # the columns of fewer stay as they are given
+            other.field = self.field @ matrix.T
         return other
 
     def with_terms(self, kept: NDArray[np.bool_]) -> Self:
