@@ -206,9 +206,9 @@ def solid_harmonic_fields(points: Floats, degrees: int) -> Floats:
 PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
 """Penalties among which the evidence chooses, in units of the mean information per amplitude."""
 
-LEAST_KNOWN = 0.1
+LEAST_KNOWN = 0.03
 """Information that readings have of a combination of amplitudes, in units of that of the prior, up
-to which it is left out. All that are left out change a reading by less than its noise together."""
+to which it is left out: the fit has 3 % of it at most."""
 
 
 @dataclass(frozen=True)
