@@ -109,8 +109,9 @@ the field there. Noise that is the same everywhere makes it 1.2."""
 
 CUT_BACK = (0.85, 0.7)
 """Shares of the readings that are asked again for the instrument, where the field is least rough.
-Of five maps near cubes and coils by magpylib in which the whole told nothing of a turn of 20 mrad or
-a drift of 2 %, both told it in four, with bars 4 to 16 times as short."""
+In three maps near cubes and coils by magpylib in which the whole did not tell of a turn of 20 mrad
+or a drift of 2 %, both did, with bars 4 to 16 times as short; in three others one alone showed
+terms that were not there."""
 
 SEEN = 2.0
 """Standard deviations of a part from which it can tell whether a parameter is there."""
