@@ -299,6 +299,16 @@ def test_an_error_of_the_probe_is_found_near_cubes(error):
     assert abs(term.value - value) < 4 * term.sd
 
 
+@pytest.mark.parametrize(("shares", "found"), [(map_check.CUT_BACK, True), ((), False)])
+def test_a_turn_is_found_where_the_field_is_not_rough(monkeypatch, shares, found):
+    """Near cubes that charges do not follow; the control asks all of the map only."""
+    monkeypatch.setattr(map_check, "CUT_BACK", shares)
+    name, value = ERRORS["roll"]
+    (term,) = [term for term in check_map(hard_map(21, "roll")).terms if term.name == name]
+    assert term.found == found
+    assert abs(term.value - value) < 2 * term.sd
+
+
 def test_what_charges_cannot_follow_is_no_error_of_the_probe(generator):
     """Readings exact to 1 uT of the field of a far dipole."""
     steps = 0.01 * np.arange(-3, 4)
