@@ -19,13 +19,15 @@ def fields_along(points: Floats, directions: Floats, places: Floats, scale: floa
     ``out`` (n, k or more) is at points ``first`` to ``last`` of (n, 3) in m, for charges at
     ``places`` (k, 3) in m whose amplitude is ``scale``.
     """
+    px, py, pz = places[:, 0].copy(), places[:, 1].copy(), places[:, 2].copy()
     for n in range(first, last):
-        for k in range(len(places)):
-            x, y, z = (points[n, 0] - places[k, 0], points[n, 1] - places[k, 1],
-                       points[n, 2] - places[k, 2])
+        a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        u, v, w = scale * directions[n, 0], scale * directions[n, 1], scale * directions[n, 2]
+        row = out[n]
+        for k in range(len(px)):
+            x, y, z = a - px[k], b - py[k], c - pz[k]
             square = x * x + y * y + z * z
-            along = x * directions[n, 0] + y * directions[n, 1] + z * directions[n, 2]
-            out[n, k] = scale * along / (square * sqrt(square))
+            row[k] = (x * u + y * v + z * w) / (square * sqrt(square))
 
 
 @reordered

@@ -9,7 +9,7 @@ amplitudes have a normal prior of mean 0, whose width the evidence of the readin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
@@ -25,6 +25,9 @@ from halbach_fe.core.threads import in_threads, share_out
 CLOSENESS = 0.6
 """Distance of charges from each other, relative to that from the region: where they are as far from
 each other as from a point, the field there is rough."""
+
+FEW = 1200
+"""Size of a matrix up to which eigenvectors are sought of all of it."""
 
 AT_ONCE = 4096
 """Number of readings whose remaining noise is computed at a time, which limits the memory."""
@@ -78,10 +81,8 @@ class Charges:
 
     def fields(self, points: Floats) -> Floats:
         """Return B (n, 3, amplitudes) at points (n, 3) in m per amplitude."""
-        result = np.empty((len(points), 3, len(self)))
-        result[..., :-3] = _fields(points, self.places) * self.scale
-        result[..., -3:] = UNIFORM * np.eye(3)
-        return result
+        return self.fields_along(np.repeat(points, 3, axis=0), np.tile(np.eye(3), (
+            len(points), 1))).reshape(len(points), 3, -1)
 
     def fields_along(self, points: Floats, directions: Floats) -> Floats:
         """Return B . u (n, amplitudes) per amplitude at points (n, 3) in m, for u (n, 3)."""
@@ -129,15 +130,15 @@ class FewCharges(Charges):
         """Return the number of combinations."""
         return self.vectors.shape[1]
 
-    def fields(self, points: Floats) -> Floats:
-        """Return B (n, 3, r) at points (n, 3) in m per amplitude."""
-        all_of_them = Charges(self.places, self.scale).fields(points)
-        return (all_of_them.reshape(3 * len(points), -1) @ self.vectors).reshape(
-            len(points), 3, -1)
-
     def fields_along(self, points: Floats, directions: Floats) -> Floats:
         """Return B . u (n, r) per amplitude, for u (n, 3)."""
-        return Charges(self.places, self.scale).fields_along(points, directions) @ self.vectors
+        result = np.empty((len(points), len(self)))
+        of_all = Charges(self.places, self.scale)
+        for first in range(0, len(points), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            np.matmul(of_all.fields_along(points[some], directions[some]), self.vectors,
+                      out=result[some])
+        return result
 
     def field(self, points: Floats, amplitudes: Floats) -> Floats:
         """Return B (n, 3) in T for amplitudes (r,)."""
@@ -205,12 +206,9 @@ def solid_harmonic_fields(points: Floats, degrees: int) -> Floats:
 PENALTIES = 10.0 ** np.arange(-12, 3, 0.5)
 """Penalties among which the evidence chooses, in units of the mean information per amplitude."""
 
-LEAST_KNOWN = 0.01
+LEAST_KNOWN = 0.03
 """Information that readings have of a combination of amplitudes, in units of that of the prior, up
-to which it is left out: the fit has 1 % of it at most."""
-
-EVERY = 4
-"""Number of penalties of which one is tried first."""
+to which it is left out: the fit has 3 % of it at most."""
 
 
 @dataclass(frozen=True)
@@ -228,8 +226,6 @@ class HarmonicFit:
         Log probability of the readings, up to a constant, at the most probable penalty and sigma.
     used : float
         Number of amplitudes that the readings determine.
-    number : int
-        That of the penalty in `PENALTIES`.
     """
 
     amplitudes: Floats
@@ -237,7 +233,6 @@ class HarmonicFit:
     sigma: float
     log_evidence: float
     used: float
-    number: int = 0
 
 
 NO_FIT = HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)
@@ -267,11 +262,29 @@ class FreeField:
         """Return the same for another penalty."""
         return FreeField(self.by_amplitude, penalty, self.gram, self.dual)
 
+    @cached_property
+    def spectrum(self) -> tuple[Floats, Floats]:
+        """The eigenvalues (r,) of the gram beyond its rounding, and its eigenvectors (m or k, r).
+
+        A Cholesky decomposition with pivots stops where nothing but rounding is left: fields far
+        from their sources have few combinations, of which alone eigenvectors are sought.
+        """
+        if len(self.gram) < FEW:
+            values, vectors = linalg.eigh(self.gram, check_finite=False)
+            kept = values > self.least
+            return values[kept], vectors[:, kept]
+        factor, pivots, rank, _ = linalg.lapack.dpstrf(self.gram, tol=self.least, lower=1)
+        lower = np.empty((len(factor), rank))
+        lower[pivots - 1] = np.tril(factor[:, :rank])
+        values, vectors = linalg.eigh(lower.T @ lower, check_finite=False)
+        kept = values > self.least
+        return values[kept], lower @ (vectors[:, kept] / np.sqrt(values[kept]))
+
     def determined(self, penalty: float) -> Floats:
         """Return the combinations (k, r) of amplitudes that readings tell more of than a share
         `LEAST_KNOWN` of what is known before them.
         """
-        values, vectors = linalg.eigh(self.gram, check_finite=False)
+        values, vectors = self.spectrum
         kept = values > LEAST_KNOWN * max(penalty, self.least)
         if not self.dual:
             return np.asarray(vectors[:, kept])
@@ -343,59 +356,29 @@ class FreeField:
                 self.lower, self.by_amplitude[first:first + AT_ONCE].T, lower=True,
                 check_finite=False))
 
-    def log_evidence(self, readings: Floats) -> tuple[float, float]:
-        """Return the log probability of readings (m,), up to a constant, and the noise in T."""
-        if self.dual:
-            rest = self.penalty * float(readings @ self.solve(readings))
-        else:
-            rest = float(readings @ readings) - float(
-                readings @ (self.by_amplitude @ self.amplitudes(readings)))
-        sigma = float(np.sqrt(max(rest, 1e-30) / len(readings)))
-        size = 2 * float(np.log(np.diag(self.lower)).sum()) - len(self.lower) * np.log(
-            self.penalty)
-        return float(-len(readings) * np.log(sigma) - size / 2), sigma
+    def most_probable(self, readings: Floats) -> HarmonicFit:
+        """Return the fit of readings (m,) by that one of `PENALTIES` which has most evidence.
 
-    @cached_property
-    def by_penalty(self) -> list[FreeField]:
-        """The same for each of `PENALTIES`, in units of `mean`."""
-        return [self.of_noise(penalty * self.mean) for penalty in PENALTIES.tolist()]
-
-    def most_probable(self, readings: Floats, near: int | None = None) -> HarmonicFit:
-        """Return the fit of readings (m,) by the penalty of largest evidence.
-
-        It is searched around the number ``near`` of one of `PENALTIES`, if one is known, else
-        around the best of every few: readings near magnets have two maxima, as far from sources
-        they have another noise.
+        All are tried: readings near magnets have two maxima, as far from sources they have another
+        noise.
         """
-        tried: dict[int, tuple[float, float]] = {}
-
-        def evidence(number: int) -> float:
-            if number not in tried:
-                try:
-                    tried[number] = self.by_penalty[number].log_evidence(readings)
-                except linalg.LinAlgError:  # the penalty is below the rounding of the gram
-                    tried[number] = -np.inf, 1.0
-            return tried[number][0]
-
-        if near is None:
-            near = max(range(0, len(PENALTIES), EVERY), key=evidence)
-        best = _climbed(evidence, near, EVERY // 2, len(PENALTIES))
-        field, (found, sigma) = self.by_penalty[best], tried[best]
-        return HarmonicFit(field.amplitudes(readings), field.penalty, sigma, found,
-                           len(readings) - field.trace, best)
-
-
-def _climbed(value: Callable[[int], float], start: int, step: int, count: int) -> int:
-    """Return the number below ``count`` of the largest value of one maximum, near a first one."""
-    best = start
-    while step:
-        ahead = [other for other in (best - step, best + step)
-                 if 0 <= other < count and value(other) > value(best)]
-        if ahead:
-            best = ahead[0]
+        values, vectors = self.spectrum
+        if self.dual:
+            along = vectors.T @ readings
+            beyond = readings - vectors @ along
         else:
-            step //= 2
-    return best
+            along = (vectors.T @ (self.by_amplitude.T @ readings)) / np.sqrt(values)
+            beyond = readings - self.by_amplitude @ (vectors @ (along / np.sqrt(values)))
+        penalties = np.maximum(PENALTIES * self.mean, self.least)
+        share = penalties[:, None] / (values + penalties[:, None])  # of each one that is left
+        sigma = np.sqrt(np.maximum(beyond @ beyond + share @ along**2, 1e-30) / len(readings))
+        evidence = np.log(share).sum(axis=1) / 2 - len(readings) * np.log(sigma)
+        best = int(np.argmax(evidence))
+        weights = (1 - share[best]) * along / np.sqrt(values)
+        amplitudes = (self.by_amplitude.T @ (vectors @ (weights / np.sqrt(values))) if self.dual
+                      else vectors @ weights)
+        return HarmonicFit(amplitudes, float(penalties[best]), float(sigma[best]),
+                           float(evidence[best]), float(np.sum(1 - share[best])))
 
 
 def fit_fields(charges: Charges, points: Floats, fields: Sequence[Floats]) -> list[HarmonicFit]:

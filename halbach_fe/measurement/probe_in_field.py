@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.measurement.harmonic_field import Charges, FreeField, HarmonicFit
+from halbach_fe.measurement.harmonic_field import Charges, FewCharges, FreeField, HarmonicFit
 from halbach_fe.measurement.suspect_rows import scatter_around
 from halbach_fe.study.types import COMPONENTS
 
@@ -140,6 +140,7 @@ class ProbeModel:
     """
 
     sensors: tuple[int, ...] = (0, 1, 2)
+    is_settled: bool = False
 
     def __init__(self, charges: Charges, points: Floats, field: Floats, time: Floats,
                  directions: Floats, scatter: Floats) -> None:
@@ -163,7 +164,8 @@ class ProbeModel:
     def turned(self, matrix: Floats) -> Self:
         """Return a model of the components that a matrix (3, 3) makes of the readings."""
         other = copy(self)
-        other.field = self.field @ matrix.T
+        if len(self.sensors) == len(COMPONENTS):  # the columns of fewer stay as they are given
+            other.field = self.field @ matrix.T
         return other
 
     def with_terms(self, kept: NDArray[np.bool_]) -> Self:
@@ -201,14 +203,31 @@ class ProbeModel:
         return ProbeFit(fit.amplitudes, np.zeros(count), np.eye(count), fit.sigma, fit.used,
                        self.prior_sd, False)
 
-    def fit(
-        self, at: ProbeFit, rows: NDArray[np.bool_], near: int | None = None
-    ) -> HarmonicFit:
-        """Return the fit of the field alone, read by an instrument that is known.
+    def fit(self, at: ProbeFit, rows: NDArray[np.bool_]) -> HarmonicFit:
+        """Return the fit of the field alone, read by an instrument that is known."""
+        return self.free(at, rows, 0.0).most_probable(self.target(at, rows))
 
-        Its penalty is searched from the number ``near``, see `FreeField.most_probable`.
-        """
-        return self.free(at, rows, 0.0).most_probable(self.target(at, rows), near)
+    def few(self, at: ProbeFit, rows: NDArray[np.bool_], penalty: float) -> Self:
+        """Return a model of the same field by those combinations of charges that rows determine."""
+        other, design = copy(self), self.free(at, rows, 0.0)
+        vectors = design.determined(penalty)
+        other.charges = FewCharges(self.charges.places, self.charges.scale, vectors)
+        other._last = [other.charges, rows, at.instrument * self.prior_sd, self.weights,
+                       FreeField(design.by_amplitude @ vectors, 0.0)]
+        return other
+
+    def settled(self) -> Self:
+        """Return a model whose instrument is known: fits of it change the field alone."""
+        other = copy(self)
+        other.is_settled = True
+        return other
+
+    def even(self) -> Self:
+        """Return a model without weights, whose designs are exact."""
+        other = copy(self)
+        other.weights, other.near = np.ones_like(self.weights), np.zeros_like(self.near)
+        other._last = list(self._last)
+        return other
 
     def free(self, at: ProbeFit, rows: NDArray[np.bool_], penalty: float) -> FreeField:
         """Return what the field leaves of the readings of some rows, for a penalty.
@@ -217,8 +236,12 @@ class ProbeModel:
         that has hardly changed it is one by which the fit still converges, see `target`.
         """
         value = at.instrument * self.prior_sd
-        kept = self._last and self._last[0] is self.charges and np.array_equal(
-            rows, self._last[1]) and bool((np.abs(value - self._last[2]) <= self.near).all())
+        kept = self._last and self._last[0] is self.charges and bool(
+            (rows <= self._last[1]).all() and (np.abs(value - self._last[2]) <= self.near).all())
+        if kept and not np.array_equal(rows, self._last[1]):
+            some = np.repeat(rows[self._last[1]], len(self.sensors))
+            self._last[1:] = [rows, *self._last[2:4], FreeField(
+                self._last[4].by_amplitude[some], 0.0)]
         if not kept:
             self._last.clear()  # before the next one is made, which is as large
             self._last += [self.charges, rows, value, self.weights, FreeField(
@@ -235,11 +258,16 @@ class ProbeModel:
         They are those without the change of the sensors' offsets, and with what the kept design
         differs from that of ``at``.
         """
-        if len(at.amplitudes) != len(self.charges):
+        self.free(at, rows, 0.0)
+        if len(at.amplitudes) != len(self.charges) or self.is_exact(at):
             return np.asarray(((self.field[rows] - self.offsets(at, rows))
                                * self.weights[rows]).ravel())
         left = (self.field[rows] - self.readings(at, rows)) * self.weights[rows]
         return left.ravel() + self.free(at, rows, 0.0).by_amplitude @ at.amplitudes
+
+    def is_exact(self, at: ProbeFit) -> bool:
+        """Tell whether the kept design is that of the instrument of ``at``, see `free`."""
+        return bool(self._last) and np.array_equal(self._last[2], at.instrument * self.prior_sd)
 
     def offsets(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the change (n, s) in T of the sensors' offsets."""
@@ -258,16 +286,17 @@ class ProbeModel:
 
     def by_amplitude(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the weighted readings (n, s, k) per amplitude."""
-        found = np.empty((int(rows.sum()), len(self.sensors), len(self.charges)))
-        for number, sensor in enumerate(self.sensors):
-            places, reads = self.read_by(at, rows, sensor)
-            found[:, number] = self.charges.fields_along(
-                places, self.weights[rows, number, None] * reads)
-        return found
+        places, reads = (np.stack(each, axis=1) for each in zip(*(
+            self.read_by(at, rows, sensor) for sensor in self.sensors), strict=True))
+        reads = reads * self.weights[rows, :, None]
+        return self.charges.fields_along(places.reshape(-1, 3), reads.reshape(-1, 3)).reshape(
+            len(places), len(self.sensors), -1)
 
     def by_parameter(self, at: ProbeFit, rows: NDArray[np.bool_]) -> Floats:
         """Return the weighted derivatives (n, s, p) in T by the parameters / `PRIOR_SD`."""
         found = np.zeros((int(rows.sum()), len(self.sensors), len(PRIOR_SD)))
+        if self.is_settled or not self.prior_sd.any():
+            return found
         for number, sensor in enumerate(self.sensors):
             places, reads = self.read_by(at, rows, sensor)
             field = self.charges.field(places, at.amplitudes)
@@ -443,7 +472,8 @@ class State:
         free = model.free(at, rows, at.sigma**2 / width2)
         state = cls._solved(model, rows, width2, at, model.target(at, rows), free)
         # a design that is used again is off by some per cent of what the amplitudes change
-        return cls._solved(model, rows, width2, at, model.target(state.at, rows), free)
+        return state if model.is_exact(at) else cls._solved(
+            model, rows, width2, at, model.target(state.at, rows), free)
 
     @classmethod
     def _solved(
@@ -498,6 +528,8 @@ class State:
 
     def step(self, design: Floats, inverse: Floats) -> Floats:
         """Return the step (p,) of the instrument, see `normal`."""
+        if self.model.is_settled:
+            return np.zeros(len(inverse))
         return np.asarray(inverse @ (
             design.T @ self.left - self.at.sigma**2 * self.at.instrument))
 
