@@ -117,10 +117,10 @@ terms that were not there."""
 SEEN = 2.0
 """Standard deviations of a part from which it can tell whether a parameter is there."""
 
-ALIKE_PARTS = (0.5, 2.0)
-"""Share of a parameter that a part shows at least and at most, if its bar does not allow more. A
-turn during the scan need not be even: of one by 20 to 30 mrad, on the measured map of an MRI
-magnet, halves showed 0.65 to 1.9 of what the whole did."""
+ALIKE_PARTS, PARTS_OF_A_CHANGE = (0.5, 1.5), (0.25, 4.0)
+"""Share of a parameter that a part of the map shows at least and at most, if its bar does not allow
+more; and that of a change during the scan, which need not be even. Of a turn by -27 mrad, on the
+measured map of an MRI magnet, the first half of the scan by itself showed 0.47."""
 
 ALIKE = 30.0
 """Orientations whose log probabilities differ by less cannot be told apart. Errors that the
@@ -925,13 +925,16 @@ CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
 class Parameter:
     """A parameter in the unit of people: the product of ``row`` (p,) and `ProbeFit.instrument`.
 
-    It is left out of a model without the parameters ``own`` of a `ProbeFit`.
+    It is left out of a model without the parameters ``own`` of a `ProbeFit`, and asked with those
+    ``beside`` it: a change during the scan need not be even, and halves of the map show other parts
+    of it.
     """
 
     name: str
     unit: str
     row: Floats
     own: tuple[int, ...]
+    beside: tuple[int, ...] = ()
 
 
 def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
@@ -945,10 +948,10 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     found = []
 
     def add(name: str, unit: str, factor: float, weights: dict[int, float],
-            own: tuple[int, ...] = ()) -> None:
+            own: tuple[int, ...] = (), beside: tuple[int, ...] = ()) -> None:
         row = np.zeros(len(prior_sd))
         row[list(weights)] = factor * np.array(list(weights.values()))
-        found.append(Parameter(name, unit, row * prior_sd, own or tuple(weights)))
+        found.append(Parameter(name, unit, row * prior_sd, own or tuple(weights), beside))
 
     for sensor, along in product(range(3), repeat=2):
         add(f"{COMPONENTS[along]} of the B{COMPONENTS[sensor]} sensor from the mean of all", "mm",
@@ -967,14 +970,16 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     for (when, by_wave), own in product(CHANGES.items(), range(3)):
         add(f"turn about {COMPONENTS[own]} {when}", "mrad", 1e3,
             {TURNS.start + 3 * wave + own: weight for wave, weight in by_wave.items()},
-            (TURNS.start + 3 * min(by_wave) + own,))
+            (TURNS.start + 3 * min(by_wave) + own,),
+            tuple(TURNS.start + 3 * min(each) + own for each in CHANGES.values()))
     for own in range(3):
         add(f"change of the offset of B{COMPONENTS[own]} from start to end", "mT", 2e3,
             {OFFSETS.start + own: 1.0})
     for when, by_wave in CHANGES.items():
         add(f"change of the gain {when}", "%", 100.0,
             {GAINS.start + wave: weight for wave, weight in by_wave.items()},
-            (GAINS.start + min(by_wave),))
+            (GAINS.start + min(by_wave),),
+            tuple(GAINS.start + min(each) for each in CHANGES.values()))
     add("lag of the readings behind the stage", "mm", 1e3, {LAG: 1.0})
     return found
 
@@ -1109,8 +1114,9 @@ def _term(
     determined = 0.5
     if not parameter.row.any():  # it is not asked, see `ProbeModel`
         return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True), 0.0
-    used = np.flatnonzero(kept | (np.isin(np.arange(len(kept)), parameter.own)))
-    row = parameter.row[used]
+    used = np.flatnonzero(kept | np.isin(
+        np.arange(len(kept)), parameter.own + parameter.beside))
+    row = np.where(np.isin(used, parameter.own) | kept[used], parameter.row[used], 0.0)
     estimates = [each.estimate(used) for each in told]
     value, *of_parts = (float(row @ mean) for mean, _ in estimates)
     sd, *sd_of_parts = (float(np.sqrt(row @ covariance @ row)) for _, covariance in estimates)
@@ -1119,8 +1125,8 @@ def _term(
     beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if of_parts else 1.0
     sees = SEEN * beyond * sds < abs(value)
     share = values / value if value else np.zeros(len(values))
-    off = (np.abs(values - value) > SEEN * sds) & ((share < ALIKE_PARTS[0])
-                                                   | (share > ALIKE_PARTS[1]))
+    least, most = PARTS_OF_A_CHANGE if parameter.beside else ALIKE_PARTS
+    off = (np.abs(values - value) > SEEN * sds) & ((share < least) | (share > most))
     supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any() and (
         SEEN * ([sd, *sd_of_parts][flat] if flat else 0.0) < abs(value)))
     prior = float(np.linalg.norm(row))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import magpylib
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
 from halbach_fe.cli.measured import floor_of
@@ -689,6 +690,26 @@ def test_a_change_during_the_scan_must_predict_lines(generator):
     assert "Not stated" not in undetermined(check)
     unlike = replace(check, terms=(replace(gain, determined=False, predictive=False),))
     assert undetermined(unlike).startswith("Not stated, because parts of the map contradict")
+
+
+def test_a_turn_that_is_not_even_is_found(generator, monkeypatch):
+    """By 30 mrad during the scan, and 8 mrad more in its middle; the first half shows another turn
+    than the second. The control judges halves as those of what does not change.
+    """
+    time, field = np.linspace(-1, 1, len(GRID)), [0.0, 0.0, 0.043] + 0.02 * source().getB(GRID)
+    turn = Rotation.from_rotvec((8e-3 * time**2 - 15e-3 * time)[:, None] * [1.0, 0.0, 0.0])
+    shown = field_map(GRID, turn.inv().apply(field) + 5e-6 * generator.standard_normal(GRID.shape))
+    check = check_map(shown)
+    for name, value in (("turn about x from start to end", -30.0),
+                        ("turn about x from the ends to the middle", -8.0)):
+        term = named(check, name)
+        assert term.found
+        assert abs(term.value - value) < 4 * term.sd
+    assert check.floor_rms_T < 2 * 5e-6
+    every = map_check.all_parameters
+    monkeypatch.setattr(map_check, "all_parameters", lambda *known: [
+        replace(one, beside=()) for one in every(*known)])
+    assert check_map(shown).floor_rms_T > 10 * check.floor_rms_T
 
 
 def test_a_region_in_which_lines_are_not_predicted_is_named(generator):
