@@ -370,8 +370,8 @@ class IronPermeabilityEffect(Effect):
         iron = iron_of(study)
         if iron is None:
             return study
-        if place.slot:
-            bodies = list(iron.bodies)
+        if place.slot and study.iron is not None:
+            bodies = list(study.iron.bodies)
             bodies[place.slot - 1] = _more_permeable(bodies[place.slot - 1], values[0])
             return study.with_(iron__bodies=tuple(bodies))
         return study.with_(**{key: _more_permeable(iron, values[0])})
