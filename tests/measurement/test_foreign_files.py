@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import nullcontext
+from time import process_time
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from halbach_fe.core.errors import MeasurementError
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
+from halbach_fe.measurement.formats.text import undecorated
 from tests.measurement.foreign_files import (
     FIELD,
     FILES,
@@ -99,6 +101,45 @@ def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(MeasurementError, match=asked):
         import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize(("field", "cells", "stated"), [
+    ("Bx[T],By[T],Bz[T]", "0.1,0.2,0.3", {}), ("B[T]", "0.1", {"component": "z"})])
+def test_scans_that_are_named_after_their_axis_are_no_components(tmp_path, field, cells, stated):
+    """Negative control of components in rows of their own: three scans that cross in one point."""
+    path = tmp_path / "file.txt"
+    path.write_text(f"scan,x[mm],y[mm],z[mm],{field}\n" + "".join(
+        f"{name},{','.join(str(at * (axis == name)) for axis in 'xyz')},{cells}\n"
+        for name in "xyz" for at in range(-2, 3)))
+    found = import_map(path, DeclaredFormat(**stated)).data
+    assert found["scan"].values.tolist() == [*"xxxxxyyyyyzzzzz"]
+
+
+@pytest.mark.parametrize("name", ["Standard deviation of B{}", "Std. dev. of B{}", "delta {}",
+                                  "Gradient {}", "Background {}", "residual B{}"])
+def test_what_is_no_component_is_not_known_by_its_axis(tmp_path, name):
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm]," + ",".join(name.format(axis) + " (mT)" for axis in "xyz")
+                    + "\n1,2,3,0.1,0.1,0.1\n")
+    with pytest.raises(MeasurementError, match="which columns are Bx, By or Bz"):
+        import_map(path, DeclaredFormat())
+
+
+def test_the_noise_of_x_in_a_unit_of_the_field_is_that_of_Bx(tmp_path):
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT],sd x (mT),sd y (mT),sd z (mT)\n"
+                    "1,2,3,100,100,100,0.1,0.2,0.3\n")
+    data = import_map(path, DeclaredFormat()).data
+    assert np.allclose(data["sigma_T"], [[1e-4, 2e-4, 3e-4]], rtol=1e-12)
+
+
+def test_long_rows_are_read_in_a_time_that_grows_as_they_do():
+    """Of a row with many blanks its end was sought once for all pairs of blanks."""
+    row = (" " * 15).join(["1.234567e-3"] * 60)
+    began = process_time()
+    assert undecorated(row) == row
+    assert undecorated(f"{row};") == row
+    assert process_time() - began < 0.2  # 1e-4 s; it took 2.3 s
 
 
 def test_rows_that_begin_as_a_grid_of_astra_are_rows(tmp_path):

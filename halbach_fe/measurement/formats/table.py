@@ -118,9 +118,9 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         other, or if the values are too large for a map of a permanent magnet.
     """
     columns = _with_times(_columns(table, declared), table)
-    _refuse_rows_of_components(table)
     missing: list[str] = []
     used = _used(columns, table, declared, missing)
+    _refuse_rows_of_components(used, table)
     missing += _missing(used, columns, table, declared)
     unit_of: dict[str, str] = {}
     for kind in OPTIONS:
@@ -197,11 +197,18 @@ def _refuse_placeholder(values: Floats, name: str, where: str) -> None:
             f"{values[row]:g}, which looks like a placeholder", PLACEHOLDER))
 
 
-def _refuse_rows_of_components(table: ForeignTable) -> None:
+def _refuse_rows_of_components(used: dict[str, int], table: ForeignTable) -> None:
     """Raise MeasurementError for a table that has each component of a reading in a row of its own.
 
-    A column of it holds the names of the components.
+    A column of it holds the names of the components, and the places are repeated; scans along x, y
+    and z that are named so have few places in common.
     """
+    several = 0.75  # places per row, from which rows are readings at places of their own
+    places = np.unique(table.values[:, [used[name] for name in used
+                                        if _kind(name) in ("length", "angle")]], axis=0)
+    if sum(name in used for name in names.FIELDS) > 1 or (
+            places.size and len(places) > several * len(table.values)):
+        return
     for column, cells in table.texts.items():
         found = {cell.strip().lower() for _, cell in cells.values()}
         if len(cells) == len(table.values) and len(found) > 1 and (
