@@ -183,7 +183,10 @@ def taking_arrays(function: Function) -> Function:
 
 def _is_array(value: object) -> bool:
     """Return whether an argument is an array of readings, and no session."""
-    return not isinstance(value, xr.Dataset) and bool(np.ndim(cast(ArrayLike, value)))
+    try:
+        return not isinstance(value, xr.Dataset) and bool(np.ndim(cast(ArrayLike, value)))
+    except ValueError:  # lists of different length
+        return True
 
 
 def _refuse_exchanged(magnet: Any, data: xr.Dataset) -> None:
