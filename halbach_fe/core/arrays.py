@@ -26,7 +26,7 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     ------
     TypeError, ValueError
         If they are no real numbers, have a unit of their own, or are a DataFrame whose columns are
-        named after other axes than ``axes``, or in another order, or state another unit than m or T.
+        named after other axes than ``axes``, are in another order, or state a unit but m or T.
     """
     if np.iscomplexobj(values):
         raise TypeError("complex numbers")
