@@ -748,6 +748,11 @@ def check_magnitudes(data: xr.Dataset) -> None:
                     "Correct it, or instrument.flux_density_unit_T of the study."))
 
 
+TO_METRES = ("Then name the columns of the map, as CSV, x_mm, y_mm, z_mm and convert it by "
+             "halbach-fe import-map")
+"""What to do with a map of halbach-fe's own, whose header says m, if its points are in mm."""
+
+
 def doubt_of_metres(data: xr.Dataset, unit: str = "") -> str:
     """Return a sentence if the points of a map lie where few magnets have a field, else nothing.
 
@@ -766,8 +771,7 @@ def doubt_of_metres(data: xr.Dataset, unit: str = "") -> str:
 def warn_of_millimetres(data: xr.Dataset) -> None:
     """Warn, where no study tells how large the magnet is, of points that are rather in mm."""
     if doubt := doubt_of_metres(data):
-        warnings.warn(f"{doubt} Then name the columns x_mm, y_mm, z_mm and convert the map by "
-                      "halbach-fe import-map.", HalbachWarning, stacklevel=2)
+        warnings.warn(f"{doubt} {TO_METRES}.", HalbachWarning, stacklevel=2)
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import field_map, points_of, write_map
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
 from halbach_fe.measurement.formats.text import undecorated
@@ -201,6 +201,21 @@ def test_points_far_away_say_what_can_be_followed(tmp_path, unit, stated, advice
     assert re.search(advice, found.imported.remarks[-1])
     followed = {"columns": TRIPLE} if unit else {"length_unit": "mm"}
     assert same(import_map(path, DeclaredFormat(**followed)).data)
+
+
+@pytest.mark.parametrize(("name", "stated", "advice"), [
+    ("map.h5", {}, "columns of the map, as CSV, x_mm, y_mm, z_mm"),
+    ("file.txt", {"at": {"r": 10.0, "z": 0.0}}, "mm[?] --at is in m[.]$")])
+def test_what_states_no_length_is_not_sent_to_its_unit(tmp_path, name, stated, advice):
+    """It is refused for maps of halbach-fe's own, and where all positions are of an option."""
+    path = tmp_path / name
+    if name.endswith("h5"):
+        write_map(field_map(1e3 * POINTS, FIELD), path)
+    else:
+        path.write_text("phi[deg],Br[T],Bphi[T]\n0,0.1,0.1\n90,0.2,0.1\n")
+    assert re.search(advice, import_map(path, DeclaredFormat(**stated)).imported.remarks[-1])
+    with pytest.raises(MeasurementError):
+        import_map(path, DeclaredFormat(**stated, length_unit="mm"))
 
 
 def test_number_of_files():

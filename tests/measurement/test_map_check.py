@@ -671,7 +671,7 @@ def test_times_that_are_not_those_of_the_rows(generator):
 def test_points_that_are_rather_in_millimetres(tmp_path):
     for write in (lambda data: check_map(data), lambda data: export_map(
             data, "csv", tmp_path / "map.csv")):
-        with pytest.warns(HalbachWarning, match=r"in mm\?.*name the columns x_mm, y_mm, z"):
+        with pytest.warns(HalbachWarning, match=r"in mm\?.*columns .* x_mm, y_mm, z"):
             write(field_map(300 * GRID, 0.1 + GRID))
         write(field_map(GRID, 0.1 + GRID))  # the control: warnings are errors
     path = tmp_path / "in_mm.csv"  # what the warning says works
