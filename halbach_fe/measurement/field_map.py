@@ -91,7 +91,7 @@ def field_map(
     ----------
     points_m : array_like, shape (n, 3)
     B_T : array_like, shape (n, components)
-        Readings; NaN where there is none.
+        Readings, of one component (n,) too; NaN where there is none.
     sigma_T : array_like, optional
         Standard deviation of the noise: one number, one for each reading (n,) or each component,
         or of the shape of ``B_T``.
@@ -121,6 +121,8 @@ def field_map(
     except (TypeError, ValueError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
+    if given.ndim == len(components) == 1:
+        given = given[:, None]
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
     count = points.shape[0] if points.ndim else 0
     if points.shape != (count, 3) or given.shape != (count, len(components)) or (
