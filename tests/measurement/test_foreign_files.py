@@ -82,6 +82,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("r[mm],angle[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,270,40,0.1\n", "from the z axis theta"),
     ("r[mm],latitude[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,40,40,0.1\n", "of 90 degrees less it"),
     ("r[mm],theta[deg],phi[deg],Br[T],Bphi[T]\n8,30,0,0.1,0\n", "Btheta, without which Br and"),
+    ("theta[deg],phi[deg],|B|[T]\n30,0,0.1\n", r"does not say r \(--at r=0.01 in m"),
     ("r[mm],theta[deg],phi[deg],Br[T],Btheta[T],Bphi[T],sigma_Br[T]\n8,30,0,0.1,0,0,1e-4\n",
      "one for all components"),
     ("3 -1 0 1\n3 -1 0 1\n3 -2 0 2\n" + "0.1 0.2 0.3\n" * 9, "ASTRA.*from its three files"),
@@ -216,6 +217,23 @@ def test_what_states_no_length_is_not_sent_to_its_unit(tmp_path, name, stated, a
     assert re.search(advice, import_map(path, DeclaredFormat(**stated)).imported.remarks[-1])
     with pytest.raises(MeasurementError):
         import_map(path, DeclaredFormat(**stated, length_unit="mm"))
+
+
+def test_a_sphere_of_one_radius(tmp_path):
+    """Its radius may be an option, as that of a circle."""
+    path = tmp_path / "file.txt"
+    path.write_text("theta[deg],phi[deg],Br[mT],Btheta[mT],Bphi[mT]\n90,90,1,2,3\n")
+    data = import_map(path, DeclaredFormat(at={"r": 0.01})).data
+    assert np.allclose(points_of(data), [[0, 0.01, 0]], rtol=0, atol=1e-17)
+    assert np.allclose(data["B_T"], [[-3e-3, 1e-3, -2e-3]], rtol=0, atol=1e-17)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_rows_and_header_that_a_delimiter_ends(tmp_path, mark):
+    path = tmp_path / "file.txt"
+    path.write_text(HEADER.replace(",", mark).replace("\n", f"{mark}\n")
+                    + table(mark).replace("\n", f"{mark}\n"))
+    assert same(import_map(path, DeclaredFormat()).data)
 
 
 def test_number_of_files():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -170,13 +170,17 @@ def _words(base: str) -> list[str]:
     return re.split(r"[\s_]+", TWO_WORDS.sub("std", base.lower().strip()))
 
 
-def with_polar(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
+def with_polar(
+    columns: Sequence[ColumnName], constant: Collection[str] = ()
+) -> tuple[ColumnName, ...]:
     """Return the columns, of which theta beside phi is the angle from the z axis, and Btheta the
     component along it. Without phi theta is the angle about z.
+
+    Coordinates of the file may be ``constant``; r may be missing, if x, y and z are no columns.
     """
     keys = [_key(split_unit(column.text)[0]) for column in columns]
-    if not {"r", "theta", "phi"} <= {"r" if column.quantity == "r" else key
-                                     for key, column in zip(keys, columns, strict=True)}:
+    there = {*constant, *(column.quantity for column in columns)}
+    if not {"theta", "phi"} <= {*keys} or ("r" not in there and {"x", "y", "z"} & there):
         return tuple(columns)
     return tuple(replace(column, quantity=POLAR[key]) if key in POLAR else column
                  for key, column in zip(keys, columns, strict=True))

@@ -384,7 +384,7 @@ def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[Col
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
     """Return the file's columns with the names and units that the user states instead."""
     if not declared.columns:
-        return _of_h(names.with_polar(table.columns))
+        return _of_h(names.with_polar(table.columns, declared.at))
     count = len(table.columns) - table.added
     more = declared.columns[count:]  # delimiters at the ends of lines have no column in the table
     if len(declared.columns) < count or any(text != "-" for text in more):
@@ -393,7 +393,7 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
             f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
     own = names.with_polar([ColumnName("") if text == "-" else names.parse(text, stated=True)
-                            for text in declared.columns])
+                            for text in declared.columns], declared.at)
     for text, stated, column in zip(declared.columns, own, table.columns[:count], strict=False):
         if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
             raise MeasurementError(must_be(
