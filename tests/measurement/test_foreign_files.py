@@ -219,6 +219,19 @@ def test_what_states_no_length_is_not_sent_to_its_unit(tmp_path, name, stated, a
         import_map(path, DeclaredFormat(**stated, length_unit="mm"))
 
 
+def test_a_factor_in_the_place_of_a_unit_is_not_left_out(tmp_path):
+    """The message says how to state it; 1 is none."""
+    path = tmp_path / "file.txt"
+    for factor, read in (("1.0", 4.0), ("1e-3", 4e-3)):
+        path.write_text(f"x[mm],y[mm],z[mm],Bx[{factor}]\n1,2,3,4\n")
+        with nullcontext() if factor == "1.0" else pytest.raises(
+                MeasurementError, match=r"--columns \.\.\.Bx\[1e-3 T\]"):
+            import_map(path, DeclaredFormat(field_unit="T"))
+        data = import_map(path, DeclaredFormat(columns=(
+            "x[mm]", "y[mm]", "z[mm]", f"Bx[{factor} T]"))).data
+        assert np.isclose(data["B_T"].values[0, 0], read, rtol=1e-12)
+
+
 def test_a_sphere_of_one_radius(tmp_path):
     """Its radius may be an option, as that of a circle."""
     path = tmp_path / "file.txt"

@@ -629,6 +629,8 @@ def _units(
         if not units.states_no_unit(text) and (not unit or (
                 kind != "time" and units.kind_of(unit) != kind)):
             stated = next(iter(units.KINDS[kind]))
+            if units.unit_symbol(f"{text} {stated}"):  # a factor
+                stated = f"{text} {stated}"
             missing.append(f"the unit of {name}, as '{text[:20]}' is none of "
                            f"{', '.join(units.KINDS[kind])} (--columns ...{name}[{stated}])")
             continue
