@@ -99,7 +99,7 @@ def halbach_ring(
     for key, value in {"inner_radius_m": inner_radius_m, "outer_radius_m": outer_radius_m,
                        "length_m": length_m, "remanence_T": remanence_T,
                        "recoil_permeability": recoil_permeability}.items():
-        if value is not None:
+        if value is not None or key.endswith("radius_m"):
             check_number(key, "halbach_ring", value)
     ring_length = None if length_m is None else length_m / rings
     magnet = new_magnet(MagnetTemplate(

@@ -15,6 +15,9 @@ Ints = NDArray[np.int64]
 AXIS = re.compile(r"[bB]?_?([xyzXYZ])(?![A-Za-z])")
 """How the name of a column of a DataFrame begins that is of an axis: x, x_m, Bx, Bx_T."""
 
+OTHER_UNIT = re.compile(r"(?<![A-Za-z])(mm|cm|um|inch|mT|uT|nT|k?G|gauss)\W?$")
+"""How such a name ends that states another unit than m or T: x_mm, Bx [mT]."""
+
 
 def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     """Return a copy of numbers as floats, NaN where an array is masked.
@@ -23,7 +26,7 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     ------
     TypeError, ValueError
         If they are no real numbers, have a unit of their own, or are a DataFrame whose columns are
-        named after other axes than ``axes``, or in another order.
+        named after other axes than ``axes``, are in another order, or state a unit but m or T.
     """
     if np.iscomplexobj(values):
         raise TypeError("complex numbers")
@@ -34,4 +37,8 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     if named and all(named) and [one[1].lower() for one in named if one] != list(axes):
         raise ValueError(f"columns named {', '.join(map(str, values.columns))} in place of "  # type: ignore[union-attr]
                          f"{', '.join(axes)}, in this order")
+    if scaled := [name for name in map(str, getattr(values, "columns", ()))
+                  if OTHER_UNIT.search(name)]:
+        raise ValueError(f"columns in other units than m and T: {', '.join(scaled)}; convert them "
+                         "and name them anew")
     return np.array(np.ma.filled(np.ma.asarray(values, float), np.nan))

@@ -153,7 +153,7 @@ def file_bytes(path: Path, where: str, workbooks: bool = False) -> bytes:
         raise MeasurementError(must_be("content", where, "a table of readings", "an empty file"))
     if (workbook := workbook_in(raw)) is not None and not (
             workbooks and workbook == "Excel" and raw.startswith(b"PK")):
-        raise MeasurementError(workbook_sentence(where, workbook))
+        raise MeasurementError(workbook_sentence(where, raw))
     return raw
 
 
@@ -167,10 +167,11 @@ def workbook_in(raw: bytes) -> str | None:
     return None
 
 
-def workbook_sentence(where: str, program: str) -> str:
+def workbook_sentence(where: str, raw: bytes) -> str:
     """Return the sentence for a workbook in place of a table of text."""
-    converted = ("; or convert the file by halbach-fe import-map, or import-blocks"
-                 if program == "Excel" else "")
+    program = workbook_in(raw)
+    converted = ("; or convert a map by halbach-fe import-map, and blocks by import-blocks"
+                 if program == "Excel" and raw.startswith(b"PK") else "")
     return must_be("content", where, "a table of text (CSV)", f"an {program} workbook",
                    f"Save the sheet as CSV{converted}.")
 

@@ -111,6 +111,8 @@ def check_number(
     StudyError
         If it is no finite number from ``low`` to ``high``, or a ``whole`` one is not.
     """
+    if getattr(value, "shape", None) == () and hasattr(value, "dtype"):  # an array of one number
+        value = value.item()  # type: ignore[attr-defined]
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if whole and not isinstance(value, Integral):
         number = math.nan

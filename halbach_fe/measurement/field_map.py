@@ -74,8 +74,8 @@ MAX_FIELD_T = 10.0
 probably in mT or G."""
 
 PLACEHOLDERS = 0.1
-"""Share of rows below which values too large are those of single rows, and no matter of the unit:
-no map of a magnet has so few strong readings, and 9999 stands for none."""
+"""Share of rows below which values too large may be those of single rows, as 9999 that stands for
+none, and no matter of the unit."""
 
 COPIES = 0.1
 """Share of rows from which rows that are alike in all numbers are copies, and no chance."""
@@ -91,7 +91,7 @@ def field_map(
     ----------
     points_m : array_like, shape (n, 3)
     B_T : array_like, shape (n, components)
-        Readings; NaN where there is none.
+        Readings, of one component (n,) too; NaN where there is none.
     sigma_T : array_like, optional
         Standard deviation of the noise: one number, one for each reading (n,) or each component,
         or of the shape of ``B_T``.
@@ -121,6 +121,8 @@ def field_map(
     except (TypeError, ValueError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
+    if given.ndim == len(components) == 1:
+        given = given[:, None]
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
     count = points.shape[0] if points.ndim else 0
     if points.shape != (count, 3) or given.shape != (count, len(components)) or (
@@ -183,7 +185,10 @@ def taking_arrays(function: Function) -> Function:
 
 def _is_array(value: object) -> bool:
     """Return whether an argument is an array of readings, and no session."""
-    return not isinstance(value, xr.Dataset) and bool(np.ndim(cast(ArrayLike, value)))
+    try:
+        return not isinstance(value, xr.Dataset) and bool(np.ndim(cast(ArrayLike, value)))
+    except ValueError:  # lists of different length
+        return True
 
 
 def _refuse_exchanged(magnet: Any, data: xr.Dataset) -> None:
@@ -713,25 +718,28 @@ def check_magnitudes(data: xr.Dataset) -> None:
     largest = float(by_component.max())
     beyond = np.flatnonzero((np.nan_to_num(np.abs(values)) > MAX_FIELD_T).reshape(
         len(values), -1).any(axis=1))
-    if 0 < len(beyond) < PLACEHOLDERS * len(values):
-        raise MeasurementError(must_be(
-            f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
-            f"{largest:g}, one of {len(beyond)} of {len(values)} rows that are not",
-            "If the meter had no reading there, leave the cell empty, or remove the row."))
-    if largest > MAX_FIELD_T:
+    if len(beyond):
         unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
                                ("millitesla", "mT", 1e-3))
-        beyond = by_component > MAX_FIELD_T
-        some = "" if (beyond | (by_component == 0)).all() else " and ".join(
-            column for column, wrong in zip(FIELD_COLUMNS, beyond, strict=True) if wrong)
+        wrong = by_component > MAX_FIELD_T
+        some = "" if (wrong | (by_component == 0)).all() else " and ".join(
+            column for column, too_large in zip(FIELD_COLUMNS, wrong, strict=True) if too_large)
+        units = (
+            f"in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
+            f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
+            "halbach-fe import-map.")
+        if len(beyond) < PLACEHOLDERS * len(values):
+            raise MeasurementError(must_be(
+                f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
+                f"{largest:g}, one of {len(beyond)} of {len(values)} rows that are not",
+                "If the meter had no reading there, leave the cell empty, or remove the row. Or is "
+                f"all of the map {units}"))
         raise MeasurementError(must_be(
             some or "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
-            f"Are they in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
-            f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
-            "halbach-fe import-map." + (
+            f"Are they {units}" + (
                 f" If only {some} is in {unit}, multiply this column of the file by {factor:g}."
                 if some else "")))
-    elif TOTAL_COLUMN in data:
+    if TOTAL_COLUMN in data:
         _check_length(data, where)
     if sigmas is not None:
         sigma = sigmas.values[~np.isnan(values)]
@@ -740,6 +748,11 @@ def check_magnitudes(data: xr.Dataset) -> None:
                 raise MeasurementError(must_be(
                     "sigma", where, f"from {MIN_SIGMA_T:g} to {MAX_SIGMA_T:g} T", f"{extreme:g}",
                     "Correct it, or instrument.flux_density_unit_T of the study."))
+
+
+TO_METRES = ("Then name the columns of the map, as CSV, x_mm, y_mm, z_mm and convert it by "
+             "halbach-fe import-map")
+"""What to do with a map of halbach-fe's own, whose header says m, if its points are in mm."""
 
 
 def doubt_of_metres(data: xr.Dataset, unit: str = "") -> str:
@@ -760,8 +773,7 @@ def doubt_of_metres(data: xr.Dataset, unit: str = "") -> str:
 def warn_of_millimetres(data: xr.Dataset) -> None:
     """Warn, where no study tells how large the magnet is, of points that are rather in mm."""
     if doubt := doubt_of_metres(data):
-        warnings.warn(f"{doubt} Then convert the map by halbach-fe import-map with --length-unit "
-                      "mm.", HalbachWarning, stacklevel=2)
+        warnings.warn(f"{doubt} {TO_METRES}.", HalbachWarning, stacklevel=2)
 
 
 def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
-from halbach_fe.core.numbers import MAD_TO_SD, decimals
+from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
@@ -373,6 +373,8 @@ def join_maps(
 
     Raises
     ------
+    StudyError
+        If there are fewer than two maps, or ``turn_rad`` is no such number.
     MeasurementError
         If a map does not obey Maxwell's equations by itself, or there is no place where its
         readings are those of the others: it is mirrored, of another magnet, or overlaps none.
@@ -392,6 +394,7 @@ def join_maps(
     if not isinstance(maps, Mapping) or len(maps) < 2:
         raise StudyError(must_be("`maps`", "join_maps", "two maps or more, by name",
                                  "fewer", "check_map checks a single one."))
+    check_number("turn_rad", "join_maps", turn_rad, 1e-12, np.pi / 2)
     checked = []
     for name, data in maps.items():
         say(f"checking {name}")

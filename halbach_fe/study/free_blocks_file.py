@@ -172,8 +172,8 @@ def _read(path: Path, where: str) -> _Content:
 
 def _csv(raw: bytes, where: str) -> _Content:
     """Return the cells of a CSV file as text, "" where they are empty."""
-    if (workbook := workbook_in(raw)) is not None:
-        raise StudyError(workbook_sentence(where, workbook))
+    if workbook_in(raw) is not None:
+        raise StudyError(workbook_sentence(where, raw))
     try:
         text = raw.decode("utf-8-sig")  # spreadsheets write a byte order mark
     except UnicodeDecodeError as error:

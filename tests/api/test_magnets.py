@@ -157,12 +157,17 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
 @pytest.mark.parametrize(("call", "said"), [
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": "30 mm"}), "inner_radius_m.*number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "finite number"),
+    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": None}), "inner_radius_m.*number"),
     (lambda frame: hf.halbach_ring(**RING).field_T(frame[["z", "y", "x"]]), "z, y, x in place of"),
     (lambda frame: hf.halbach_ring(**RING).field_T(Quantity()), "unit of their own"),
     (lambda frame: hf.field_map(frame, frame[["y", "x", "z"]]), "y, x, z in place of x, y, z"),
     (lambda frame: hf.field_map(frame, frame[["x", "y"]].rename(columns="B{}_T".format),
                                 components=["y", "x"]), "Bx_T, By_T in place of y, x"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.rename(columns="{}_mm".format)),
+     "other units than m and T: x_mm, y_mm, z_mm"),
+    (lambda frame: hf.field_map(frame, frame.rename(columns="B{} [mT]".format)), r"Bx \[mT\]"),
     (lambda frame: hf.field_map(3.0, 3.0), "of shapes"),
+    (lambda frame: hf.infer(hf.halbach_ring(**RING), frame, [[0.1], [0.1, 0.2]]), "is none"),
     (lambda frame: hf.to_magpylib(hf.halbach_ring(**RING).study), "must be a Magnet"),
     (lambda frame: hf.write_study("ring.toml", hf.halbach_ring(**RING)), "be a Magnet"),
     (lambda frame: hf.field_map(frame, frame, "50 uT"), "sigma_T.*numbers in T"),
@@ -171,7 +176,10 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
 def test_arrays_that_say_what_they_are(call, said):
     """Columns by name and numbers with units are not read as if they were plain."""
     frame = pandas.DataFrame([[0.0, 0.001, 0.0], [0.0, 0.0, 0.001]], columns=["x", "y", "z"])
-    assert np.isfinite(hf.halbach_ring(**RING).field_T(frame)).all()
+    ring = hf.halbach_ring(**RING | {"inner_radius_m": np.array(0.03)})  # the control
+    assert np.isfinite(ring.field_T(frame)).all()
+    along = hf.field_map(frame, [0.1, 0.2], components=["y"])["B_T"].sel(component="y")
+    assert along.values.tolist() == [0.1, 0.2]
     with pytest.raises(hf.HalbachError, match=said):
         call(frame)
 

@@ -144,6 +144,8 @@ def test_workbooks(tmp_path, capsys, kind, program, what):
     assert code == (3 if what in ("free", "iron") else 4)
     assert f"an {program} workbook" in sentence
     assert "ave the sheet as CSV" in sentence
+    assert ("by halbach-fe import-map" in sentence) == (  # which reads no other workbooks
+        kind == "xlsx" and what not in ("import-map", "iron"))
 
 
 @pytest.mark.parametrize("text", [

@@ -194,6 +194,9 @@ def test_single_rows_that_are_no_readings():
         check_magnitudes(field_map(points, field))
     with pytest.raises(MeasurementError, match="Are they in gauss"):
         check_magnitudes(field_map(points, 1e4 * (0.1 + points)))
+    tail = 300 * np.exp(-(np.arange(40.0) / 1.5)**2)  # in mT, of a short magnet
+    with pytest.raises(MeasurementError, match=r"reading 1 .* all of the map in millitesla"):
+        check_magnitudes(field_map(points, np.tile(tail[:, None], 3)))
 
 
 def test_another_table_is_not_replaced(tmp_path):

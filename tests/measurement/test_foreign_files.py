@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from contextlib import nullcontext
+from time import process_time
 
 import numpy as np
 import pytest
 
 from halbach_fe.core.errors import MeasurementError
-from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.field_map import field_map, points_of, write_map
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import import_map
+from halbach_fe.measurement.formats.text import undecorated
 from tests.measurement.foreign_files import (
     FIELD,
     FILES,
@@ -80,6 +82,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("r[mm],angle[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,270,40,0.1\n", "from the z axis theta"),
     ("r[mm],latitude[deg],phi[deg],|B|[T]\n8,30,0,0.1\n8,40,40,0.1\n", "of 90 degrees less it"),
     ("r[mm],theta[deg],phi[deg],Br[T],Bphi[T]\n8,30,0,0.1,0\n", "Btheta, without which Br and"),
+    ("theta[deg],phi[deg],|B|[T]\n30,0,0.1\n", r"does not say r \(--at r=0.01 in m"),
     ("r[mm],theta[deg],phi[deg],Br[T],Btheta[T],Bphi[T],sigma_Br[T]\n8,30,0,0.1,0,0,1e-4\n",
      "one for all components"),
     ("3 -1 0 1\n3 -1 0 1\n3 -2 0 2\n" + "0.1 0.2 0.3\n" * 9, "ASTRA.*from its three files"),
@@ -99,6 +102,45 @@ def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(MeasurementError, match=asked):
         import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize(("field", "cells", "stated"), [
+    ("Bx[T],By[T],Bz[T]", "0.1,0.2,0.3", {}), ("B[T]", "0.1", {"component": "z"})])
+def test_scans_that_are_named_after_their_axis_are_no_components(tmp_path, field, cells, stated):
+    """Negative control of components in rows of their own: three scans that cross in one point."""
+    path = tmp_path / "file.txt"
+    path.write_text(f"scan,x[mm],y[mm],z[mm],{field}\n" + "".join(
+        f"{name},{','.join(str(at * (axis == name)) for axis in 'xyz')},{cells}\n"
+        for name in "xyz" for at in range(-2, 3)))
+    found = import_map(path, DeclaredFormat(**stated)).data
+    assert found["scan"].values.tolist() == [*"xxxxxyyyyyzzzzz"]
+
+
+@pytest.mark.parametrize("name", ["Standard deviation of B{}", "Std. dev. of B{}", "delta {}",
+                                  "Gradient {}", "Background {}", "residual B{}"])
+def test_what_is_no_component_is_not_known_by_its_axis(tmp_path, name):
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm]," + ",".join(name.format(axis) + " (mT)" for axis in "xyz")
+                    + "\n1,2,3,0.1,0.1,0.1\n")
+    with pytest.raises(MeasurementError, match="which columns are Bx, By or Bz"):
+        import_map(path, DeclaredFormat())
+
+
+def test_the_noise_of_x_in_a_unit_of_the_field_is_that_of_Bx(tmp_path):
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT],sd x (mT),sd y (mT),sd z (mT)\n"
+                    "1,2,3,100,100,100,0.1,0.2,0.3\n")
+    data = import_map(path, DeclaredFormat()).data
+    assert np.allclose(data["sigma_T"], [[1e-4, 2e-4, 3e-4]], rtol=1e-12)
+
+
+def test_long_rows_are_read_in_a_time_that_grows_as_they_do():
+    """Of a row with many blanks its end was sought once for all pairs of blanks."""
+    row = (" " * 15).join(["1.234567e-3"] * 60)
+    began = process_time()
+    assert undecorated(row) == row
+    assert undecorated(f"{row};") == row
+    assert process_time() - began < 0.2  # 1e-4 s; it took 2.3 s
 
 
 def test_rows_that_begin_as_a_grid_of_astra_are_rows(tmp_path):
@@ -160,6 +202,51 @@ def test_points_far_away_say_what_can_be_followed(tmp_path, unit, stated, advice
     assert re.search(advice, found.imported.remarks[-1])
     followed = {"columns": TRIPLE} if unit else {"length_unit": "mm"}
     assert same(import_map(path, DeclaredFormat(**followed)).data)
+
+
+@pytest.mark.parametrize(("name", "stated", "advice"), [
+    ("map.h5", {}, "columns of the map, as CSV, x_mm, y_mm, z_mm"),
+    ("file.txt", {"at": {"r": 10.0, "z": 0.0}}, "mm[?] --at is in m[.]$")])
+def test_what_states_no_length_is_not_sent_to_its_unit(tmp_path, name, stated, advice):
+    """It is refused for maps of halbach-fe's own, and where all positions are of an option."""
+    path = tmp_path / name
+    if name.endswith("h5"):
+        write_map(field_map(1e3 * POINTS, FIELD), path)
+    else:
+        path.write_text("phi[deg],Br[T],Bphi[T]\n0,0.1,0.1\n90,0.2,0.1\n")
+    assert re.search(advice, import_map(path, DeclaredFormat(**stated)).imported.remarks[-1])
+    with pytest.raises(MeasurementError):
+        import_map(path, DeclaredFormat(**stated, length_unit="mm"))
+
+
+def test_a_factor_in_the_place_of_a_unit_is_not_left_out(tmp_path):
+    """The message says how to state it; 1 is none."""
+    path = tmp_path / "file.txt"
+    for factor, read in (("1.0", 4.0), ("1e-3", 4e-3)):
+        path.write_text(f"x[mm],y[mm],z[mm],Bx[{factor}]\n1,2,3,4\n")
+        with nullcontext() if factor == "1.0" else pytest.raises(
+                MeasurementError, match=r"--columns \.\.\.Bx\[1e-3 T\]"):
+            import_map(path, DeclaredFormat(field_unit="T"))
+        data = import_map(path, DeclaredFormat(columns=(
+            "x[mm]", "y[mm]", "z[mm]", f"Bx[{factor} T]"))).data
+        assert np.isclose(data["B_T"].values[0, 0], read, rtol=1e-12)
+
+
+def test_a_sphere_of_one_radius(tmp_path):
+    """Its radius may be an option, as that of a circle."""
+    path = tmp_path / "file.txt"
+    path.write_text("theta[deg],phi[deg],Br[mT],Btheta[mT],Bphi[mT]\n90,90,1,2,3\n")
+    data = import_map(path, DeclaredFormat(at={"r": 0.01})).data
+    assert np.allclose(points_of(data), [[0, 0.01, 0]], rtol=0, atol=1e-17)
+    assert np.allclose(data["B_T"], [[-3e-3, 1e-3, -2e-3]], rtol=0, atol=1e-17)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_rows_and_header_that_a_delimiter_ends(tmp_path, mark):
+    path = tmp_path / "file.txt"
+    path.write_text(HEADER.replace(",", mark).replace("\n", f"{mark}\n")
+                    + table(mark).replace("\n", f"{mark}\n"))
+    assert same(import_map(path, DeclaredFormat()).data)
 
 
 def test_number_of_files():

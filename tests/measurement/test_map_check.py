@@ -22,7 +22,8 @@ from halbach_fe.measurement.field_map import (
     readings_sha256,
     write_map,
 )
-from halbach_fe.measurement.formats.files import export_map
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.files import export_map, import_map
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
@@ -671,9 +672,14 @@ def test_times_that_are_not_those_of_the_rows(generator):
 def test_points_that_are_rather_in_millimetres(tmp_path):
     for write in (lambda data: check_map(data), lambda data: export_map(
             data, "csv", tmp_path / "map.csv")):
-        with pytest.warns(HalbachWarning, match="Are they in mm"):
+        with pytest.warns(HalbachWarning, match=r"in mm\?.*columns .* x_mm, y_mm, z"):
             write(field_map(300 * GRID, 0.1 + GRID))
         write(field_map(GRID, 0.1 + GRID))  # the control: warnings are errors
+    path = tmp_path / "in_mm.csv"  # what the warning says works
+    write_map(field_map(300 * GRID, 0.1 + GRID), path)
+    path.write_text(path.read_text().replace("x_m,y_m,z_m", "x_mm,y_mm,z_mm"))
+    found = import_map(path, DeclaredFormat()).data
+    assert np.allclose(points_of(found), 0.3 * GRID, rtol=1e-12, atol=0)
 
 
 def test_a_change_during_the_scan_must_predict_lines(generator):

@@ -262,6 +262,9 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     assert main(["check", str(tmp_path / "part0.csv"), "--turn-rad", "0.001"]) == 2
     with pytest.raises(StudyError, match="two maps or more"):
         join_maps({"part0": maps["part0"]})
+    for turn_rad in (0.0, -0.001, 2.0, np.nan, "0.001"):
+        with pytest.raises(StudyError, match="turn_rad of join_maps must be a finite number from"):
+            join_maps(maps, turn_rad=turn_rad)
     check = as_checked(maps)[0].check
     disobedient = replace(check, floor_T=np.full(3, 0.03 * check.size_T))  # as of shuffled rows
     monkeypatch.setattr(map_join, "check_map", lambda *_: disobedient)

@@ -327,6 +327,8 @@ def _header(
     plain: tuple[ColumnName, ...] = ()
     for number, line in reversed(preface):
         for cells in map(_with_vector, _splits(line, delimiter)):
+            if len(cells) == count + 1 and not cells[-1].strip():  # as the rows, with an empty end
+                cells = cells[:-1]
             columns = names.with_axes([names.parse(cell) for cell in cells])
             known = sum(bool(column.quantity) for column in columns)
             if len(cells) == count and not below and names.is_units(cells):

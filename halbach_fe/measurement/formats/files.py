@@ -14,6 +14,7 @@ from halbach_fe.core.errors import MeasurementError, OutputError, must_be, print
 from halbach_fe.core.files import atomic, file_bytes
 from halbach_fe.measurement.field_map import (
     POSITION_COLUMNS,
+    TO_METRES,
     check_readings,
     doubt_of_metres,
     read_map,
@@ -35,7 +36,7 @@ from halbach_fe.measurement.formats.grid import Grid, grid_of, implied_format, r
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import lines_of, text_of_table
 from halbach_fe.measurement.formats.units import unit_symbol
-from halbach_fe.study.types import COMPONENTS
+from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
     FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read,
@@ -109,15 +110,20 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
 
 def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
     """Return the file, with a remark if its points lie where few magnets have a field."""
-    units = file.imported.length_units
-    stated = units[0] if units and file.format in READERS and not declared.length_unit else ""
+    units, is_own = file.imported.length_units, file.format not in READERS
+    by_option = np.array([declared.at.get(axis, 0.0) for axis in COMPONENTS])
+    by_option[0] += declared.at.get("r", 0.0)
+    by_option += 0.0 if declared.origin_m is None else np.array(declared.origin_m)
+    of_file = bool(units) and not look_like_mm(by_option[None])[0]
+    stated = units[0] if of_file and not is_own and not declared.length_unit else ""
     doubt = doubt_of_metres(file.data, stated)
     if not doubt:
         return file
-    remark = f"{doubt} " + (
-        "--columns can name another, as in x[mm]" if stated else "Then give --length-unit mm") + (
-        "; and --origin-m is in m." if declared.origin_m is not None
-        else "; and --at is in m." if declared.at else ".")
+    advice = [TO_METRES if is_own else "--columns can name another, as in x[mm]" if stated else
+              "Then give --length-unit mm"] if of_file else []
+    advice += (["--origin-m is in m"] if declared.origin_m is not None else
+               ["--at is in m"] if declared.at else [])
+    remark = f"{doubt} {'; and '.join(advice)}."
     return replace(file, imported=replace(
         file.imported, remarks=(*file.imported.remarks, remark)))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -66,7 +66,8 @@ NOISE_WORDS = frozenset((
     "sigma", "σ", "sd", "std", "stdev", "stddev", "err", "error", "unc", "uncertainty", "noise"))
 """Words in the name of a column that say that it is a standard deviation."""
 TWO_WORDS = re.compile(r"(?:std|standard)[\s_.]+dev(?:iation)?\b\.?")
-NO_AXIS = NOISE_WORDS | {"offset", "shift", "step", "size"}
+NO_AXIS = NOISE_WORDS | {"offset", "shift", "step", "size", "delta", "difference", "residual",
+                         "gradient", "grad", "background", "rms"}
 """Words of a name that is no position or component, though an axis is among them."""
 GLUED = re.compile(r"(?:sigma|σ|std|stdev|err|error|unc|noise|delta|d|u)(b|b[xyzr]|bphi)"
                    r"|(b|b[xyzr]|bphi)(?:sigma|std|stdev|err|error|unc|noise)")
@@ -145,6 +146,8 @@ def _other_quantity(base: str, key: str, unit: str) -> str:
     if key == "hhmmss":
         return "t"
     of = noise_of(base, key)
+    if of in POSITIONS and kind_of(unit_symbol(unit)) == "field":
+        of = f"B{of}"  # as x in T is Bx
     return "" if of is None or of in POSITIONS else f"sigma_{of}".removesuffix("_B")
 
 
@@ -155,20 +158,29 @@ def noise_of(base: str, key: str) -> str | None:
     """
     if glued := GLUED.fullmatch(key):
         return ALIASES[glued[1] or glued[2]]
-    words = re.split(r"[\s_]+", TWO_WORDS.sub("std", base.lower().strip()))
+    words = _words(base)
     rest = [word for word in words if word not in NOISE_WORDS]
     if len(rest) == len(words):
         return None
     return ALIASES.get(_key(split_unit("_".join(rest))[0])) if rest else "B"
 
 
-def with_polar(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
+def _words(base: str) -> list[str]:
+    """Return the words of a name in lower case, of which a standard deviation is one, std."""
+    return re.split(r"[\s_]+", TWO_WORDS.sub("std", base.lower().strip()))
+
+
+def with_polar(
+    columns: Sequence[ColumnName], constant: Collection[str] = ()
+) -> tuple[ColumnName, ...]:
     """Return the columns, of which theta beside phi is the angle from the z axis, and Btheta the
     component along it. Without phi theta is the angle about z.
+
+    Coordinates of the file may be ``constant``; r may be missing, if x, y and z are no columns.
     """
     keys = [_key(split_unit(column.text)[0]) for column in columns]
-    if not {"r", "theta", "phi"} <= {"r" if column.quantity == "r" else key
-                                     for key, column in zip(keys, columns, strict=True)}:
+    there = {*constant, *(column.quantity for column in columns)}
+    if not {"theta", "phi"} <= {*keys} or ("r" not in there and {"x", "y", "z"} & there):
         return tuple(columns)
     return tuple(replace(column, quantity=POLAR[key]) if key in POLAR else column
                  for key, column in zip(keys, columns, strict=True))
@@ -194,8 +206,7 @@ def with_axes(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
             base, unit = split_unit(column.text)
             axes = AXIS.findall(base)
             of_kind = not column.quantity and kind_of(unit_symbol(unit)) == kind
-            if of_kind and len(axes) == 1 and not NO_AXIS & set(
-                    re.split(r"[\s_]+", base.lower())):
+            if of_kind and len(axes) == 1 and not NO_AXIS & set(_words(base)):
                 found.append((axes[0].lower(), index, unit))
         if sorted(axis for axis, *_ in found) == ["x", "y", "z"] and not known & set(quantities):
             for axis, index, unit in found:

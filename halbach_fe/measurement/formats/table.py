@@ -118,9 +118,9 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         other, or if the values are too large for a map of a permanent magnet.
     """
     columns = _with_times(_columns(table, declared), table)
-    _refuse_rows_of_components(table)
     missing: list[str] = []
     used = _used(columns, table, declared, missing)
+    _refuse_rows_of_components(used, table)
     missing += _missing(used, columns, table, declared)
     unit_of: dict[str, str] = {}
     for kind in OPTIONS:
@@ -197,11 +197,18 @@ def _refuse_placeholder(values: Floats, name: str, where: str) -> None:
             f"{values[row]:g}, which looks like a placeholder", PLACEHOLDER))
 
 
-def _refuse_rows_of_components(table: ForeignTable) -> None:
+def _refuse_rows_of_components(used: dict[str, int], table: ForeignTable) -> None:
     """Raise MeasurementError for a table that has each component of a reading in a row of its own.
 
-    A column of it holds the names of the components.
+    A column of it holds the names of the components, and the places are repeated; scans along x, y
+    and z that are named so have few places in common.
     """
+    several = 0.75  # places per row, from which rows are readings at places of their own
+    places = np.unique(table.values[:, [used[name] for name in used
+                                        if _kind(name) in ("length", "angle")]], axis=0)
+    if sum(name in used for name in names.FIELDS) > 1 or (
+            places.size and len(places) > several * len(table.values)):
+        return
     for column, cells in table.texts.items():
         found = {cell.strip().lower() for _, cell in cells.values()}
         if len(cells) == len(table.values) and len(found) > 1 and (
@@ -377,7 +384,7 @@ def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[Col
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
     """Return the file's columns with the names and units that the user states instead."""
     if not declared.columns:
-        return _of_h(names.with_polar(table.columns))
+        return _of_h(names.with_polar(table.columns, declared.at))
     count = len(table.columns) - table.added
     more = declared.columns[count:]  # delimiters at the ends of lines have no column in the table
     if len(declared.columns) < count or any(text != "-" for text in more):
@@ -386,7 +393,7 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
             f"{len(declared.columns)}", "Name each column; - ignores a column."))
     found = []
     own = names.with_polar([ColumnName("") if text == "-" else names.parse(text, stated=True)
-                            for text in declared.columns])
+                            for text in declared.columns], declared.at)
     for text, stated, column in zip(declared.columns, own, table.columns[:count], strict=False):
         if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
             raise MeasurementError(must_be(
@@ -622,6 +629,8 @@ def _units(
         if not units.states_no_unit(text) and (not unit or (
                 kind != "time" and units.kind_of(unit) != kind)):
             stated = next(iter(units.KINDS[kind]))
+            if units.unit_symbol(f"{text} {stated}"):  # a factor
+                stated = f"{text} {stated}"
             missing.append(f"the unit of {name}, as '{text[:20]}' is none of "
                            f"{', '.join(units.KINDS[kind])} (--columns ...{name}[{stated}])")
             continue

@@ -41,8 +41,6 @@ RUN_TOGETHER = re.compile(r"(\.\d+(?:[eEdD][-+]\d+)?)(?=[-+]\d*\.\d)")
 """A number that another one follows without a blank, as in columns of fixed width."""
 IN_LISTS = frozenset("0123456789+-.,;eE*^|[]{}() \t")
 """Characters of rows of numbers in the brackets of lists or between bars."""
-ENDED = re.compile(r"[^;]*[^;\s][ \t,]+[^;]*[^;\s][ \t,]+[^;]*[^;\s];\s*")
-"""A row of three cells or more that a semicolon ends."""
 COMPLEX = re.compile(r"[-+]?[\d.]+([eE][-+]?\d+)?[-+][\d.]+([eE][-+]?\d+)?\s*\*?[ij]")
 MAX_COMMENTS = 2000
 """Largest number of characters of comments that are kept."""
@@ -97,14 +95,21 @@ def _refuse_binary(raw: bytes, where: str) -> None:
 
 def undecorated(line: str) -> str:
     """Return a row of numbers without the brackets, bars and stars that some programs print."""
-    if ENDED.fullmatch(line[:MAX_COMMENTS]):  # as rows of a matrix in MATLAB
-        line = line.rstrip(" \t;")
+    line = _without_end(line)
     starred = line.strip().startswith("* ") and line.rstrip().endswith(" *")
     listed = any(mark in line for mark in "|[]{}") and IN_LISTS.issuperset(line)
     if len(line) > MAX_COMMENTS or not (starred or listed):
         return line
     numbers = re.sub(r"[\[\](){}|]|(?<!\S)\*(?!\S)", " ", line)
     return " ".join(re.sub(r"[,;]\s", " ", f"{numbers} ").split())
+
+
+def _without_end(line: str) -> str:
+    """Return a row without the one semicolon that ends it, as rows of a matrix in MATLAB."""
+    if line.count(";") != 1 or not line.rstrip().endswith(";"):
+        return line
+    row = line.rstrip(" \t\r;")
+    return row if len(re.split(r"[ \t,]+", row.lstrip())) > 2 else line
 
 
 def text_of_table(raw: bytes, where: str) -> bytes:

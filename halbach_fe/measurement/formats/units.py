@@ -67,8 +67,9 @@ POWER = re.compile(r"10(?:\^|\*\*)\{?([-+]?\d{1,2})\}?|10([⁻⁺]?[⁰¹²³⁴
 """A power of ten as a factor: 10^-4, 10⁻⁴."""
 RAISED = str.maketrans("⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹", "-+0123456789")
 
-SILENT = re.compile(r"(?i)-?|lengu|fluxu|[-+]?[\d.]+(e[-+]?\d+)?")
-"""Texts in the place of a unit that state none: Opera's LENGU and FLUXU, a dash, or a factor."""
+SILENT = re.compile(r"(?i)-?|lengu|fluxu|\+?1(\.0*)?(e[-+]?0+)?")
+"""Texts in the place of a unit that state none: Opera's LENGU and FLUXU, a dash, or a factor of
+1."""
 
 
 def unit_symbol(text: str) -> str:
