@@ -244,3 +244,23 @@ def test_iron_is_displaced_where_there_is_room():
     between = effect.signature(NominalFields(beside, POINTS, TIME, height_of(1)),
                                effect.places(beside)[1])
     assert between[2] == pytest.approx(0 * POINTS)  # it can move to neither side
+
+
+@pytest.mark.parametrize("fraction", [-2.0, -1.0, -0.5, 0.5])
+def test_what_is_multiplied_is_known_per_unit_of_what_the_study_says(fraction):
+    """In the model, too, where the coil of 1 kA is off, or the iron of 30 has 15."""
+    def in_model(name, study, place, solve):
+        effect = EFFECTS[name]
+        return effect.derivative(NominalFields(
+            effect.apply(study, place, [fraction]), POINTS, TIME, solve), place, [fraction])
+
+    effect = EFFECTS["coil_current"]
+    (coil,) = effect.places(STUDY)
+    more, less = (shown(effect.apply(STUDY, coil, [fraction + step])) for step in (0.1, -0.1))
+    np.testing.assert_allclose(in_model("coil_current", STUDY, coil, None)[0],
+                               (more - less) / 0.2, rtol=1e-9, atol=1e-15)
+    if fraction > -1:
+        iron = EFFECTS["iron_permeability"].places(IN_IRON)[0]
+        slope = in_model("iron_permeability", IN_IRON, iron,
+                         lambda study: study.iron.relative_permeability + 0 * POINTS)
+        np.testing.assert_allclose(slope, 30.0 + 0 * slope, rtol=1e-9)
