@@ -33,8 +33,7 @@ IN_IRON = STUDY.with_(external={}, iron={"relative_permeability": 30.0, "bodies"
 POINTS = np.vstack([circle(0.06, 8, z, 0.1) for z in np.linspace(-0.25, 0.25, 7)])
 TIME = np.linspace(0, 1, len(POINTS))
 EFFECTS = {effect.name: effect for effect in catalogue()}
-SOLVED = {"iron_displaced", "iron_permeability", "iron_ring", "iron_saturation", "knee",
-          "recoil_permeability", "recoil_permeability_across"}
+SOLVED = {name for name, effect in EFFECTS.items() if effect.is_solved}
 EQUAL = {"rings_swapped"}
 """Changes nothing in a magnet of equal rings; see test_assembly.py."""
 

@@ -211,6 +211,7 @@ class IronRingEffect(Effect):
     name = "iron_ring"
     title = "iron ring around the magnet"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
     refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
     unique = True
@@ -272,6 +273,7 @@ class IronSaturationEffect(Effect):
     name = "iron_saturation"
     title = "saturation of the iron ring"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("strength", "1", 1.0),)
     is_binary = True
     applied_in_full = True
@@ -374,6 +376,7 @@ class IronPermeabilityEffect(Effect):
     name = "iron_permeability"
     title = "permeability of iron"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("fraction", "1", 0.3, minimum=-0.99),)
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -416,6 +419,7 @@ class IronDisplacedEffect(Effect):
     name = "iron_displaced"
     title = "body of iron displaced"
     kind = "field"
+    is_solved = True
     parameters = tuple(Parameter(axis, "m", 3e-4) for axis in "xyz")
 
     def places(self, study: Study) -> Sequence[Place]:
