@@ -181,11 +181,17 @@ class ElementFields:
         return self.nominal is not self.along_nominal
 
 
-def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
-    """Return B (n, 3) in T of the nominal array at points (n, 3) in m, by the study's method."""
+def solve_nominal(
+    magnet: Magnet, points: Floats, session: Session, estimate: bool = False
+) -> Floats:
+    """Return B (n, 3) in T of the nominal array at points (n, 3) in m, by the study's method.
+
+    ``estimate`` tells whether to solve for error bars too, by which iron of any shape is
+    extrapolated, see `halbach_fe.solver.iron_bodies.BodiesReaction.field_with_errors`.
+    """
     points = check_points(magnet, points)
     return vacuum_part(magnet, points) + finite_element_part(
-        magnet, points, session, columns=False, estimate=False).nominal
+        magnet, points, session, columns=False, estimate=estimate).nominal
 
 
 def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
