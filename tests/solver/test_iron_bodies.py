@@ -162,6 +162,7 @@ def test_the_updated_magnet_is_extrapolated_as_the_model_is(session, coarse_mesh
     plain, model = (solve_nominal(magnet, points, session.within(str(estimate)), estimate)
                     for estimate in (False, True))
     assert np.abs(model - plain).max() > 1e-6  # five times the noise
+    np.testing.assert_allclose(magnet.field_T(points), model, rtol=0, atol=1e-9)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         infer(magnet, field_map(points, model), session.within("update"))
