@@ -153,13 +153,13 @@ def test_iron_of_another_permeability(session, generator):
 
 
 def test_an_estimate_of_iron_that_touches(generator):
-    """Two boxes on each other can move along z to one side only: 5 of 6 fields for each."""
+    """Two boxes on each other can move along z to one side only, there by two steps."""
     box = {"kind": "box", "size_m": [0.05, 0.05, 0.02]}
     study = parse_study(DOCUMENT | {"iron": {"relative_permeability": 500.0, "bodies": [
         box | {"centre_m": [0.12, 0.0, height]} for height in (0.12, 0.14)]}})
     (effect,) = (one for one in catalogue() if one.name == "iron_displaced")
     estimate = estimate_diagnosis(study, measured(STUDY, generator), effects=[effect])
-    assert (estimate.signatures, estimate.fields) == (2, 10)
+    assert (estimate.signatures, estimate.fields) == (2, 12)
     assert estimate.fields_s > 5 * estimate.update.seconds
 
 

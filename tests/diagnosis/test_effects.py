@@ -231,7 +231,8 @@ def test_iron_is_displaced_where_there_is_room():
             heights = [body.centre_m[2] for body in study.iron.bodies]
             if min(np.diff(heights)) < 0.1 - 1e-9:
                 raise StudyError("iron in iron")
-            return heights[number] + 0 * POINTS
+            in_place = study.iron == beside.iron  # where another route is 1 mm off
+            return heights[number] + 1e-3 * in_place + 0 * POINTS
 
         return solve
 

@@ -432,12 +432,18 @@ class IronDisplacedEffect(Effect):
         return np.array([self._derivative(nominal, place, axis) for axis in np.eye(3)])
 
     def _derivative(self, nominal: NominalFields, place: Place, axis: Floats) -> Floats:
-        """Return the derivative (n, 3) in T/m, to the side that is free; 0 if there is none."""
+        """Return the derivative (n, 3) in T/m, to the side that is free; 0 if there is none.
+
+        The difference is that of displaced bodies on either side, or on one of them: a body in its
+        place may have another route, whose error would be taken for the effect.
+        """
         step, fields = 5e-4, []
-        for side in (step, -step):
+        for number in (1, -1, 2, -2):
+            if len(fields) == 2 or (number == 2 and not fields):
+                break
             try:
-                fields.append((side, nominal.solve(
-                    self.apply(nominal.study, place, (side * axis).tolist()))))
+                fields.append((number * step, nominal.solve(
+                    self.apply(nominal.study, place, (number * step * axis).tolist()))))
             except StudyError:  # what stands there is in the way
                 continue
         if len(fields) == 1:
