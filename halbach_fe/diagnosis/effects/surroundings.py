@@ -437,7 +437,8 @@ class IronDisplacedEffect(Effect):
         The difference is that of displaced bodies on either side, or on one of them: a body in its
         place may have another route, whose error would be taken for the effect.
         """
-        step, fields = 5e-4, []
+        step = 5e-4
+        fields: list[tuple[float, Floats]] = []
         for number in (1, -1, 2, -2):
             if len(fields) == 2 or (number == 2 and not fields):
                 break
