@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,27 +113,31 @@ def estimate_diagnosis(
             continue
         signatures += min(len(places), SHORTLIST) if isinstance(
             effect, AssemblyEffect) else len(places)
-        asked = _asked(effect, own, points, places[0])
-        if asked:  # all places of an effect need fields of much the same cost
-            fields += len(places) * len(asked)
-            seconds += len(places) * sum(
-                estimate_solve(build_magnet(each), observation, jobs).seconds for each in asked)
+        asked = _asked(effect, own, points, places[0], lambda changed: estimate_solve(
+            build_magnet(changed), observation, jobs).seconds)
+        # all places of an effect need fields of much the same cost
+        fields += len(places) * len(asked)
+        seconds += len(places) * sum(asked)
     return DiagnosisEstimate(estimate_infer(magnet, observation, jobs), signatures, fields,
                              seconds)
 
 
-def _asked(effect: Effect, study: Study, points: Floats, place: Place) -> list[Study]:
-    """Return the magnets whose field the signature at a place needs, the rough one if there is one.
+def _asked(
+    effect: Effect, study: Study, points: Floats, place: Place, seconds_of: Callable[[Study], float]
+) -> list[float]:
+    """Return the times in s of the fields that the signature at a place needs, the rough one if
+    there is one.
 
-    Their meshes are those that suffice for signatures.
+    Their meshes are those that suffice for signatures. ``seconds_of`` is that of the field of a
+    magnet, or refuses it as solving it would.
     """
-    asked: list[Study] = []
+    asked: list[float] = []
     if effect.kind == "instrument":
         return asked
 
     def solve(changed: Study) -> Floats:
         if changed != study:  # the field of the study itself is shared by all
-            asked.append(with_rough_mesh(changed))
+            asked.append(seconds_of(with_rough_mesh(changed)))
         return np.zeros((len(points), 3))
 
     nominal = NominalFields(study, points, np.zeros(len(points)), solve)

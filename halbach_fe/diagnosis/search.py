@@ -136,12 +136,13 @@ class _Comparison:
         first = {(effect.name, place) for effect in {one.effect for one in self.hypotheses}
                  for place in effect.representatives(self.places[effect.name])}
         first |= {*self.point.in_model, *self.point.signatures}
-        later = []
-        for hypothesis in self.hypotheses:
-            if hypothesis.key in first:
-                self._compare(hypothesis)
-            else:
-                later.append(hypothesis)
+        # what has to be solved is compared after all else, in case there is no time
+        at_once = [one for one in self.hypotheses if one.key in first]
+        for hypothesis in sorted(at_once, key=lambda one: one.effect.is_solved):
+            self._compare(hypothesis)
+        order = {one.key: number for number, one in enumerate(self.hypotheses)}
+        self.competitors.sort(key=lambda one: order[one.hypothesis.key])
+        later = [one for one in self.hypotheses if one.key not in first]
         fixed, few = self._fixed(), {one.effect.name for one in later}
         noticed = {one.candidate.effect for one in self.competitors
                    if one.candidate.effect in few

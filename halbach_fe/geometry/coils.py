@@ -8,7 +8,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.study.magnet import AnyCoil, PolygonCoil, Racetrack
+from halbach_fe.study.magnet import AnyCoil, PolygonCoil, Racetrack, RoundCoil
 
 
 def closest(coil: AnyCoil) -> float:
@@ -77,27 +77,44 @@ def in_winding(coil: AnyCoil, points: Floats) -> Ints:
 def points_in_winding(coil: AnyCoil) -> Floats:
     """Return points (n, 3) in m of the magnet all along a winding: in its middle and its edges."""
     if coil.kind == "polygon":
-        turns = [closed_polygon(coil)]
+        own = _along(closed_polygon(coil))
     else:
-        turns = []
         # bodies in a thick winding hold points in it themselves, those that a sheet cuts do not
         just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 97)
-        for across in np.unique(just_inside * coil.section_m[0]):
-            if coil.kind == "round":
-                angle = np.linspace(0.0, 2 * np.pi, 97)
-                turn = (coil.radius_m + across) * np.column_stack(
-                    [np.cos(angle), np.sin(angle), 0 * angle])
-            else:
-                turn = turn_corners(coil, across, 12)
-            turns += [turn + np.array([0.0, 0.0, height])
-                      for height in np.unique(just_inside * coil.section_m[1])]
-    own = np.vstack([_along(turn) for turn in turns])
+        own = np.vstack([
+            np.column_stack([_turn(coil, across), np.full(POINTS_OF_TURN, height)])
+            for across in np.unique(just_inside * coil.section_m[0])
+            for height in np.unique(just_inside * coil.section_m[1])])
     axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
     return np.asarray(own @ axes.T + coil.centre_m)
+
+
+POINTS_OF_TURN = 200
+"""Points of a turn that are kept clear of blocks, iron and other coils."""
+
+
+def _turn(coil: RoundCoil | Racetrack, across: float) -> Floats:
+    """Return points (200, 2) in m of a turn, ``across`` m off the middle of the section.
+
+    They lie on its arcs, not on chords: those would reach into what touches the winding.
+    """
+    if coil.kind == "round":
+        middle, radius = np.zeros(2), coil.radius_m + across
+    else:
+        middle = np.array(coil.size_m) / 2 - coil.corner_radius_m
+        radius = coil.corner_radius_m + across
+    centres = np.array([(1, 1), (1, 1), (-1, 1), (-1, 1), (-1, -1), (-1, -1), (1, -1), (1, -1),
+                        (1, 1)]) * middle
+    angles = np.pi / 2 * np.array([0, 1, 1, 2, 2, 3, 3, 4, 4])
+    place = np.cumsum([0.0, *np.linalg.norm(np.diff(centres, axis=0), axis=1)
+                       + radius * np.diff(angles)])
+    at = np.linspace(0.0, place[-1], POINTS_OF_TURN)
+    angle, x, y = (np.interp(at, place, part) for part in (angles, *centres.T))
+    return np.column_stack([x + radius * np.cos(angle), y + radius * np.sin(angle)])
 
 
 def _along(corners: Floats) -> Floats:
     """Return points (200, 3) at equal distances along a line with the corners (m, 3)."""
     place = np.cumsum([0.0, *np.linalg.norm(np.diff(corners, axis=0), axis=1)])
-    at = np.linspace(0.0, place[-1], 200)
+    at = np.linspace(0.0, place[-1], POINTS_OF_TURN)
     return np.column_stack([np.interp(at, place, part) for part in corners.T])

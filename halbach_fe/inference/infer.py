@@ -666,7 +666,8 @@ def _check_linearization(
     mean = mean[:len(magnet.parameter_names)]
     if choose_route(magnet, observation.points) == "moments":
         updated = Magnet(magnet.study, with_magnetizations(magnet, mean))
-        true = observation.apply(solve_nominal(updated, observation.points, own))
+        true = observation.apply(solve_nominal(  # extrapolated, as the model is
+            updated, observation.points, own, estimate=True))
     else:
         true = newton_readings(magnet, observation, own, mean[None])[0]
     others = np.zeros(len(model.parameters) - len(mean))

@@ -181,11 +181,17 @@ class ElementFields:
         return self.nominal is not self.along_nominal
 
 
-def solve_nominal(magnet: Magnet, points: Floats, session: Session) -> Floats:
-    """Return B (n, 3) in T of the nominal array at points (n, 3) in m, by the study's method."""
+def solve_nominal(
+    magnet: Magnet, points: Floats, session: Session, estimate: bool = False
+) -> Floats:
+    """Return B (n, 3) in T of the nominal array at points (n, 3) in m, by the study's method.
+
+    ``estimate`` tells whether to solve for error bars too, by which iron of any shape is
+    extrapolated, see `halbach_fe.solver.iron_bodies.BodiesReaction.field_with_errors`.
+    """
     points = check_points(magnet, points)
     return vacuum_part(magnet, points) + finite_element_part(
-        magnet, points, session, columns=False, estimate=False).nominal
+        magnet, points, session, columns=False, estimate=estimate).nominal
 
 
 def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
@@ -201,19 +207,24 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
                                  "values that are not finite" if missing else
                                  f"one of shape {points.shape}"))
     session = NOT_KEPT if magnet.is_vacuum else Session.temporary()  # closed forms write no file
-    return field_function(magnet, session)(points.reshape(-1, 3)).reshape(points.shape)
+    # as `halbach_fe.solve` has it, which extrapolates iron of any shape
+    field = field_function(magnet, session, estimate=not magnet.iron_is_axisymmetric)
+    return field(points.reshape(-1, 3)).reshape(points.shape)
 
 
-def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Floats]:
+def field_function(
+    magnet: Magnet, session: Session, estimate: bool = False
+) -> Callable[[Floats], Floats]:
     """Return a function of points (n, 3) in m that computes B (n, 3) in T of the nominal array.
 
     It serves points that move little by little. The blocks are solved for once where that does not
     depend on the points, and the field of many blocks is summed by expansions. That of a
-    cross-section does not depend on z, but for that of external sources.
+    cross-section does not depend on z, but for that of external sources. ``estimate`` is that of
+    `solve_nominal`.
     """
     def solved(points: Floats) -> Floats:
         if magnet.dimension == 3:
-            return solve_nominal(magnet, points, session)
+            return solve_nominal(magnet, points, session, estimate)
         plane = points * [1.0, 1.0, 0.0]
         found = solve_nominal(magnet, plane, session)
         return found + external_field(magnet, points) - external_field(magnet, plane)
@@ -222,7 +233,7 @@ def field_function(magnet: Magnet, session: Session) -> Callable[[Floats], Float
     if magnet.is_vacuum or choose_route(magnet, np.zeros((0, 3))) is not Route.MOMENTS or (
             auto and is_axisymmetric(magnet)):
         return solved
-    reaction = solve_separate(magnet, session, estimate=False)
+    reaction = solve_separate(magnet, session, estimate)
     vacuum = field_in_vacuum(magnet.blocks)
 
     def field(points: Floats) -> Floats:

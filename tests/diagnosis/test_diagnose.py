@@ -9,6 +9,7 @@ import pytest
 import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.diagnosis import diagnose as module
+from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.assembly import BlocksSwappedEffect
@@ -112,9 +113,9 @@ def test_a_search_among_pairs_of_blocks(name, session, generator):
     assert np.isfinite(found.loo_residuals_after).all()
 
 
-@pytest.mark.parametrize("fraction", [0.03, -2.0])
+@pytest.mark.parametrize("fraction", [0.03, -1.0, -2.0])
 def test_the_current_of_a_coil(fraction, session, generator):
-    """It is 3 % larger than stated, or the coil is connected the wrong way round."""
+    """It is 3 % larger than stated, or the coil is off, or connected the wrong way round."""
     ring = {"radius_m": 0.3, "current_A": 2e3}
     study = parse_study(DOCUMENT | {"external": {"coils": [
         {"kind": "round", "centre_m": [0.0, 0.0, z]} | ring for z in (-0.1, 0.1)]}})
@@ -149,6 +150,17 @@ def test_iron_of_another_permeability(session, generator):
     (named,) = found.identified
     assert named.hypothesis.effect.name == "iron_permeability"
     assert named.values == pytest.approx([1.0], abs=4 * named.sd[0])
+
+
+def test_an_estimate_of_iron_that_touches(generator):
+    """Two boxes on each other can move along z to one side only, there by two steps."""
+    box = {"kind": "box", "size_m": [0.05, 0.05, 0.02]}
+    study = parse_study(DOCUMENT | {"iron": {"relative_permeability": 500.0, "bodies": [
+        box | {"centre_m": [0.12, 0.0, height]} for height in (0.12, 0.14)]}})
+    (effect,) = (one for one in catalogue() if one.name == "iron_displaced")
+    estimate = estimate_diagnosis(study, measured(STUDY, generator), effects=[effect])
+    assert (estimate.signatures, estimate.fields) == (2, 12)
+    assert estimate.fields_s > 5 * estimate.update.seconds
 
 
 @pytest.mark.parametrize("name", ["azimuthal_gap", "radial_gap"])

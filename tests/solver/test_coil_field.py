@@ -240,6 +240,32 @@ def test_windings_in_one_another_are_refused():
             build_magnet(study)
 
 
+@pytest.mark.parametrize(("inner", "outer"), [
+    ({"kind": "round", "radius_m": 0.3}, {"radius_m": 0.302}),
+    ({"kind": "racetrack", "size_m": [0.5, 0.4], "corner_radius_m": 0.1},
+     {"size_m": [0.504, 0.404], "corner_radius_m": 0.102})])
+def test_layers_of_windings_may_touch_on_arcs(inner, outer):
+    """So may a round winding and its core. What overlaps by a tenth of a millimetre is refused."""
+    own = {"current_A": 1.0, "section_m": [0.002, 0.01], "centre_m": [0.0, 0.0, 1.0]}
+    nearer = {key: [side - 2e-4 for side in value] if key == "size_m" else value - 1e-4
+              for key, value in outer.items()}
+    for other, refused in ((outer, False), (nearer, True)):
+        study = parse_study(changed(DIPOLE, external={"coils": [
+            own | inner, own | inner | other]}))
+        with pytest.raises(StudyError, match=r"coils\[1\].* clear of other coils") if refused else (
+                nullcontext()):
+            build_magnet(study)
+    if inner["kind"] == "round":
+        for radius, refused in ((0.299, False), (0.2991, True)):
+            study = parse_study(changed(DIPOLE, dimension=3, array__ring_length_m=0.08, iron={
+                "relative_permeability": 9.0, "bodies": [
+                    {"kind": "tube", "inner_radius_m": 0.2, "outer_radius_m": radius,
+                     "length_m": 0.5, "z_m": 1.0}]}, external={"coils": [own | inner]}))
+            with pytest.raises(StudyError, match="clear of blocks and iron") if refused else (
+                    nullcontext()):
+                build_magnet(study)
+
+
 def test_other_refusals():
     with pytest.raises(StudyError, match="corner_radius_m"):
         parse_study(changed(DIPOLE, external={"coils": [

@@ -11,6 +11,8 @@ import pytest
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geo.iron_bodies import Sizes
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.infer import infer
+from halbach_fe.measurement.field_map import field_map
 from halbach_fe.response.resource_estimate import estimate_solve
 from halbach_fe.response.solution import study_observation
 from halbach_fe.solver import iron_bodies
@@ -145,6 +147,25 @@ def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
     # the first one is too near to its elements: it stays as it was, and its bar is longer
     assert np.sqrt(np.mean(off[1:]**2)) < 0.5 * np.sqrt(np.mean(before[1:]**2))
     assert (before > bars[:, 0]).any()  # the control
+
+
+def test_the_updated_magnet_is_extrapolated_as_the_model_is(session, coarse_mesh):
+    """Of a map of the magnet itself, `infer` has nothing to say of iron that is linearized."""
+    box = {"kind": "box", "size_m": [0.02, 0.03, 0.01], "centre_m": [0.0, 0.0, 0.05]}
+    points = np.array([[x, y, z] for x in (0.0, 0.01, 0.02) for y in (-0.02, 0.0, 0.02)
+                       for z in (0.0, 0.02)])
+    study = study_with(
+        box, iron={"curve": {"kind": "steel", "name": "aisi_1010"}},
+        noise={"regions": [{"name": "all", "sigma_T": 2e-7}]},
+        prior={"magnitude_sd": 0.01, "direction_sd_deg": 1.0})
+    magnet = build_magnet(study)
+    plain, model = (solve_nominal(magnet, points, session.within(str(estimate)), estimate)
+                    for estimate in (False, True))
+    assert np.abs(model - plain).max() > 1e-6  # five times the noise
+    np.testing.assert_allclose(magnet.field_T(points), model, rtol=0, atol=1e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        infer(magnet, field_map(points, model), session.within("update"))
 
 
 def test_external_field_acts_on_the_iron(session, coarse_mesh):

@@ -44,6 +44,7 @@ class KneeEffect(Effect):
     name = "knee"
     title = "losses by the knee of the demagnetization curve"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("there", "1", 1.0),)
     refinements = (Parameter("coercivity", "A/m", 0.1, longest_step=0.05),
                    Parameter("squareness", "1", 1.0, longest_step=0.5))

@@ -35,6 +35,7 @@ class RecoilPermeabilityEffect(Effect):
     name = "recoil_permeability"
     title = "recoil permeability of the blocks"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("difference", "1", 0.05),)
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:

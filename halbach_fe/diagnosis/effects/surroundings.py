@@ -17,7 +17,7 @@ from halbach_fe.solver.exact_block_field import dipole_field, neighbour_field
 from halbach_fe.solver.formulation_choice import choose_route
 from halbach_fe.solver.separate_blocks import external_acts
 from halbach_fe.study.iron import IronRing, SteelCurve
-from halbach_fe.study.magnet import Neighbour, PointDipole
+from halbach_fe.study.magnet import AnyCoil, Neighbour, PointDipole
 from halbach_fe.study.model import Study, iron_of
 
 
@@ -211,6 +211,7 @@ class IronRingEffect(Effect):
     name = "iron_ring"
     title = "iron ring around the magnet"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
     refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
     unique = True
@@ -272,6 +273,7 @@ class IronSaturationEffect(Effect):
     name = "iron_saturation"
     title = "saturation of the iron ring"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("strength", "1", 1.0),)
     is_binary = True
     applied_in_full = True
@@ -327,18 +329,42 @@ class CoilCurrentEffect(Effect):
                 for number, coil in enumerate(study.external.coils, start=1) if coil.current_A]
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        study = nominal.study
+        return self._change(nominal, place, _coil(nominal.study, place).current_A)
+
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.derivative`: per unit of the current that the study says, not of its own."""
+        return self._change(
+            nominal, place, _coil(nominal.study, place).current_A / _factor(values[0]))
+
+    def _change(self, nominal: NominalFields, place: Place, more_A: float) -> Floats:
+        """Return the change of B (1, n, 3) in T for more current, with that of what answers it."""
+        study, coil = nominal.study, _coil(nominal.study, place)
         if not external_acts(nominal.magnet):
-            coil = study.external.coils[place.slot - 1]
-            return coil_field(coil, nominal.points, study.name)[None]
-        more = nominal.solve(self.apply(study, place, [SHARE]))
+            return coil_field(coil.with_(current_A=more_A), nominal.points, study.name)[None]
+        more = nominal.solve(_with_coil(study, place, coil.current_A + SHARE * more_A))
         return ((more - nominal.finite_element_field) / SHARE)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        coils = list(study.external.coils)
-        coil = coils[place.slot - 1]
-        coils[place.slot - 1] = coil.with_(current_A=(1 + float(values[0])) * coil.current_A)
-        return study.with_(external__coils=tuple(coils))
+        return _with_coil(study, place, _factor(values[0]) * _coil(study, place).current_A)
+
+
+def _coil(study: Study, place: Place) -> AnyCoil:
+    """Return the coil at a place."""
+    return study.external.coils[place.slot - 1]
+
+
+def _with_coil(study: Study, place: Place, current_A: float) -> Study:
+    """Return a study in which the coil at a place carries another current."""
+    coils = list(study.external.coils)
+    coils[place.slot - 1] = _coil(study, place).with_(current_A=current_A)
+    return study.with_(external__coils=tuple(coils))
+
+
+def _factor(fraction: float) -> float:
+    """Return by what a number is multiplied that is larger by a fraction, but not 0, from which it
+    could not be found back.
+    """
+    return 1 + float(fraction) or 1e-9
 
 
 class IronPermeabilityEffect(Effect):
@@ -350,6 +376,7 @@ class IronPermeabilityEffect(Effect):
     name = "iron_permeability"
     title = "permeability of iron"
     kind = "field"
+    is_solved = True
     parameters = (Parameter("fraction", "1", 0.3, minimum=-0.99),)
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -364,6 +391,10 @@ class IronPermeabilityEffect(Effect):
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         more = nominal.solve(self.apply(nominal.study, place, [SHARE]))
         return ((more - nominal.finite_element_field) / SHARE)[None]
+
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.derivative`: per unit of the permeability that the study says."""
+        return self.signature(nominal, place) / _factor(values[0])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         key = "iron" if study.iron_ring is None else "iron_ring"
@@ -388,6 +419,7 @@ class IronDisplacedEffect(Effect):
     name = "iron_displaced"
     title = "body of iron displaced"
     kind = "field"
+    is_solved = True
     parameters = tuple(Parameter(axis, "m", 3e-4) for axis in "xyz")
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -400,12 +432,19 @@ class IronDisplacedEffect(Effect):
         return np.array([self._derivative(nominal, place, axis) for axis in np.eye(3)])
 
     def _derivative(self, nominal: NominalFields, place: Place, axis: Floats) -> Floats:
-        """Return the derivative (n, 3) in T/m, to the side that is free; 0 if there is none."""
-        step, fields = 5e-4, []
-        for side in (step, -step):
+        """Return the derivative (n, 3) in T/m, to the side that is free; 0 if there is none.
+
+        The difference is that of displaced bodies on either side, or on one of them: a body in its
+        place may have another route, whose error would be taken for the effect.
+        """
+        step = 5e-4
+        fields: list[tuple[float, Floats]] = []
+        for number in (1, -1, 2, -2):
+            if len(fields) == 2 or (number == 2 and not fields):
+                break
             try:
-                fields.append((side, nominal.solve(
-                    self.apply(nominal.study, place, (side * axis).tolist()))))
+                fields.append((number * step, nominal.solve(
+                    self.apply(nominal.study, place, (number * step * axis).tolist()))))
             except StudyError:  # what stands there is in the way
                 continue
         if len(fields) == 1:
@@ -427,7 +466,7 @@ class IronDisplacedEffect(Effect):
 def _more_permeable(material: Any, fraction: float) -> Any:
     """Return iron of a permeability that is larger by a fraction, but at least 1."""
     return material.with_(relative_permeability=max(
-        1.0, (1 + float(fraction)) * material.relative_permeability))
+        1.0, _factor(fraction) * material.relative_permeability))
 
 
 EFFECTS = (BackgroundEffect(), NeighbourMagnetEffect(), FerromagneticObjectEffect(),
