@@ -1101,6 +1101,22 @@ def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[ND
 def _term(
     parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int
 ) -> tuple[InstrumentTerm, float]:
+    """Return what the whole map and its halves show of a parameter, see `_shown`.
+
+    A change during the scan that they do not show alike by itself is asked with its uneven part.
+    """
+    even = _shown(parameter, kept, told, flat, ALIKE_PARTS)
+    if even[0].found or not parameter.beside:
+        return even
+    uneven = _shown(replace(parameter, own=parameter.own + parameter.beside), kept, told, flat,
+                    PARTS_OF_A_CHANGE)
+    return uneven if uneven[0].found else even
+
+
+def _shown(
+    parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int,
+    alike: tuple[float, float]
+) -> tuple[InstrumentTerm, float]:
     """Return what the whole map and its halves show of a parameter, besides those that are kept.
 
     The second number is how many prior standard deviations it is from 0.
@@ -1114,9 +1130,8 @@ def _term(
     determined = 0.5
     if not parameter.row.any():  # it is not asked, see `ProbeModel`
         return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True), 0.0
-    used = np.flatnonzero(kept | np.isin(
-        np.arange(len(kept)), parameter.own + parameter.beside))
-    row = np.where(np.isin(used, parameter.own) | kept[used], parameter.row[used], 0.0)
+    used = np.flatnonzero(kept | np.isin(np.arange(len(kept)), parameter.own))
+    row = parameter.row[used]
     estimates = [each.estimate(used) for each in told]
     value, *of_parts = (float(row @ mean) for mean, _ in estimates)
     sd, *sd_of_parts = (float(np.sqrt(row @ covariance @ row)) for _, covariance in estimates)
@@ -1125,8 +1140,7 @@ def _term(
     beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if of_parts else 1.0
     sees = SEEN * beyond * sds < abs(value)
     share = values / value if value else np.zeros(len(values))
-    least, most = PARTS_OF_A_CHANGE if parameter.beside else ALIKE_PARTS
-    off = (np.abs(values - value) > SEEN * sds) & ((share < least) | (share > most))
+    off = (np.abs(values - value) > SEEN * sds) & ((share < alike[0]) | (share > alike[1]))
     supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any() and (
         SEEN * ([sd, *sd_of_parts][flat] if flat else 0.0) < abs(value)))
     prior = float(np.linalg.norm(row))
