@@ -282,8 +282,8 @@ def answer_page(answers: list[Answer], found: list[str], published: PublishedErr
     sound = best.registration.explains
     trust = [
         f"{'Yes' if sound else 'No'}: with positions uncertain by 1 mm, chi² of held-out readings "
-        f"is {left:.2g} each, where 1 is expected; but which of four equal lines it is, the "
-        "profile cannot tell.",
+        f"is {left:.2g} each, where 1 is expected; but which of four lines, equal by symmetry, "
+        "it is, the profile cannot tell.",
         *found[1:]]
     if not best.registration.at_rest:
         trust.append("The search for the line ended before it came to rest, so that the line may "
@@ -294,8 +294,8 @@ def answer_page(answers: list[Answer], found: list[str], published: PublishedErr
         gist=f"It is no profile of the axis, but of a line {radius:.0f} ± {radius_sd:.0f} mm "
         f"beside it, in a magnet {array.rings * array.ring_length_m:.3g} m long.",
         numbers=(("median relative error in the fringe: the paper's, and ours (on the axis "
-                  f"{axis:.3f})",
-                  f"{paper:.2f} → {here:.3f}"),))
+                  f"{100 * axis:.2g} %)",
+                  f"{100 * paper:.0f} % → {100 * here:.1g} %"),))
 
 
 def distance_mm(found: Registration) -> tuple[float, float]:
@@ -335,13 +335,13 @@ def profile_figure(answers: list[Answer], published: PublishedErrors) -> Figure:
         nominal = each.update.prediction_prior.mean
         scale = np.median(each.update.readings[60:100] / nominal[60:100])
         field.semilogy(index, 1e3 * scale * nominal, color=colour, label=(
-            f"before the update: {each.hypothesis.name}"))
+            f"ordered blocks: {each.hypothesis.name}"))
         error.semilogy(index, each.error, color=colour, lw=0.8)
         apart = each.update.held_out
         error.semilogy(index[apart], each.error[apart], ".", color=colour,
-                       label=f"updated: {each.hypothesis.name}; points were held out")
+                       label=f"fitted blocks: {each.hypothesis.name}; dots were held out")
     field.semilogy(index, 1e3 * best.update.readings, ".", ms=4, color=MEASURED, label="readings")
-    error.semilogy(index, published.posterior, color=PUBLISHED, label="the paper's updated magnet")
+    error.semilogy(index, published.posterior, color=PUBLISHED, label="the magnet that the paper fitted")
     for axes in (field, error):
         axes.axvspan(1, FRINGE[0], color="0.93")
         axes.axvspan(FRINGE[1], len(index), color="0.93")
@@ -438,9 +438,9 @@ def run(arguments: argparse.Namespace) -> int:
             Section([Items(further)], "Further pages")],
         figures={
             "profile.png": (
-                partial(profile_figure, answers, published), "The readings with the nominal "
-                "magnet, scaled to the middle, and the relative errors of B_x; the published "
-                "fringe field is grey"),
+                partial(profile_figure, answers, published), "The readings with the magnet "
+                "as ordered, scaled to the middle, and the relative errors of B_x. The profile is "
+                "published by the index of its readings, and the shaded parts are its fringe"),
             "places.png": (partial(place_figure, poses),
                            "Where the profile lies in the cross-section")},
         files=dict.fromkeys(("profile.json", "measured.csv")), stored=False, stem="profile"),
