@@ -341,7 +341,8 @@ def profile_figure(answers: list[Answer], published: PublishedErrors) -> Figure:
         error.semilogy(index[apart], each.error[apart], ".", color=colour,
                        label=f"fitted blocks: {each.hypothesis.name}; dots were held out")
     field.semilogy(index, 1e3 * best.update.readings, ".", ms=4, color=MEASURED, label="readings")
-    error.semilogy(index, published.posterior, color=PUBLISHED, label="the magnet that the paper fitted")
+    error.semilogy(index, published.posterior, color=PUBLISHED,
+                   label="the magnet that the paper fitted")
     for axes in (field, error):
         axes.axvspan(1, FRINGE[0], color="0.93")
         axes.axvspan(FRINGE[1], len(index), color="0.93")
