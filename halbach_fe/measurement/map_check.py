@@ -1077,10 +1077,29 @@ def selected(
         new = [(abs(term.value) / term.sd / (1 + far), parameter.own)
                for parameter, term, far, old in zip(parameters, terms, away, there, strict=True)
                if term.found and not old]
-        if not new:
+        finer = [] if new else _finer(parameters, kept, told, flat)
+        if finer:
+            kept[finer] = True
+        elif not new:
             return kept, tuple(replace(term, predictive=term.predictive and (not term.found or old))
                                for term, old in zip(terms, there, strict=True))
-        kept[list(max(new)[1])] = True
+        else:
+            kept[list(max(new)[1])] = True
+
+
+def _finer(
+    parameters: list[Parameter], kept: NDArray[np.bool_], told: list[Evidence], flat: int
+) -> list[int]:
+    """Return the finer parts of changes during the scan that are kept, which are found too."""
+    found = []
+    for parameter in parameters:
+        if parameter.beside and kept[list(parameter.own)].all():
+            for part in np.flatnonzero((parameter.row != 0) & ~kept).tolist():
+                alone = np.where(np.arange(len(kept)) == part, parameter.row, 0.0)
+                if _shown(replace(parameter, row=alone, own=(part,)), kept, told, flat,
+                          PARTS_OF_A_CHANGE)[0].found:
+                    found.append(part)
+    return found
 
 
 def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
