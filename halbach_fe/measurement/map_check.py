@@ -1094,9 +1094,12 @@ def _finer(
     found = []
     for parameter in parameters:
         if parameter.beside and kept[list(parameter.own)].all():
+            waves = tuple(np.flatnonzero(np.any([
+                other.row != 0 for other in parameters if other.beside == parameter.beside],
+                axis=0)).tolist())
             for part in np.flatnonzero((parameter.row != 0) & ~kept).tolist():
                 alone = np.where(np.arange(len(kept)) == part, parameter.row, 0.0)
-                if _shown(replace(parameter, row=alone, own=(part,)), kept, told, flat,
+                if _shown(replace(parameter, row=alone, own=waves), kept, told, flat,
                           PARTS_OF_A_CHANGE)[0].found:
                     found.append(part)
     return found

@@ -712,6 +712,10 @@ def test_a_turn_that_is_not_even_is_found(generator, monkeypatch):
         assert term.found
         assert abs(term.value - value) < 4 * term.sd
     assert check.floor_rms_T < 2 * 5e-6
+    # a cubic part that is found is corrected, too
+    finer = Rotation.from_rotvec((6e-3 * (5 * time**3 - 3 * time) / 2)[:, None] * [1.0, 0.0, 0.0])
+    cubic = check_map(field_map(GRID, finer.inv().apply(shown["B_T"].values)))
+    assert cubic.floor_rms_T < 2 * 5e-6
     every = map_check.all_parameters
     monkeypatch.setattr(map_check, "all_parameters", lambda *known: [
         replace(one, beside=()) for one in every(*known)])
