@@ -361,9 +361,7 @@ def _with_coil(study: Study, place: Place, current_A: float) -> Study:
 
 
 def _factor(fraction: float) -> float:
-    """Return by what a number is multiplied that is larger by a fraction, but not 0, from which it
-    could not be found back.
-    """
+    """Return 1 + fraction, or 1e-9 in place of 0: a derivative is divided by this factor."""
     return 1 + float(fraction) or 1e-9
 
 
