@@ -291,10 +291,9 @@ def answer_page(answers: list[Answer], found: list[str], published: PublishedErr
     return PageAnswer(
         asked, said, " ".join(trust), step, own if quick else "",
         sound=sound,
-        gist=f"It is no profile of the axis, but of a line {radius:.0f} ± {radius_sd:.0f} mm "
-        f"beside it, in a magnet {array.rings * array.ring_length_m:.3g} m long.",
-        numbers=(("median relative error in the fringe: the paper's, and ours (on the axis "
-                  f"{100 * axis:.2g} %)",
+        gist=f"It is the profile of a line {radius:.0f} ± {radius_sd:.0f} mm beside the axis, "
+        f"in a magnet {array.rings * array.ring_length_m:.3g} m long.",
+        numbers=((f"error in the fringe: the paper's, ours (on the axis {100 * axis:.2g} %)",
                   f"{100 * paper:.0f} % → {100 * here:.1g} %"),))
 
 
