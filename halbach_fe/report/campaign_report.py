@@ -132,9 +132,14 @@ class Campaign:
             other.record.inputs.values() for other in self.chapters if chapter.uses(other)))
 
     def replaced(self, chapter: Chapter) -> Chapter | None:
-        """Return a later chapter of the same command, whose answers may all be used."""
+        """Return a later chapter of the same command, whose answers may all be used.
+
+        A diagnosis of the study that `register` wrote fits the pose anew, with the cause that the
+        registration lacked, and so takes its place.
+        """
         later = self.chapters[self.chapters.index(chapter) + 1:]
-        return next((one for one in later if one.verb == chapter.verb and one.sound), None)
+        return next((one for one in later if one.sound and (one.verb == chapter.verb or (
+            (chapter.verb, one.verb) == ("register", "diagnose") and one.uses(chapter)))), None)
 
     @property
     def answer(self) -> Answer:
@@ -160,9 +165,8 @@ class Campaign:
             f"{', for a test' if simulated else ' as they stand'}."])
         trust = (
             "No: they do not all fit together, as is said below." if self.doubts else
-            f"{self._verdict(left)}: they are of {self._studies}, and no file "
-            f"was changed since.{self._trust_of_update()} How far each can be trusted stands with "
-            "it below.")
+            f"{self._verdict(left)}: {self._trust_of_update()} of {self._studies}, and no file was "
+            "changed since. How far each can be trusted stands with it below.")
         last = self._next()
         step = last.step if last else "Nothing that the results name is left to do."
         if loses:
@@ -226,10 +230,12 @@ class Campaign:
         return f"Not {names}, for the reasons that stand below. The others, yes"
 
     def _trust_of_update(self) -> str:
-        """Say in a sentence why the last update can be trusted; empty if it cannot."""
+        """Say why the last update can be trusted, unless it cannot, and begin the sentence that
+        says which studies the results are of.
+        """
         said = [answer.trust.removeprefix("Yes. ").partition(". ")[0].rstrip(".")
                 for _, answer in self._used("infer")[-1:] if answer.sound]
-        return "".join(f" Of the measured magnet: {one[:1].lower()}{one[1:]}." for one in said)
+        return f"{said[0][:1].lower()}{said[0][1:]}. The results are" if said else "they are"
 
     def _newest(self) -> list[str]:
         """Return the last answer about the measured magnet that may be used, and before it that of

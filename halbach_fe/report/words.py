@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -121,14 +122,20 @@ def is_fourier(study: Study) -> bool:
 
 
 def faults_in_words(study: Study) -> str:
-    """Say which blocks the study has reversed, missing or in places of others; empty if none."""
+    """Say which blocks the study has reversed, turned, missing or in places of others; empty if
+    none.
+    """
+    # Largest angle of a block that is mounted as ordered, in degrees: a slot lets it turn by a few
+    # degrees, and a wrong orientation is a quarter or half turn, or the step to the next slot.
+    as_ordered_deg = 10.0
     found: dict[str, list[str]] = {}
     for one in study.array.exceptions:
         if one.ring is None or one.slot is None:
             continue
         kind = ("missing" if not one.magnetization_factor else "reversed"
                 if one.magnetization_factor < 0 else "made for another place"
-                if one.mounted_from not in (None, (one.ring, one.slot)) else None)
+                if one.mounted_from not in (None, (one.ring, one.slot)) else
+                "put in the wrong way" if math.hypot(*one.rotation_deg) > as_ordered_deg else None)
         if kind:
             found.setdefault(kind, []).append(block_in_words(one.ring, one.slot))
     # largest number of blocks that a line names

@@ -137,6 +137,9 @@ def test_blocks_that_are_not_as_designed_are_named(given):
     assert said({"ring": 1, "slot": 1, "mounted_from": (1, 2)},
                 {"ring": 1, "slot": 2, "mounted_from": (1, 1)}) == (
         "made for another place: ring 1, slot 1; ring 1, slot 2")
+    assert said({"ring": 1, "slot": 3, "rotation_deg": (0, 5.0, 0)},  # a slot allows that
+                {"ring": 1, "slot": 4, "rotation_deg": (-180.0, 0, 0)}) == (
+        "put in the wrong way: ring 1, slot 4")
     assert "6 blocks" in said(*(
         {"ring": 1, "slot": slot, "magnetization_factor": -1} for slot in range(1, 7)))
 

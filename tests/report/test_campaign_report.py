@@ -484,11 +484,11 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert "Not to be trusted as it is: folder inferred." in alone.said
     assert alone.trust.startswith("Not folder inferred, for the reasons that stand below. The "
                                   "others, yes: they are of one study, and no file")
-    assert "Of the measured magnet" not in alone.trust
+    assert "model and readings agree" not in alone.trust
     results(home / "sound", "infer", reads=[study, home / "map.csv"], answer=Answer(
         "Like what?", "Good.", "Yes. Model and readings agree: chi² is 1. More.", "", ""))
-    assert "Of the measured magnet: model and readings agree: chi² is 1. How" in found_in(
-        home, "sound").answer.trust
+    assert found_in(home, "sound").answer.trust.startswith(
+        "Yes: model and readings agree: chi² is 1. The results are of one study, and")
     bad = found_in(home, "inferred").answer.trust
     assert bad.startswith("No, for the reasons that stand below. But they belong together: they")
     results(home / "better", "infer", another(instrument={"translation_m": [1e-3, 0, 0]}),
@@ -497,7 +497,7 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert [one.label for one in campaign.chapters] == ["field", "inferred", "diagnosis", "better"]
     assert campaign.answer.said.endswith("Do not trust folder inferred: folder better takes "
                                          "its place. All others may be used as they stand.")
-    assert campaign.answer.trust.startswith("Yes: they are of")
+    assert campaign.answer.trust.startswith("Yes: trust in infer. The results are of")
     assert "simulated" not in campaign.answer.said
     assert (campaign.answer.sound, campaign.answer.step) == (True, "Step after infer.")
 
@@ -510,8 +510,8 @@ def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
     found = found_in(home, "inferred", "refuted")
     assert "Not to be trusted as it is: folder refuted." in found.answer.said
     assert found.answer.trust.startswith(
-        "Not folder refuted, for the reasons that stand below. The others, yes: they are of "
-        "versions of the study that have the same magnet and differ as is said below,")
+        "Not folder refuted, for the reasons that stand below. The others, yes: trust in infer. "
+        "The results are of versions of the study that have the same magnet and differ as is said below,")
     assert not found.answer.sound
     assert "prior.magnitude_sd is 0.0001 instead of" in found.versions[0]
     unused_finding(home)
@@ -519,7 +519,23 @@ def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
             [home / "diagnosis" / "study.diagnosed.toml", home / "map.csv"])
     control = found_in(home, "field", "diagnosis", "better").answer
     assert control.trust.startswith(
-        "Yes: they are of versions of the study that follow from each other,")
+        "Yes: trust in infer. The results are of versions of the study that follow from each "
+        "other,")
+
+
+def test_a_diagnosis_takes_the_place_of_the_registration_before_it(home):
+    """Which lacked the cause; it fits the pose anew. Control: a diagnosis of another study."""
+    poor = Answer("Where?", "There.", "No.", "Diagnose.", "halbach-fe diagnose STUDY", False)
+    results(home / "registered", "register", reads=[home / "study.toml", home / "map.csv"],
+            files=["study.registered.toml"], answer=poor)
+    results(home / "control", "diagnose", reads=[home / "study.toml", home / "map.csv"])
+    assert "Not to be trusted as it is: folder registered." in found_in(
+        home, "registered", "control").answer.said
+    results(home / "diagnosis", "diagnose", reads=[
+        home / "registered" / "study.registered.toml", home / "map.csv"])
+    found = found_in(home, "registered", "diagnosis").answer
+    assert "Do not trust folder registered: folder diagnosis takes its place." in found.said
+    assert found.sound
 
 
 def test_what_ignores_a_diagnosis_is_repeated_with_it(home):
