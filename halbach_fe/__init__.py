@@ -146,7 +146,10 @@ def __getattr__(name: str) -> Any:
 
         return version("halbach-fe")
     if name not in _HOME:
-        raise AttributeError(f"module 'halbach_fe' has no attribute '{name}'")
+        command = {"check": "check_map", "design": "design_rings",
+                   "report": "campaign_report"}.get(name)
+        raise AttributeError(f"module 'halbach_fe' has no attribute '{name}'" + (
+            f"; what `halbach-fe {name}` does is {command}()" if command else ""))
     value = getattr(importlib.import_module(f"halbach_fe.{_HOME[name]}"), name)
     globals()[name] = value
     return value

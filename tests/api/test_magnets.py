@@ -353,3 +353,11 @@ def test_options_of_other_names_are_refused(tmp_path):
             call(lenght=1)
     with pytest.raises(hf.HalbachError, match=r"format .*'stl'"):
         hf.export(hf.field_map([[0, 0, 0]], [[1, 0, 0]], sigma_T=1e-5), tmp_path / "a", "stl")
+
+
+def test_a_command_whose_function_has_another_name_is_told():
+    """A control: of a name that is no command nothing is told."""
+    with pytest.raises(AttributeError, match=r"what `halbach-fe check` does is check_map\(\)$"):
+        hf.check  # noqa: B018
+    with pytest.raises(AttributeError, match="no attribute 'chek'$"):
+        hf.chek  # noqa: B018
