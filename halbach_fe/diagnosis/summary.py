@@ -229,7 +229,7 @@ def _rounded(value: float, sd: float) -> str:
 def place_in_words(place: Place) -> str:
     """Describe a place in words; of two blocks, both."""
     if place.words:
-        return place.name
+        return label_in_words(place.name)
     numbers = [(place.ring, place.slot), *([place.other] if any(place.other) else [])]
     labels = place.labels or ("",) * len(numbers)
     blocks = [block_in_words(ring, slot, label)

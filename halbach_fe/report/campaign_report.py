@@ -208,8 +208,11 @@ class Campaign:
         """Say what is known of the magnet and, if large type has room for it, of its map; empty
         without either.
         """
-        changed = [answer for _, answer in self._used("diagnose") if answer.changes_study]
-        magnet = changed[-1:] or [answer for _, answer in self._used("infer")[-1:]]
+        updates = [answer for _, answer in self._used("infer")]
+        explained = bool(updates) and updates[-1].sound
+        found = [answer for _, answer in self._used("diagnose")
+                 if answer.changes_study or not explained]
+        magnet = found[-1:] or updates[-1:]
         of_map = [answer for _, answer in self._used("check", "register")[-1:]]
         said = [one.headline for one in magnet + of_map]
         both = Answer("", "", "", "", gist=" ".join(said), numbers=self._numbers())
@@ -221,13 +224,18 @@ class Campaign:
                      for page, _ in reversed(self._used(verb)) if page.picture is not None), None)
 
     def _verdict(self, left: Sequence[str]) -> str:
-        """Say whether all answers can be trusted; ``left`` are the folders of those that cannot."""
+        """Say whether all answers can be trusted, and else why not the last of those that cannot,
+        whose folders are ``left``.
+        """
         if not left:
             return "Yes"
+        last = [answer for chapter, _, answer in self.answered
+                if chapter.label == left[-1] and not answer.sound][-1].short_trust
+        why = re.match(r"No[:.,] (.)(.*?)\.?$", last)
+        reason = f"{why[1].lower()}{why[2]}" if why else "for the reasons that stand below"
         if not any(answer.sound for _, _, answer in self.answered):
-            return "No, for the reasons that stand below. But they belong together"
-        names = in_a_row([f"folder {each}" for each in left])
-        return f"Not {names}, for the reasons that stand below. The others, yes"
+            return f"No: {reason}. But the results belong together"
+        return f"Not {in_a_row([f'folder {each}' for each in left])}: {reason}. The others, yes"
 
     def _trust_of_update(self) -> str:
         """Say why the last update can be trusted, unless it cannot, and begin the sentence that

@@ -105,17 +105,9 @@ def part_in_words(part: UnknownPart) -> str:
     rms, largest = (decimals(1e3 * one, 2) for one in (part.rms_T, part.largest_T))
     size = f"{rms} mT rms and {largest} mT at most"
     if part.acts_on == "field":
-        return f"a field that Maxwell's equations allow in the bore, {size}"
+        return f"{_target(part)}, {size}"
     texture = "smooth" if part.smooth else "rough"
-    names = ", ".join(part.components)
-    target = {
-        "readings": f"an error of the readings of B{names.replace(', ', ', B')}",
-        "gains": f"an error of {decimals(1e2 * part.size, 2)} % rms of the gain of B"
-                 f"{names.replace(', ', ', B')}",
-        "positions": f"an error of {decimals(1e3 * part.size, 2)} mm rms of the probe's position "
-                     f"along {names}"}[part.acts_on]
-    where = f" in map {part.map}" if part.map else ""
-    text = f"{target}{where}, a {texture} function of {COORDINATES[part.along]}"
+    text = f"{_target(part)}, a {texture} function of {COORDINATES[part.along]}"
     if part.half_wave is not None:
         factor, unit = HALF_WAVES[part.along]
         text += f" that changes within some {decimals(factor * part.half_wave, 2)} {unit}"
@@ -123,6 +115,19 @@ def part_in_words(part: UnknownPart) -> str:
     if part.or_else:
         text += "; as well explained by " + ", ".join(map(_alternative, part.or_else))
     return text + ")"
+
+
+def _target(part: UnknownPart) -> str:
+    """Say what of the readings one term of an unknown cause changes, and by how much."""
+    names = ", ".join(part.components)
+    target = {
+        "field": "a field that Maxwell's equations allow in the bore",
+        "readings": f"an error of the readings of B{names.replace(', ', ', B')}",
+        "gains": f"an error of {decimals(1e2 * part.size, 2)} % rms of the gain of B"
+                 f"{names.replace(', ', ', B')}",
+        "positions": f"an error of {decimals(1e3 * part.size, 2)} mm rms of the probe's position "
+                     f"along {names}"}[part.acts_on]
+    return target + (f" in map {part.map}" if part.map and part.acts_on != "field" else "")
 
 
 def _alternative(text: str) -> str:
@@ -229,7 +234,16 @@ def answer(diagnosis: Diagnosis) -> Answer:
         diagnosis, sound), *step, sound, "" if not remedies else (
             f"The magnet was not assembled as designed: {in_a_row(remedies)}, or use "
             f"{STUDY_FILE}, which describes it with these errors."),
-        diagnosis.found_anything, numbers=distances(diagnosis.before, diagnosis.after))
+        diagnosis.found_anything, _gist(diagnosis), distances(diagnosis.before, diagnosis.after))
+
+
+def _gist(diagnosis: Diagnosis) -> str:
+    """Say in large type what an unknown cause looks like; empty to begin as the answer does."""
+    unknown = diagnosis.unknown
+    if unknown is None or not unknown.parts or diagnosis.identified or diagnosis.gross_errors:
+        return ""
+    return ("Something outside the catalogue is missing. It looks like "
+            f"{'; and '.join(map(_target, unknown.parts))}.")
 
 
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:

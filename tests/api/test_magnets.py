@@ -359,5 +359,5 @@ def test_a_command_whose_function_has_another_name_is_told():
     """A control: of a name that is no command nothing is told."""
     with pytest.raises(AttributeError, match=r"what `halbach-fe check` does is check_map\(\)$"):
         hf.check  # noqa: B018
-    with pytest.raises(AttributeError, match="no attribute 'chek'$"):
+    with pytest.raises(AttributeError, match=r"no attribute 'chek'$"):
         hf.chek  # noqa: B018

@@ -273,6 +273,13 @@ def test_the_page_of_what_is_unknown(flat, tmp_path):
     assert 'class="answer doubtful"' in page
     assert "tells a field from the sensors" in page
     assert "not to be believed" in page
+    part = UnknownPart(acts_on="positions", along="z", or_else=(), components=("z",), smooth=False,
+                       rms_T=1e-3, largest_T=4e-3, size=1e-4, half_wave=0.016,
+                       log_bayes_factor=300.0)
+    look = replace(unknown, parts=(part,))
+    assert answer(replace(found, identified=(), after=found.before, unknown=look)).headline == (
+        "Something outside the catalogue is missing. It looks like an error of 0.1 mm rms of the "
+        "probe's position along z.")
 
 
 def test_numbers_for_people(flat):
@@ -294,6 +301,8 @@ def test_numbers_for_people(flat):
     assert human_unit(Parameter("spin", "furlong", 1.0)) == ("furlong", 1.0)
     assert place_in_words(Place(2, 11)) == "ring 2, slot 11"
     assert place_in_words(Place(2, 0)) == "ring 2"
+    assert place_in_words(Place(2, 11, words="r02s11, half a turn about its radius")) == (
+        "ring 2, slot 11, half a turn about its radius")
     assert place_in_words(Place(at_m=(0.5,))) == "at 0.5 m"
     assert place_in_words(Place()) == ""
 

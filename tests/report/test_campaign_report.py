@@ -482,7 +482,7 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     alone = found_in(home, "field", "inferred").answer
     assert (alone.sound, alone.step) == (False, "Diagnose.")
     assert "Not to be trusted as it is: folder inferred." in alone.said
-    assert alone.trust.startswith("Not folder inferred, for the reasons that stand below. The "
+    assert alone.trust.startswith("Not folder inferred: for the reasons that stand below. The "
                                   "others, yes: they are of one study, and no file")
     assert "model and readings agree" not in alone.trust
     results(home / "sound", "infer", reads=[study, home / "map.csv"], answer=Answer(
@@ -490,7 +490,8 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
     assert found_in(home, "sound").answer.trust.startswith(
         "Yes: model and readings agree: chi² is 1. The results are of one study, and")
     bad = found_in(home, "inferred").answer.trust
-    assert bad.startswith("No, for the reasons that stand below. But they belong together: they")
+    assert bad.startswith("No: for the reasons that stand below. But the results belong together: "
+                          "they")
     results(home / "better", "infer", another(instrument={"translation_m": [1e-3, 0, 0]}),
             [home / "diagnosis" / "study.diagnosed.toml", home / "map.csv"])
     campaign = found_in(home, "field", "inferred", "better", "diagnosis")
@@ -504,14 +505,15 @@ def test_a_better_answer_replaces_one_that_is_not_sound(home):
 
 def test_a_good_and_a_refuted_update_do_not_follow_from_each_other(home):
     """Nor are all to be trusted; versions that a command wrote do follow, and are the control."""
-    refuted = Answer("Like what?", "Bad.", "No.", "Diagnose.", "halbach-fe diagnose STUDY", False)
+    refuted = Answer("Like what?", "Bad.", "No. Model and map disagree. More.", "Diagnose.",
+                     "halbach-fe diagnose STUDY", False)
     results(home / "refuted", "infer", another(prior__magnitude_sd=1e-4),
             [home / "study.toml", home / "map.csv"], answer=refuted)
     found = found_in(home, "inferred", "refuted")
     assert "Not to be trusted as it is: folder refuted." in found.answer.said
     assert found.answer.trust.startswith(
-        "Not folder refuted, for the reasons that stand below. The others, yes: trust in infer. "
-        "The results are of versions of the study that have the same magnet and differ as is said below,")
+        "Not folder refuted: model and map disagree. The others, yes: trust in infer. The results "
+        "are of versions of the study that have the same magnet and differ as is said below,")
     assert not found.answer.sound
     assert "prior.magnitude_sd is 0.0001 instead of" in found.versions[0]
     unused_finding(home)
