@@ -82,9 +82,12 @@ MOST_POINTS = 3000
 SOME_POINTS = 600
 """Number of points by which orientations are compared, and with which the first fit is made."""
 
-GAPS = (1.0, 1.5, 2.0, 2.5, 4.0)
+GAPS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Distances of the charges from the region that are tried, in units of the points' spacing. The
 last one is tried always, the others if the charges are near each other, see `TOO_FAR_APART`."""
+
+MIDDLING = 2.5
+"""That of the charges by which orientations are compared."""
 
 FIRST_FIT_PARTS = 3 * (len(GAPS) + 1)
 """Parts of the first fit, for the time left: all fits by charges at some distance take about as
@@ -820,7 +823,7 @@ def _thinned(scan: Scan) -> ProbeModel:
     """
     some = scan.of(np.linspace(0, len(scan.points) - 1, min(
         len(scan.points), SOME_POINTS)).astype(int))
-    return some.model(Charges.around(some.points, GAPS[-2] * point_spacing(scan.points)))
+    return some.model(Charges.around(some.points, MIDDLING * point_spacing(scan.points)))
 
 
 def _orientation(
