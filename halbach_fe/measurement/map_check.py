@@ -47,6 +47,7 @@ from halbach_fe.measurement.probe_in_field import (
     OFFSETS,
     PAIRS,
     TURNS,
+    WAVES,
     Evidence,
     ProbeFit,
     ProbeModel,
@@ -919,9 +920,11 @@ def _read_at(points: Floats, sensors: Floats) -> Floats:
 # --- instrument ---------------------------------------------------------------------------------
 
 
-CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
-           "from the ends to the middle": {1: -1.5, 3: -0.625}}
-"""Differences of the Legendre polynomials 1 to 4 between times of the scan."""
+CHANGES = {"from start to end": dict.fromkeys(range(0, WAVES, 2), 2.0),
+           "from the ends to the middle": {
+               wave: float(np.polynomial.Legendre.basis(wave + 1)(0)) - 1
+               for wave in range(1, WAVES, 2)}}
+"""Differences of the Legendre polynomials 1 to `WAVES` between times of the scan."""
 
 
 @dataclass(frozen=True)
