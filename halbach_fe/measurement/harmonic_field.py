@@ -22,9 +22,10 @@ from scipy import linalg
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.threads import in_threads, share_out
 
-CLOSENESS = 0.6
+CLOSENESS = 0.45
 """Distance of charges from each other, relative to that from the region: where they are as far from
-each other as from a point, the field there is rough."""
+each other as from a point, the field there is rough. In a clean map of 945 readings charges at 0.6
+left 1.3 times the noise, at 0.45 and at 0.35 1.03 times, with a log evidence larger by 120."""
 
 FEW = 1200
 """Size of a matrix up to which eigenvectors are sought of all of it."""
@@ -267,18 +268,23 @@ class FreeField:
         """The eigenvalues (r,) of the gram beyond its rounding, and its eigenvectors (m or k, r).
 
         A Cholesky decomposition with pivots stops where nothing but rounding is left: fields far
-        from their sources have few combinations, of which alone eigenvectors are sought.
+        from their sources have few combinations, of which alone eigenvectors are sought. Those of
+        its factor by itself are not perpendicular where values are near to rounding, which took up
+        to 9 off log evidences; of an orthonormal basis of its columns they are.
         """
-        if len(self.gram) < FEW:
-            values, vectors = linalg.eigh(self.gram, check_finite=False)
-            kept = values > self.least
-            return values[kept], vectors[:, kept]
-        factor, pivots, rank, _ = linalg.lapack.dpstrf(self.gram, tol=self.least, lower=1)
-        lower = np.empty((len(factor), rank))
-        lower[pivots - 1] = np.tril(factor[:, :rank])
-        values, vectors = linalg.eigh(lower.T @ lower, check_finite=False)
+        # What the decomposition leaves out, in units of what is kept: columns together hold more
+        # than each by itself.
+        deeper = 1 / 16
+        gram, basis = self.gram, None
+        if len(gram) >= FEW:
+            factor, pivots, rank, _ = linalg.lapack.dpstrf(gram, tol=deeper * self.least, lower=1)
+            lower = np.empty((len(factor), rank))
+            lower[pivots - 1] = np.tril(factor[:, :rank])
+            basis, _ = linalg.qr(lower, mode="economic", overwrite_a=True, check_finite=False)
+            gram = basis.T @ gram @ basis
+        values, vectors = linalg.eigh(gram, check_finite=False)
         kept = values > self.least
-        return values[kept], lower @ (vectors[:, kept] / np.sqrt(values[kept]))
+        return values[kept], vectors[:, kept] if basis is None else basis @ vectors[:, kept]
 
     def determined(self, penalty: float) -> Floats:
         """Return the combinations (k, r) of amplitudes that readings tell more of than a share

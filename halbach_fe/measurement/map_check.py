@@ -47,6 +47,7 @@ from halbach_fe.measurement.probe_in_field import (
     OFFSETS,
     PAIRS,
     TURNS,
+    WAVES,
     Evidence,
     ProbeFit,
     ProbeModel,
@@ -82,9 +83,12 @@ MOST_POINTS = 3000
 SOME_POINTS = 600
 """Number of points by which orientations are compared, and with which the first fit is made."""
 
-GAPS = (1.0, 1.5, 2.0, 2.5, 4.0)
+GAPS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Distances of the charges from the region that are tried, in units of the points' spacing. The
 last one is tried always, the others if the charges are near each other, see `TOO_FAR_APART`."""
+
+MIDDLING = 2.5
+"""That of the charges by which orientations are compared."""
 
 FIRST_FIT_PARTS = 3 * (len(GAPS) + 1)
 """Parts of the first fit, for the time left: all fits by charges at some distance take about as
@@ -820,7 +824,7 @@ def _thinned(scan: Scan) -> ProbeModel:
     """
     some = scan.of(np.linspace(0, len(scan.points) - 1, min(
         len(scan.points), SOME_POINTS)).astype(int))
-    return some.model(Charges.around(some.points, GAPS[-2] * point_spacing(scan.points)))
+    return some.model(Charges.around(some.points, MIDDLING * point_spacing(scan.points)))
 
 
 def _orientation(
@@ -916,9 +920,11 @@ def _read_at(points: Floats, sensors: Floats) -> Floats:
 # --- instrument ---------------------------------------------------------------------------------
 
 
-CHANGES = {"from start to end": {0: 2.0, 2: 2.0},
-           "from the ends to the middle": {1: -1.5, 3: -0.625}}
-"""Differences of the Legendre polynomials 1 to 4 between times of the scan."""
+CHANGES = {"from start to end": dict.fromkeys(range(0, WAVES, 2), 2.0),
+           "from the ends to the middle": {
+               wave: float(np.polynomial.Legendre.basis(wave + 1)(0)) - 1
+               for wave in range(1, WAVES, 2)}}
+"""Differences of the Legendre polynomials 1 to `WAVES` between times of the scan."""
 
 
 @dataclass(frozen=True)
