@@ -134,6 +134,9 @@ WORTH_TRYING = 3.0
 """Orientations are tried with an instrument of their own if their rms residuals without one differ
 by less than this factor."""
 
+ALMOST_ALIKE = float(np.log(20.0))
+"""Log odds within which one parameter may as well be another, as for causes in the diagnosis."""
+
 SIGNIFICANT = 4.0
 """Standard deviations from which a parameter is reported as found."""
 
@@ -183,6 +186,9 @@ class InstrumentTerm:
         Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
     predictive : bool
         Whether no part of the map contradicts the others about it, see `_term`.
+    rivals : tuple of str
+        Other parameters of which each by itself explains the map as well: one of all these is off,
+        and the map does not tell which.
     """
 
     name: str
@@ -192,6 +198,7 @@ class InstrumentTerm:
     determined: bool
     plausible: bool
     predictive: bool = True
+    rivals: tuple[str, ...] = ()
 
     @property
     def found(self) -> bool:
@@ -465,7 +472,7 @@ def check_map(
         order=_order(data),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
-        corrected_T=fitted.model.ideal(fitted.at), gap_m=float(np.min(
+        corrected_T=fitted.model.ideal(_as_stated(fitted, terms)), gap_m=float(np.min(
             scan.points[rows.usable].min(axis=0) - fitted.model.charges.places.min(axis=0))),
         **_remaining(fitted, whole, scan, matrix, rows))
 
@@ -1028,6 +1035,17 @@ def _stated(
         for term, stated in zip(terms, supported[best], strict=True))
 
 
+def _as_stated(fitted: _Fitted, terms: Sequence[InstrumentTerm]) -> ProbeFit:
+    """Return the fit without the parameters of which the map does not tell which is off."""
+    kept = np.ones(len(fitted.at.instrument), bool)
+    model = fitted.model
+    for parameter, term in zip(all_parameters(model.prior_sd, model.shares(fitted.at)), terms,
+                               strict=True):
+        if term.rivals:
+            kept[list(parameter.own + parameter.beside)] = False
+    return replace(fitted.at, instrument=np.where(kept, fitted.at.instrument, 0.0))
+
+
 def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
     """Tell whether no other region of the map contradicts a term, and another one shows it too."""
     told = [other for other in others if other.determined]
@@ -1070,27 +1088,60 @@ def selected(
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
     """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
 
-    ``told`` is what the whole map tells, and what its halves do. In a field along one axis, a turn
-    of the probe and an angle between its sensors differ by little: of what explains the map, it is
-    what is certain, and near to 0 by what instruments do. ``known`` (p,) are kept already, ``flat``
-    is the number of the half in which the field is flat, see `_term`.
+    ``told`` is what the whole map tells, and what its halves do. ``known`` (p,) are kept already,
+    ``flat`` is the number of the half in which the field is flat, see `_term`. Parameters of which
+    one is enough, and that explain the map about as well, are kept together: in the flat field of
+    an MRI magnet a gain that drifts along x is a gradient of the field and a sensor that is off
+    along x. None is found then, as none has a value without the others, unless later ones help.
     """
     kept = np.zeros(len(told[0].sums), bool) if known is None else known.copy()
+    rivals: dict[str, tuple[str, ...]] = {}
     while True:
-        terms, away = zip(*(_term(parameter, kept, told, flat) for parameter in parameters),
-                          strict=True)
+        terms = [_term(parameter, kept, told, flat) for parameter in parameters]
         there = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
-        new = [(abs(term.value) / term.sd / (1 + far), parameter.own)
-               for parameter, term, far, old in zip(parameters, terms, away, there, strict=True)
-               if term.found and not old]
+        new = {parameter.name: _most_probable(parameter, kept, told[0])
+               for parameter, term, old in zip(parameters, terms, there, strict=True)
+               if term.found and not old}
         finer = [] if new else _finer(parameters, kept, told, flat)
         if finer:
             kept[finer] = True
         elif not new:
-            return kept, tuple(replace(term, predictive=term.predictive and (not term.found or old))
-                               for term, old in zip(terms, there, strict=True))
+            found = {term.name for term in terms if term.found}
+            return kept, tuple(
+                replace(term, predictive=term.predictive and (not term.found or old),
+                        rivals=() if found & {term.name, *rivals.get(term.name, ())}
+                        else rivals.get(term.name, ()))
+                for term, old in zip(terms, there, strict=True))
         else:
-            kept[list(max(new)[1])] = True
+            alike = _alike(new, told[0])
+            rivals |= {name: tuple(other for other in alike if other != name) for name in alike}
+            for parameter in parameters:
+                if parameter.name in alike:
+                    kept[list(parameter.own)] = True
+
+
+def _most_probable(
+    parameter: Parameter, kept: NDArray[np.bool_], whole: Evidence
+) -> NDArray[np.bool_]:
+    """Return all that is kept (p,) with a parameter, or with its uneven part if that is more
+    probable.
+    """
+    number = np.arange(len(kept))
+    even = kept | np.isin(number, parameter.own)
+    return max(even, even | np.isin(number, parameter.beside), key=whole.log_evidence)
+
+
+def _alike(new: dict[str, NDArray[np.bool_]], whole: Evidence) -> list[str]:
+    """Return the parameter, of all that are found, that explains the map best, and those that do so
+    nearly as well in its place but add nothing to it.
+
+    ``new`` is what is kept (p,) with each of them.
+    """
+    evidence = {name: whole.log_evidence(kept) for name, kept in new.items()}
+    best = max(evidence, key=evidence.__getitem__)
+    return [best, *(name for name, kept in new.items() if name != best
+                    and evidence[best] - evidence[name] < ALMOST_ALIKE
+                    and whole.log_evidence(kept | new[best]) - evidence[best] < ALMOST_ALIKE)]
 
 
 def _finer(
@@ -1106,7 +1157,7 @@ def _finer(
             for part in np.flatnonzero((parameter.row != 0) & ~kept).tolist():
                 alone = np.where(np.arange(len(kept)) == part, parameter.row, 0.0)
                 if _shown(replace(parameter, row=alone, own=waves), kept, told, flat,
-                          PARTS_OF_A_CHANGE)[0].found:
+                          PARTS_OF_A_CHANGE).found:
                     found.append(part)
     return found
 
@@ -1128,26 +1179,24 @@ def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[ND
 
 def _term(
     parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int
-) -> tuple[InstrumentTerm, float]:
+) -> InstrumentTerm:
     """Return what the whole map and its halves show of a parameter, see `_shown`.
 
     A change during the scan that they do not show alike by itself is asked with its uneven part.
     """
     even = _shown(parameter, kept, told, flat, ALIKE_PARTS)
-    if even[0].found or not parameter.beside:
+    if even.found or not parameter.beside:
         return even
     uneven = _shown(replace(parameter, own=parameter.own + parameter.beside), kept, told, flat,
                     PARTS_OF_A_CHANGE)
-    return uneven if uneven[0].found else even
+    return uneven if uneven.found else even
 
 
 def _shown(
     parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int,
     alike: tuple[float, float]
-) -> tuple[InstrumentTerm, float]:
+) -> InstrumentTerm:
     """Return what the whole map and its halves show of a parameter, besides those that are kept.
-
-    The second number is how many prior standard deviations it is from 0.
 
     If the halves scatter about the whole by more than their bars, its bar is as much longer. They
     support it if both of a pair could tell whether it is there, and none that could contradicts it.
@@ -1157,7 +1206,7 @@ def _shown(
     # A parameter is determined if its standard deviation is below this part of its prior one.
     determined = 0.5
     if not parameter.row.any():  # it is not asked, see `ProbeModel`
-        return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True), 0.0
+        return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True)
     used = np.flatnonzero(kept | np.isin(np.arange(len(kept)), parameter.own))
     row = parameter.row[used]
     estimates = [each.estimate(used) for each in told]
@@ -1176,7 +1225,7 @@ def _shown(
     return InstrumentTerm(
         parameter.name, parameter.unit, value, beyond * sd, beyond * sd < determined * prior,
         away <= doubted_from(len(kept)),
-        supported or abs(value) <= SIGNIFICANT * beyond * sd), away
+        supported or abs(value) <= SIGNIFICANT * beyond * sd)
 
 
 # --- what remains -------------------------------------------------------------------------------

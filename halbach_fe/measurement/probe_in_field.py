@@ -440,6 +440,12 @@ class Evidence:
             yield told(first, own)
             yield told(whole.part(~own, first), ~own)
 
+    def log_evidence(self, kept: NDArray[np.bool_]) -> float:
+        """Return the log Bayes factor of an instrument of some parameters (p,) to a perfect one."""
+        information, sums = self.information[np.ix_(kept, kept)] + np.eye(kept.sum()), self.sums[kept]
+        return float(sums @ np.linalg.solve(information, sums)
+                     - np.linalg.slogdet(information)[1]) / 2
+
     def estimate(self, kept: Ints) -> tuple[Floats, Floats]:
         """Return the values (k,) and covariance (k, k) of an instrument of some parameters only."""
         covariance = np.linalg.inv(self.information[np.ix_(kept, kept)] + np.eye(len(kept)))

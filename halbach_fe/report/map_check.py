@@ -256,6 +256,9 @@ def sentences(check: MapCheck) -> list[str]:
                      + (f"; and {others} more of the parameters in the table" if others > 0
                         else "")
                      + ".")
+    found += [f"One of these is off, and the map does not tell which: {'; '.join(names)}."
+              for names in dict.fromkeys(tuple(sorted((term.name, *term.rivals)))
+                                         for term in check.terms if term.rivals)]
     return found
 
 
