@@ -133,7 +133,7 @@ def _by_name(files: list[InputFile]) -> dict[str, InputFile]:
             return dict(zip(names, files, strict=True))
     raise CommandLineError(must_be(
         "MAP", "command line", "maps of different names", " and ".join(map(str, files)),
-        "Leave out the one that was given twice, or rename it."))
+        "Leave out the one that was given twice, or rename one of two different maps."))
 
 
 def _open_key(text: str) -> OpenKey:

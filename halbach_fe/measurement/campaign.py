@@ -185,7 +185,7 @@ def maps_of(
             refuse_unordered(one.name, data[one.name], own)
             found.append(Map(one.name, data[one.name], own, middle, middle, one.probe or one.name,
                              one.stage or one.name, one.name, one.stage_shift_sd_m))
-        _refuse_repeated(found)
+        refuse_shared({one.name: _rows(one.data, one.study) for one in found})
         _refuse_mixed_probes(found)
     if validation_map is not None:
         validation_map = checked_map(validation_map, VALIDATION_MAP)
@@ -306,11 +306,13 @@ def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
     return bool(special.bdtrc(copies - 1, pairs, alike) < BY_CHANCE)
 
 
-def _refuse_repeated(maps: Sequence[Map]) -> None:
-    """Raise a MeasurementError if many readings of a map are in another one too."""
-    rows = [_rows(one.data, one.study) for one in maps]
+def refuse_shared(maps: Mapping[str, tuple[Floats, Floats, float]]) -> None:
+    """Raise a MeasurementError if many readings of a map are in another one too.
+
+    ``maps`` are points (n, 3) in m, values (n, k) in T and typical noise in T of each, by its name.
+    """
     for (one, (points, field, noise)), (other, (places, values, sigma)) in combinations(
-            zip(maps, rows, strict=True), 2):
+            maps.items(), 2):
         both = np.isfinite(field).any(axis=0) & np.isfinite(values).any(axis=0)
         sides = []
         for position, reading in ((points, field), (places, values)):
@@ -329,7 +331,7 @@ def _refuse_repeated(maps: Sequence[Map]) -> None:
         if rounded or _no_chance(copies, there, of_fewer[:, both], min(noise, sigma)):
             count = max(shared, FEWEST_COPIES) if rounded else copies
             _refuse(count, must_be(
-                f"`maps` '{one.name}' and '{other.name}'", "the campaign",
+                f"`maps` '{one}' and '{other}'", "the campaign",
                 "different maps, as the same readings must not count twice",
                 f"the same readings in {shared if rounded else copies} of {len(fewer)} rows",
                 "Remove one of them, or these rows of one."))

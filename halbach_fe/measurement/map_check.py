@@ -1035,7 +1035,7 @@ def _stated(
         for term, stated in zip(terms, supported[best], strict=True))
 
 
-def _as_stated(fitted: _Fitted, terms: Sequence[InstrumentTerm]) -> ProbeFit:
+def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
     """Return the fit without the parameters of which the map does not tell which is off."""
     kept = np.ones(len(fitted.at.instrument), bool)
     model = fitted.model

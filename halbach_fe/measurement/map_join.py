@@ -25,6 +25,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
 from halbach_fe.core.pace import Pace, Progress
+from halbach_fe.measurement.campaign import refuse_shared
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, spacing_of
 from halbach_fe.measurement.joined_probe import (
@@ -377,7 +378,8 @@ def join_maps(
         If there are fewer than two maps, or ``turn_rad`` is no such number.
     MeasurementError
         If a map does not obey Maxwell's equations by itself, or there is no place where its
-        readings are those of the others: it is mirrored, of another magnet, or overlaps none.
+        readings are those of the others: it is mirrored, of another magnet, or overlaps none. If
+        two maps hold the same readings.
 
     Examples
     --------
@@ -401,6 +403,8 @@ def join_maps(
         check = check_map(data, say, progress)
         _refuse_disobedient(name, check)
         checked.append(Checked.of(name, data, check))
+    refuse_shared({one.name: (points_of(one.data), one.data["B_T"].values, one.check.noise_T)
+                   for one in checked})
     return join_checked(checked, Pace(say, progress), turn_rad)
 
 

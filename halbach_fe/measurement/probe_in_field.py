@@ -442,7 +442,8 @@ class Evidence:
 
     def log_evidence(self, kept: NDArray[np.bool_]) -> float:
         """Return the log Bayes factor of an instrument of some parameters (p,) to a perfect one."""
-        information, sums = self.information[np.ix_(kept, kept)] + np.eye(kept.sum()), self.sums[kept]
+        sums = self.sums[kept]
+        information = self.information[np.ix_(kept, kept)] + np.eye(len(sums))
         return float(sums @ np.linalg.solve(information, sums)
                      - np.linalg.slogdet(information)[1]) / 2
 

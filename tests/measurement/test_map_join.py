@@ -144,6 +144,16 @@ def test_maps_that_cannot_be_joined(generator):
         joined_of(maps | {"part1": foreign})
 
 
+def test_a_copy_of_a_map_is_refused(generator):
+    """Its readings would count twice. Control: the same places, measured again."""
+    maps, *_ = campaign(3)
+    one = maps["part0"]
+    with pytest.raises(MeasurementError, match=r"'one' and 'copy'.* must not count twice"):
+        join_maps({"one": one, "copy": one.copy()})
+    again = one["B_T"] + 2e-5 * generator.standard_normal(one["B_T"].shape)
+    assert join_maps({"one": one, "again": one.assign(B_T=again)}).poses
+
+
 def test_the_sign_that_no_single_map_shows():
     maps, poses, _ = campaign(1, maps=2)
     opposite = maps["part1"].assign(B_T=-maps["part1"]["B_T"])
