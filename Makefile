@@ -91,8 +91,10 @@ results/mri4all/map.csv: studies/mri4all/measured/cube_10cm_11_steps.csv | setup
 	.venv/bin/halbach-fe import-map $< -o $@ "--columns=-,dx[mm],dy[mm],dz[mm],Bx[G],By[G],Bz[G],-,-"
 results/%/check/check.html: results/%/map.csv
 	.venv/bin/halbach-fe check $< -o $(@D)
-results/emphatic/registered/study.registered.toml: results/emphatic/body/check.html results/emphatic/fringe/check.html
-	.venv/bin/halbach-fe register studies/emphatic/measured/study.toml -o $(@D)
+results/emphatic/registered/study.registered.toml: results/emphatic/body/check.html \
+    results/emphatic/fringe/check.html results/emphatic/joined/joined.html
+	.venv/bin/halbach-fe register studies/emphatic/measured/study.toml -o $(@D) \
+	    --joined results/emphatic/joined/joined.json
 results/mri4all/registered/registration.html: results/mri4all/check/check.html
 	.venv/bin/halbach-fe register studies/mri4all/measured/study.toml -o $(@D) \
 	    --measurements results/mri4all/check/corrected_map.csv

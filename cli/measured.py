@@ -189,7 +189,10 @@ class _DifferentKeys(argparse.Action):
            "not determine it (default: the blocks' outer radius)"),
     option("--turn-rad", metavar="SD", type=within(positive_number, 0, math.pi / 2),
            help="prior standard deviation of the map's turns from right angles, for a map that "
-           "does not determine them (default: 0.1)"))
+           "does not determine them (default: 0.1)"),
+    option("--joined", type=input_file, metavar="JSON",
+           help="joined.json of `halbach-fe check MAP MAP`: where overlaps of the maps that the "
+           "study lists have them without a magnet, which poses must not contradict"))
 def register(arguments: argparse.Namespace) -> int:
     """Find where a field map lies in the magnet, and the probe's axes.
 
@@ -201,7 +204,8 @@ def register(arguments: argparse.Namespace) -> int:
     reported with their odds; the file has the most probable one, or of those between which the
     readings do not decide the one that is turned least. If the study lists maps, they are
     registered one after the other, each in the magnet as those before it have updated it, and each
-    gets a folder with its own page.
+    gets a folder with its own page. With --joined a pose that contradicts the overlap of maps is
+    said, and the overlap is a datum of the update by maps on one stage.
     """
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.pose_result import PosePrior
@@ -220,6 +224,10 @@ def register(arguments: argparse.Namespace) -> int:
                     option, "the command line", "left out for a study that lists several maps",
                     "given", "Register one of the maps alone with it."))
         return _run_campaign(arguments, study, data, say)
+    if arguments.joined:
+        raise StudyError(must_be(
+            "--joined", "the command line", "left out for a single map", "given",
+            "List the maps that were joined in the study ([[maps]])."))
     pose = PosePrior(arguments.across_m, arguments.turn_rad or PosePrior.turn_rad)
     with common.session(arguments, study) as session:
         found = register(build_magnet(study), data, session, open_keys=arguments.fit,
@@ -237,14 +245,16 @@ def _run_campaign(
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.campaign_registration import register_maps, registered_study
     from halbach_fe.measurement.campaign import maps_of
+    from halbach_fe.measurement.map_join import read_joined
     from halbach_fe.report.page import write_changed_study, write_files
     from halbach_fe.report.registration import NOTE, STUDY_FILE, pages_of_maps
 
-    maps = maps_of(study, data)
+    maps, joined = maps_of(study, data), arguments.joined and read_joined(arguments.joined)
     with common.session(arguments, study) as session:
-        found = register_maps(build_magnet(study.with_(maps=())), maps, session, arguments.fit, say)
+        found = register_maps(build_magnet(study.with_(maps=())), maps, session, arguments.fit, say,
+                              joined)
     write_changed_study(arguments.output / STUDY_FILE,
-                        [(registered_study(study, maps, found), NOTE)], arguments.study)
+                        [(registered_study(study, maps, found, joined), NOTE)], arguments.study)
     pages = pages_of_maps(maps, found)
     paths = {name: write_files(page, make_folder(arguments.output / name))
              for name, page in pages.items()}

@@ -269,6 +269,9 @@ class Registration:
         Whether the map is of |B|, which then stands in place of x in the residuals.
     left_out : int
         Number of poses that the search found too, and that were not fitted.
+    apart : tuple of Term
+        By how much this pose is off, along and about axes of the stage, where overlaps with other
+        maps have it without a magnet; its standard deviation is that of both.
     """
 
     study: Study
@@ -294,6 +297,7 @@ class Registration:
     component: str = ""
     total: bool = False
     left_out: int = 0
+    apart: tuple[Term, ...] = ()
 
     @property
     def undetermined(self) -> tuple[str, ...]:

@@ -39,6 +39,7 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.harmonic_field import NO_FIT, Charges, HarmonicFit, spacing_of
 from halbach_fe.measurement.probe_in_field import (
+    COARSE_WAVES,
     FEW_ITERATIONS,
     GAINS,
     LAG,
@@ -1147,19 +1148,33 @@ def _alike(new: dict[str, NDArray[np.bool_]], whole: Evidence) -> list[str]:
 def _finer(
     parameters: list[Parameter], kept: NDArray[np.bool_], told: list[Evidence], flat: int
 ) -> list[int]:
-    """Return the finer parts of changes during the scan that are kept, which are found too."""
-    found = []
-    for parameter in parameters:
-        if parameter.beside and kept[list(parameter.own)].all():
-            waves = tuple(np.flatnonzero(np.any([
-                other.row != 0 for other in parameters if other.beside == parameter.beside],
-                axis=0)).tolist())
-            for part in np.flatnonzero((parameter.row != 0) & ~kept).tolist():
+    """Return the finer parts of changes during the scan that are kept, which are found too.
+
+    The smooth ones are asked first, by themselves: beside all others each of them has a longer bar.
+    """
+    for most in (COARSE_WAVES, WAVES):
+        found = []
+        for parameter in parameters:
+            if not parameter.beside or not kept[list(parameter.own)].all():
+                continue
+            waves = _waves_of(parameter, parameters, most)
+            for part in [each for each in waves if parameter.row[each] and not kept[each]]:
                 alone = np.where(np.arange(len(kept)) == part, parameter.row, 0.0)
                 if _shown(replace(parameter, row=alone, own=waves), kept, told, flat,
                           PARTS_OF_A_CHANGE).found:
                     found.append(part)
-    return found
+        if found:
+            return found
+    return []
+
+
+def _waves_of(
+    parameter: Parameter, parameters: list[Parameter], most: int
+) -> tuple[int, ...]:
+    """Return the first parts of all changes during the scan that differ in their waves only."""
+    every = np.flatnonzero(np.any([
+        other.row != 0 for other in parameters if other.beside == parameter.beside], axis=0))
+    return tuple(every[:most].tolist())
 
 
 def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:

@@ -8,9 +8,11 @@ common. Terms of the probe that only one map has are added if all parts of the o
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -23,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
 from halbach_fe.core.pace import Pace, Progress
 from halbach_fe.measurement.campaign import refuse_shared
@@ -223,6 +226,31 @@ class MapPose:
         """Whether the overlap says more (6,) of shift and turn than what a stage may be off."""
         sd = np.concatenate([self.shift_sd_m, self.rotation_sd_rad])
         return np.asarray(sd < np.array(PLACED_SD[:6]) / 2)
+
+
+def read_joined(path: Path) -> tuple[str, tuple[MapPose, ...]]:
+    """Return the name of the map whose frame is that of others, and their poses in it.
+
+    Raises
+    ------
+    MeasurementError
+        If the file is no joined.json of `halbach-fe check MAP MAP`.
+    """
+    where, wanted = "joined maps", "a joined.json that `halbach-fe check MAP MAP` wrote"
+    try:
+        found = json.loads(file_bytes(path, where))
+        poses = tuple(MapPose(str(one["name"]), *(np.array(one[key], float) for key in (
+            "middle_m", "shift_m", "shift_sd_m", "rotation_rad", "rotation_sd_rad")),
+            int(one["sign"])) for one in found["poses"])
+        numbers = np.array([list(vars(one).values())[1:-1] for one in poses], float)
+        bars = numbers[:, [2, 4]] if numbers.shape[1:] == (5, 3) else np.zeros(1)
+        if not np.isfinite(numbers).all() or not (bars > 0).all():
+            raise ValueError
+        return str(found["frame"]), poses
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError,
+            IndexError):
+        raise MeasurementError(must_be(
+            f"file {path}", where, wanted, "another file")) from None
 
 
 @dataclass(frozen=True)

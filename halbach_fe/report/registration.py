@@ -24,6 +24,7 @@ from halbach_fe.inference.registration import (
 )
 from halbach_fe.measurement.campaign import Map
 from halbach_fe.measurement.doubted_terms import (
+    UNITS,
     UNLIKE,
     doubts_in_words,
     factor_in_words,
@@ -91,6 +92,11 @@ USE_ANY = (
     "or give measured blocks (--blocks): then find out by a mark on the magnet which pose is the "
     "real one.")
 
+MOVES_A_SECTION = (
+    "The overlap needs no magnet: something is missing in the model, such as steps of the bore, "
+    "lengths of rings and gaps between them, magnetization that was lost at the ends, or "
+    "permeability.")
+
 NEAR_M, NEAR_RAD = 1e-3, 1e-2
 """Shift and turn up to which `diagnose` finds a map's pose from that of the study."""
 
@@ -130,6 +136,7 @@ def answer(
     if best.explains:
         said = _component(found) + said
         trust.insert(0, NOT_AT_REST if not best.at_rest else DOUBTED if best.doubts else
+                     _apart(best, name) if best.apart else
                      AT_REST if all(is_symmetric_to(best, each) for each in rivals(found))
                      else UNDECIDED)
     else:
@@ -152,11 +159,11 @@ def answer(
              "components of B that are missing, or narrow the search by what is known of the place "
              "(--across-m, --turn-rad), and register again.",
              f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
-            if best.explains else
+            if best.explains and not best.apart else
             ("Look for what the model lacks. The map lies about where the study states it, and "
              "diagnose finds small shifts and turns by itself.",
              f"halbach-fe diagnose STUDY{maps} -o DIR")
-            if _is_near(best, assumed or Instrument()) else
+            if _is_near(best, assumed or Instrument()) and not best.apart else
             ("Look for what the model lacks.",
              f"halbach-fe diagnose DIR/{STUDY_FILE}{own} -o DIR")), sound=sound,
         changes_study=not _is_as_assumed(best, assumed or Instrument()), gist="" if not sound else
@@ -166,7 +173,19 @@ def answer(
 
 def is_sound(best: Registration) -> bool:
     """Tell whether a pose may be used: it explains the map, with terms that are to be expected."""
-    return best.explains and best.at_rest and not best.doubts
+    return best.explains and best.at_rest and not best.doubts and not best.apart
+
+
+def _apart(best: Registration, name: str) -> str:
+    """Say where the model of the magnet wants a map otherwise than its overlap with others."""
+    said = []
+    for one in best.apart:
+        where, axis = one.name.split("_")
+        unit, factor = UNITS[one.unit]
+        said.append(f"{with_error(factor * one.value, factor * one.prior_sd)}\u00a0{unit} {where} "
+                    f"{axis} of the stage ({decimals(one.distance, 2)} standard deviations)")
+    return (f"No. The magnet's model wants map {name} {in_a_row(said)} from where its overlap with "
+            f"the other maps has it. {MOVES_A_SECTION}")
 
 
 def _component(found: Sequence[Registration]) -> str:
@@ -512,6 +531,7 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
         "odds": float(probability) if has_odds(found) else None,
         "at_rest": each.at_rest, "explains": each.explains, "sound": is_sound(each),
         "doubts": [one.plain() for one in each.doubts], "factor": each.factor,
+        "apart": [one.plain() for one in each.apart],
         **({"component": each.component} if each.component else {}),
         "undetermined": list(each.undetermined), "chi2": each.chi2,
         "held_out_chi2": None if np.isnan(each.held_out_chi2) else each.held_out_chi2,

@@ -463,6 +463,36 @@ def test_a_campaign_on_one_stage_is_registered(generator, tmp_path, monkeypatch,
     assert fringe.rotation_rad == pytest.approx(body.rotation_rad, abs=1e-12)
     assert turn.inv().apply(np.subtract(fringe.translation_m, body.translation_m)) == (
         pytest.approx([0, 0, 0.0513], abs=2e-4))
+    # where the overlap of both maps has the second one, which the registration need not believe
+    at = (FRINGE - SHIFTED[1]) @ SHIFTED[0].as_matrix()
+    for off_m in (0.0, 4e-4):
+        overlap = {"frame": "body", "poses": [{
+            "name": "fringe", "middle_m": ((at.min(axis=0) + at.max(axis=0)) / 2).tolist(),
+            "shift_m": [0.0, 0.0, 0.0513 + off_m], "shift_sd_m": [1e-4, 1e-4, 2e-5],
+            "rotation_rad": [0.0] * 3, "rotation_sd_rad": [1e-3] * 3, "sign": 1}]}
+        (tmp_path / "joined.json").write_text(json.dumps(overlap))
+        capsys.readouterr()
+        assert main(["register", str(path), "-o", str(tmp_path / "joined"), "--joined",
+                     str(tmp_path / "joined.json")]) == 0
+        said = " ".join(capsys.readouterr().err.split())
+        _, fringe = read_study(tmp_path / "joined" / "study.registered.toml").maps
+        assert fringe.stage_shift_sd_m == (1e-4, 1e-4, 2e-5)
+        place = turn.inv().apply(np.subtract(fringe.instrument.translation_m, body.translation_m))
+        assert place == pytest.approx([0, 0, 0.0513 + off_m], abs=1e-6)
+        assert ("from where its overlap with the other maps has it" in said) == bool(off_m)
+        best, *_ = json.loads((tmp_path / "joined" / "fringe" / "registration.json").read_text())[
+            "poses"]
+        assert [one["name"] for one in best["apart"]] == (["along_z"] if off_m else [])
+        assert best["sound"] == (not off_m)
+    (apart,) = best["apart"]  # the model wants the map before where the overlap has it
+    assert apart["value"] == pytest.approx(-4e-4, abs=4 * apart["prior_sd"])
+    assert apart["prior_sd"] < 1e-4
+    for text, sentence in (('{"frame": "body", "poses": [{"name": "x"}]}', "a joined.json that"),
+                           (json.dumps(overlap | {"frame": "else"}), "at least two of its maps")):
+        (tmp_path / "joined.json").write_text(text)
+        assert main(["register", str(path), "-o", str(tmp_path / "none"), "--joined",
+                     str(tmp_path / "joined.json")]) in (3, 4)
+        assert sentence in " ".join(capsys.readouterr().err.split())
     # control: a map whose stage was turned by a right angle about the axis
     quarter = Rotation.from_euler("z", 90, degrees=True)
     monkeypatch.setitem(POSES, "fringe", (SHIFTED[0] * quarter, SHIFTED[1]))
