@@ -37,6 +37,8 @@ class Sizes:
         Largest size relative to the radius of a round body.
     edge : float
         Size along the edges, where the field is singular, relative to that in the body.
+    gap : float
+        Size along edges at a narrow gap between two bodies, relative to the gap's width.
     growth : float
         Change of the size per unit of distance in the air.
     """
@@ -45,6 +47,7 @@ class Sizes:
     thickness: float
     curvature: float
     edge: float
+    gap: float
     growth: float
 
     @classmethod
@@ -53,7 +56,7 @@ class Sizes:
         usual = 0.4  # growth - 1 for which the numbers below are
         relative = coarseness * (mesh.growth - 1) / usual
         return cls(coarseness * mesh.block_size_m, 1.2 * relative, 0.25 * relative, 0.4,
-                   0.35 * relative**0.6)
+                   0.3 * relative, 0.35 * relative**0.6)
 
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""
@@ -183,6 +186,7 @@ def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes
         used.append(field.add("MathEval"))
         field.setString(used[-1], "F", f"{size:.9g}+{sizes.growth:.9g}*F{distance}")
 
+    narrow: dict[int, set[int]] = {}
     for body, volumes in zip(bodies, iron, strict=True):
         solid = [(3, tag) for tag in volumes]
         faces = gmsh.model.getBoundary(solid, oriented=False)
@@ -192,13 +196,59 @@ def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes
                  if _is_sharp(one)]
         if edges:
             limit("CurvesList", edges, sizes.edge * size)
+            others = [(3, tag) for other in iron for tag in other if tag not in volumes]
+            widest = sizes.edge * size / sizes.gap
+            for width, points in _narrow_gaps(edges, solid, others, widest).items():
+                narrow.setdefault(width, set()).update(points)
         used.append(field.add("Constant"))
         field.setNumbers(used[-1], "VolumesList", list(volumes))
         field.setNumber(used[-1], "VIn", size)
         field.setNumber(used[-1], "VOut", shell.inner / 3)
+    gmsh.model.occ.synchronize()
+    for width, points in narrow.items():
+        limit("PointsList", [(0, tag) for tag in points], sizes.gap * 2.0 ** width)
     least = field.add("Min")
     field.setNumbers(least, "FieldsList", used)
     field.setAsBackgroundMesh(least)
+
+
+def _narrow_gaps(
+    edges: Sequence[tuple[int, int]], solid: Sequence[tuple[int, int]],
+    others: Sequence[tuple[int, int]], widest: float,
+) -> dict[int, list[int]]:
+    """Add points along edges of a solid where another one is nearer to them than ``widest`` in m.
+
+    The points are listed by the width of the gap, as its logarithm to base 2, rounded down. Solids
+    that touch have no gap, and the narrowest are as one of an eighth of ``widest``.
+    """
+    occ, narrowest = gmsh.model.occ, widest / 8
+    boxes = [np.array(occ.getBoundingBox(*one)) for one in solid]
+    near = [other for other in others if any(
+        _apart(box, np.array(occ.getBoundingBox(*other))) < widest for box in boxes) and all(
+        widest > occ.getDistance(*one, *other)[0] > 0 for one in solid)]
+    found: dict[int, list[int]] = {}
+    for edge in sorted(set(edges)):
+        for other in near:
+            width = occ.getDistance(*edge, *other)[0]
+            if width >= widest:
+                continue
+            (low,), (high,) = gmsh.model.getParametrizationBounds(*edge)
+            count = 2 + round(occ.getMass(*edge) / max(width, narrowest))
+            places = gmsh.model.getValue(*edge, np.linspace(low, high, count))
+            for place in np.reshape(places, (-1, 3)):
+                point = occ.addPoint(*place)
+                width = occ.getDistance(0, point, *other)[0]
+                if width < widest:
+                    found.setdefault(int(np.floor(np.log2(max(width, narrowest)))), []).append(point)
+                else:
+                    occ.remove([(0, point)])
+    return found
+
+
+def _apart(first: Floats, second: Floats) -> float:
+    """Return the distance in m of two boxes, each by its low and high corners (6,)."""
+    return float(np.linalg.norm(np.maximum(np.maximum(first[:3] - second[3:],
+                                                      second[:3] - first[3:]), 0.0)))
 
 
 def _is_sharp(curve: tuple[int, int]) -> bool:
