@@ -14,7 +14,7 @@ import gmsh
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import MeshError, StudyError, must_be
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions
@@ -61,8 +61,8 @@ class Sizes:
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""
         volume, surface, _ = body.measures
-        round_body = np.inf if body.outline or body.triangles is not None else (
-            self.curvature * body.outer_radius)
+        flat = body.outline or (body.triangles is not None and body.profile is None)
+        round_body = np.inf if flat else self.curvature * body.outer_radius
         return min(self.iron, self.thickness * volume / surface, round_body)
 
     def count(self, bodies: Sequence[IronSolid]) -> tuple[int, int]:
@@ -145,6 +145,13 @@ def _draw(name: str, bodies: Sequence[IronSolid]) -> tuple[list[list[int]], Shel
     """
     occ = gmsh.model.occ
     drawn = [_volume(body) for body in bodies]
+    rounding = 0.01  # of the chords that stand for circles in `IronSolid.measures`
+    for number, (body, volume) in enumerate(zip(bodies, drawn, strict=True)):
+        found, expected = occ.getMass(*volume), body.measures[0]
+        if not abs(found - expected) <= rounding * expected:
+            raise MeshError(
+                f"Gmsh draws body {number + 1} of iron of study '{name}' with {found:.4g} m^3, but "
+                f"it has {expected:.4g} m^3. Please report this with the study.")
     shell = _shell(drawn)
     whole = sum(occ.getMass(*volume) for volume in drawn)
     inner, outer = (occ.addSphere(*shell.middle, radius) for radius in (shell.inner, shell.outer))
@@ -283,19 +290,33 @@ def _within(triangles: Floats) -> int:
     return int(occ.addVolume([occ.addSurfaceLoop(faces)]))
 
 
+def _loop(places: Sequence[tuple[float, float, float]]) -> int:
+    """Add a closed loop of lines through places in m to the model."""
+    occ = gmsh.model.occ
+    points = [occ.addPoint(*place) for place in places]
+    return int(occ.addCurveLoop([occ.addLine(start, end)
+                                 for start, end in pairwise([*points, points[0]])]))
+
+
 def _volume(body: IronSolid) -> tuple[int, int]:
     """Add a body to the Gmsh model in its place; return its dimension and tag."""
     occ = gmsh.model.occ
     if body.sphere:
         volume = 3, occ.addSphere(0.0, 0.0, 0.0, body.outer_radius)
-    elif body.triangles is not None:
-        volume = 3, _within(body.triangles)
+    elif body.profile is not None:
+        face = occ.addPlaneSurface([_loop([(r, 0.0, z) for r, z in body.profile])])
+        found = occ.revolve([(2, face)], 0, 0, 0, 0, 0, 1, 2 * np.pi)
+        volume = next(each for each in found if each[0] == 3)
     elif body.outline is not None:
-        starts = [occ.addPoint(*edge.start, body.z_min) for edge in body.outline]
-        lines = [occ.addLine(start, end) for start, end in pairwise([*starts, starts[0]])]
-        face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
+        loops = [_loop([(*edge.start, body.z_min) for edge in body.outline])]
+        for hole in body.holes:
+            loops.append(_loop([(x, y, body.z_min) for x, y in hole[::-1]]) if hole.ndim == 2 else (
+                occ.addCurveLoop([occ.addCircle(*hole[:2], body.z_min, hole[2])])))
+        face = occ.addPlaneSurface(loops)
         found = occ.extrude([(2, face)], 0, 0, body.z_max - body.z_min)
         volume = next(each for each in found if each[0] == 3)
+    elif body.triangles is not None:
+        volume = 3, _within(body.triangles)
     else:
         ends = 0.0, 0.0, body.z_min, 0.0, 0.0, body.z_max - body.z_min
         volume = 3, occ.addCylinder(*ends, body.outer_radius)
