@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from functools import partial
+from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geo.iron_bodies import Sizes
+from halbach_fe.geo.iron_bodies import Sizes, mesh_iron
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -128,6 +131,48 @@ def test_a_body_of_triangles_is_as_a_box(session):
     scale = np.abs(found[0]).max()
     assert np.abs(found[1] - found[0]).max() < 0.03 * scale
     assert np.abs(found[2] - found[0]).max() > 0.05 * scale
+
+
+def test_a_profile_is_as_a_tube(session):
+    """In a uniform field, on coarse meshes; without its bore as the control."""
+    mesh = {"block_size_m": 0.02, "growth": 2.6}
+    uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    place = {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
+    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform,
+                          session.within(name), estimate=False).field(POINTS[:3])
+             for name, body in (
+        ("tube", {"kind": "tube", "inner_radius_m": 0.01, "outer_radius_m": 0.02,
+                  "length_m": 0.03}),
+        ("profile", {"kind": "revolved", "profile_m": [
+            [0.01, -0.015], [0.01, 0.015], [0.02, 0.015], [0.02, -0.015]]}),
+        ("full", {"kind": "revolved", "profile_m": [
+            [0.0, -0.015], [0.0, 0.015], [0.02, 0.015], [0.02, -0.015]]}))]
+    scale = np.abs(found[0]).max()
+    assert np.abs(found[1] - found[0]).max() < 0.02 * scale
+    assert np.abs(found[2] - found[0]).max() > 0.05 * scale
+
+
+def nodes_of(*bodies):
+    """Return the number of nodes of the mesh."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "iron.msh"
+        mesh_iron("gap", build_magnet(study_with(*bodies)).iron, Sizes.of(
+            MeshSettings(block_size_m=0.02, growth=2.2)), path)
+        return len(meshio.read(path).points)
+
+
+def test_edges_at_narrow_gaps_have_small_elements():
+    """They carry the flux from body to body: 40 % of that of TEAM problem 13 was off without. Bodies
+    that touch, or are far apart, have none; and a gap of glue is no finer than an eighth of an edge.
+    """
+    lower = {"kind": "box", "size_m": [0.02, 0.02, 0.01], "centre_m": [0.05, 0.0, 0.0]}
+    upper = {"kind": "box", "size_m": [0.02, 0.01, 0.01]}
+    touching, glued, narrow, wide = (
+        nodes_of(lower, upper | {"centre_m": [0.05, 0.0, 0.01 + gap]})
+        for gap in (0.0, 1e-5, 1e-3, 0.02))
+    assert narrow > 1.3 * wide
+    assert touching < 1.1 * wide
+    assert narrow < glued < 10 * wide
 
 
 def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
