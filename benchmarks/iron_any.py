@@ -155,8 +155,8 @@ MEASURED_T = (1.33, 1.329, 1.286, 1.225, 1.129, 0.985, 0.655, 0.259, 0.453, 0.55
               0.755, 0.809, 0.901, 0.945, 0.954, 0.956, 0.96, 0.965, 0.97, 0.974, 0.981, 0.984,
               0.985)
 """H in A/m and B in T of the steel, and the measured mean of B over 25 sections of the plates at
-1000 ampere turns: T. Nakata, K. Fujiwara, Summary of results for benchmark problem 13 (3-D nonlinear
-magnetostatic model), COMPEL 11 (1992) 345; Compumag, TEAM workshop problem 13."""
+1000 ampere turns: T. Nakata, K. Fujiwara, Summary of results for benchmark problem 13 (3-D
+nonlinear magnetostatic model), COMPEL 11 (1992) 345; Compumag, TEAM workshop problem 13."""
 
 THICK, TOP, INNER, OUTER = 0.0032, 0.0632, 0.0021, 0.1253
 

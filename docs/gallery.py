@@ -20,6 +20,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Annulus, Polygon, Rectangle
+from matplotlib.path import Path as Outline
 from scipy.spatial import ConvexHull
 
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -96,6 +97,10 @@ def cross_section(axis: Axes, magnet: Magnet) -> None:
     Of equal rings the first one is drawn.
     """
     for body in magnet.iron:
+        if body.triangles is not None:  # which leave holes along z open
+            for triangle in np.stack(body.surface[:2], axis=2):
+                axis.add_patch(Polygon(MM * triangle, color=IRON, lw=0.3))
+            continue
         if body.sphere or not body.in_place:
             hull = np.column_stack([part.ravel() for part in body.surface[:2]])
             axis.add_patch(Polygon(MM * hull[ConvexHull(hull).vertices], color=IRON))
@@ -145,7 +150,10 @@ def side_view(axis: Axes, magnet: Magnet) -> None:
     for body in magnet.iron:
         if body.sphere or not body.in_place:
             across = np.column_stack([part.ravel() for part in body.surface[:2]])
-            low, high = radii(across[ConvexHull(across).vertices])
+            hull = across[ConvexHull(across).vertices]
+            low, high = radii(hull)
+            if Outline(hull).contains_point((0.0, 0.0)):  # it lies across the axis
+                low = 0.0
             start, end = body.surface[2].min(), body.surface[2].max()
         else:
             low, high, start, end = body.inner_radius, body.outer_radius, body.z_min, body.z_max

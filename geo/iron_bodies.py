@@ -55,7 +55,7 @@ class Sizes:
         """Return those of a study; a larger ``coarseness`` is for error bars."""
         usual = 0.4  # growth - 1 for which the numbers below are
         relative = coarseness * (mesh.growth - 1) / usual
-        return cls(coarseness * mesh.block_size_m, 1.2 * relative, 0.25 * relative, 0.4,
+        return cls(coarseness * mesh.block_size_m, 1.2 * relative, min(0.25 * relative, 1.0), 0.4,
                    0.3 * relative, 0.35 * relative**0.6)
 
     def of_body(self, body: IronSolid) -> float:
@@ -245,8 +245,9 @@ def _narrow_gaps(
             for place in np.reshape(places, (-1, 3)):
                 point = occ.addPoint(*place)
                 width = occ.getDistance(0, point, *other)[0]
+                octave = int(np.floor(np.log2(max(width, narrowest))))
                 if width < widest:
-                    found.setdefault(int(np.floor(np.log2(max(width, narrowest)))), []).append(point)
+                    found.setdefault(octave, []).append(point)
                 else:
                     occ.remove([(0, point)])
     return found

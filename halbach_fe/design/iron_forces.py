@@ -1,16 +1,16 @@
 """Forces on bodies of iron, by what the iron does to all else.
 
-The force of blocks and coils on a body is, by Newton's third law, minus that of the body's own field
-on them: on the surface charge of the blocks (`halbach_fe.design.forces`) and on the current of the
-coils. Blocks may touch the iron. The force between two bodies is the integral of the mixed part of
-Maxwell's stress tensor,
+The force of blocks and coils on a body is, by Newton's third law, minus that of the body's own
+field on them: on the surface charge of the blocks (`halbach_fe.design.forces`) and on the current
+of the coils. Blocks may touch the iron. The force between two bodies is the integral of the mixed
+part of Maxwell's stress tensor,
 
     ``1/mu_0 int (B_1 (B_2.n) + B_2 (B_1.n) - (B_1.B_2) n) dS``,
 
-with B_1 and B_2 the fields of the polarization of each alone, over a plane that separates them (J. D.
-Jackson, Classical Electrodynamics, 3rd ed., section 6.7); whatever else lies across the plane takes no
-part. Bodies that touch, or that no plane separates, feel one force together. The change from a mesh
-twice as coarse is the error bar.
+with B_1 and B_2 the fields of the polarization of each alone, over a plane that separates them (J.
+D. Jackson, Classical Electrodynamics, 3rd ed., section 6.7); whatever else lies across the plane
+takes no part. Bodies that touch, or that no plane separates, feel one force together. The change
+from a mesh twice as coarse is the error bar.
 """
 
 from __future__ import annotations

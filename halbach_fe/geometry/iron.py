@@ -266,8 +266,8 @@ def _slit(corners: Floats, holes: list[Floats]) -> Floats:
                     corners[:i + 1], np.roll(hole, -j, axis=0), hole[j:j + 1], corners[i:]])
                 break
         else:
-            raise StudyError("The holes of a prism of iron cannot be cut out: no straight way leads "
-                             "to one. Please report this with the study.")
+            raise StudyError("The holes of a prism of iron cannot be cut out: no straight way "
+                             "leads to one. Please report this with the study.")
     return corners
 
 

@@ -135,11 +135,12 @@ def test_a_body_of_triangles_is_as_a_box(session):
 
 def test_a_profile_is_as_a_tube(session):
     """In a uniform field, on coarse meshes; without its bore as the control."""
-    mesh = {"block_size_m": 0.02, "growth": 2.6}
+    mesh = {"block_size_m": 0.02, "growth": 2.0}
     uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    points = np.array([[0, 0, 0], [0.01, 0.02, 0.02], [0.04, 0, 0.05], [0, -0.035, 0.09]])
     place = {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
     found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform,
-                          session.within(name), estimate=False).field(POINTS[:3])
+                          session.within(name), estimate=False).field(points)
              for name, body in (
         ("tube", {"kind": "tube", "inner_radius_m": 0.01, "outer_radius_m": 0.02,
                   "length_m": 0.03}),
@@ -148,8 +149,8 @@ def test_a_profile_is_as_a_tube(session):
         ("full", {"kind": "revolved", "profile_m": [
             [0.0, -0.015], [0.0, 0.015], [0.02, 0.015], [0.02, -0.015]]}))]
     scale = np.abs(found[0]).max()
-    assert np.abs(found[1] - found[0]).max() < 0.02 * scale
-    assert np.abs(found[2] - found[0]).max() > 0.05 * scale
+    assert np.abs(found[1] - found[0]).max() < 0.01 * scale  # 0.3 % were measured
+    assert np.abs(found[2] - found[0]).max() > 0.02 * scale
 
 
 def nodes_of(*bodies):
@@ -162,8 +163,8 @@ def nodes_of(*bodies):
 
 
 def test_edges_at_narrow_gaps_have_small_elements():
-    """They carry the flux from body to body: 40 % of that of TEAM problem 13 was off without. Bodies
-    that touch, or are far apart, have none; and a gap of glue is no finer than an eighth of an edge.
+    """They carry the flux from body to body. Bodies that touch, or are far apart, have none; and a
+    gap of glue is no finer than an eighth of the widest that counts.
     """
     lower = {"kind": "box", "size_m": [0.02, 0.02, 0.01], "centre_m": [0.05, 0.0, 0.0]}
     upper = {"kind": "box", "size_m": [0.02, 0.01, 0.01]}
