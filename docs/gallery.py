@@ -58,6 +58,7 @@ def main(folder: Path) -> None:
              for path in sorted(STUDIES.glob("*/study.toml"))}
     drawn |= {f"magnets/{name}": picture(magnet_of(text, page), points=False)
               for name, text in fragments(page).items() if f"magnets/{name}.png" in page}
+    drawn["team-13"] = measured_plates((DOCS / "accuracy.md").read_text(encoding="utf-8"))
     for name, figure in drawn.items():
         target = folder / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -65,6 +66,23 @@ def main(folder: Path) -> None:
             target, dpi=90, pil_kwargs={"optimize": True},
             metadata={"Software": None})  # the same file from every version of Matplotlib
         print(f"{target}: {target.stat().st_size / 1024:.0f} kB")  # noqa: T201
+
+
+def measured_plates(page: str) -> Figure:
+    """Draw the mean flux densities of the table of TEAM problem 13 on the page of accuracy."""
+    table = page[page.index("| section | at |"):].split("\n\n")[0].splitlines()[2:]
+    rows = np.array([[line.split("|")[column] for column in (1, 3, 4)] for line in table], float)
+    figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(rows[:, 0], rows[:, 1], "k_", ms=14, mew=2, label="measured")
+    axis.plot(rows[:, 0], rows[:, 2], "o", color="#1f77b4", ms=5, label="computed")
+    for last, name in ((0, "plate"), (7, "arm of the channel"), (18, "back")):
+        axis.axvline(last + 0.5, color="#999999", lw=0.6)
+        axis.text(last + 0.7, 0.05, name)
+    axis.set(xlabel="section", ylabel="mean flux density in T", ylim=(0, 1.6), xlim=(0.5, 25.5))
+    axis.legend(loc="lower right")
+    axis.grid(alpha=0.3)
+    return figure
 
 
 def picture(magnet: Magnet, points: bool = True) -> Figure:
