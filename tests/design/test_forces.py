@@ -15,7 +15,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.forces import round_below
+from halbach_fe.report.forces import page, round_below
 from halbach_fe.report.result_files import write_report
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
@@ -300,6 +300,11 @@ def test_two_spheres_pull_one_another(tmp_path):
                                atol=0.01 * expected)
     assert np.abs(found.iron.force_N[0, :2]).max() < 0.01 * expected
     assert (np.abs(found.iron.force_N[0, 2] - expected) < 2 * found.iron.error_N).all()
+    shown = page(found)
+    rows = shown.tables["Forces on the iron"]
+    assert [row["iron"] for row in rows] == ["iron 1", "iron 2"]
+    assert "+1.00" in rows[0]["direction (x, y, z)"]
+    assert shown.summary["iron"][0]["force_N"][2] == found.iron.force_N[0, 2]
 
 
 def test_a_coil_pulls_a_sphere(tmp_path):
