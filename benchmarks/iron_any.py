@@ -165,7 +165,7 @@ def plates(growth: float) -> dict[str, Any]:
     """The study of problem 13: a plate, a channel on either side of it, 0.5 mm away, and a coil."""
     channel = [(INNER, -TOP), (OUTER, -TOP), (OUTER, TOP), (INNER, TOP), (INNER, TOP - THICK),
                (OUTER - THICK, TOP - THICK), (OUTER - THICK, THICK - TOP), (INNER, THICK - TOP)]
-    bodies = [{"kind": "box", "size_m": [THICK, 0.05, 2 * TOP]}]
+    bodies: list[dict[str, Any]] = [{"kind": "box", "size_m": [THICK, 0.05, 2 * TOP]}]
     for sign in (1.0, -1.0):
         bodies.append({"kind": "prism", "outline_m": [(sign * x, z) for x, z in channel],
                        "length_m": 0.05, "rotation_deg": [90.0, 0.0, 0.0],

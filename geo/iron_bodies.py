@@ -212,8 +212,8 @@ def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes
         field.setNumber(used[-1], "VIn", size)
         field.setNumber(used[-1], "VOut", shell.inner / 3)
     gmsh.model.occ.synchronize()
-    for width, points in narrow.items():
-        limit("PointsList", [(0, tag) for tag in points], sizes.gap * 2.0 ** width)
+    for width, some in narrow.items():
+        limit("PointsList", [(0, tag) for tag in some], sizes.gap * 2.0 ** width)
     least = field.add("Min")
     field.setNumbers(least, "FieldsList", used)
     field.setAsBackgroundMesh(least)
@@ -310,9 +310,9 @@ def _volume(body: IronSolid) -> tuple[int, int]:
         volume = next(each for each in found if each[0] == 3)
     elif body.outline is not None:
         loops = [_loop([(*edge.start, body.z_min) for edge in body.outline])]
-        for hole in body.holes:
-            loops.append(_loop([(x, y, body.z_min) for x, y in hole[::-1]]) if hole.ndim == 2 else (
-                occ.addCurveLoop([occ.addCircle(*hole[:2], body.z_min, hole[2])])))
+        for rim in body.holes:
+            loops.append(_loop([(x, y, body.z_min) for x, y in rim[::-1]]) if rim.ndim == 2 else (
+                occ.addCurveLoop([occ.addCircle(*rim[:2], body.z_min, rim[2])])))
         face = occ.addPlaneSurface(loops)
         found = occ.extrude([(2, face)], 0, 0, body.z_max - body.z_min)
         volume = next(each for each in found if each[0] == 3)

@@ -127,8 +127,7 @@ def iron_loads(magnet: Magnet, charges: Sequence[tuple[Floats, Floats]],
         rough = iron.coarse or iron
         found, other = (_of_sources(magnet, charge, each.field)
                         for charge, each in zip(charges, (iron, rough), strict=True))
-        names = ("iron",)
-        return IronLoads(names, found[None], np.linalg.norm(found - other, keepdims=True))
+        return IronLoads(("iron",), found[None], np.array([np.linalg.norm(found - other)]))
     groups, gaps = _groups(iron)
     found, other = (_of_bodies(magnet, charge, each, groups, gaps, panels) for charge, each, panels
                     in zip(charges, (iron, iron.coarse or iron), (40, 20), strict=True))
@@ -177,8 +176,9 @@ def _groups(iron: BodiesReaction) -> tuple[list[tuple[int, ...]], dict[tuple[int
         for first, second in combinations(range(len(numbers)), 2):
             axes = [rotation_matrix(problem.bodies[number].turn_rad).T
                     for number in (*numbers[first], *numbers[second])]
-            gap = _gap(*(np.vstack([places[number] for number in numbers[each]])
-                         for each in (first, second)), np.vstack([np.eye(3), *axes]))
+            one, other = (np.vstack([places[number] for number in numbers[each]])
+                          for each in (first, second))
+            gap = _gap(one, other, np.vstack([np.eye(3), *axes]))
             if gap is None:
                 joined[first, second] = 1.0
             else:
@@ -186,8 +186,8 @@ def _groups(iron: BodiesReaction) -> tuple[list[tuple[int, ...]], dict[tuple[int
         count, group = connected_components(sparse.csr_array(joined), directed=False)
         if count == len(numbers):
             return numbers, gaps
-        for number, one in zip(numbers, group, strict=True):
-            label[list(number)] = one
+        for members, together in zip(numbers, group, strict=True):
+            label[list(members)] = together
 
 
 def _gap(first: Floats, second: Floats, axes: Floats) -> Gap | None:

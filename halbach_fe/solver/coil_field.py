@@ -15,6 +15,8 @@ where windings begin.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import special
 
@@ -166,6 +168,7 @@ def _filaments(coil: Racetrack, chords: int) -> tuple[Floats, Floats]:
 def current_elements(coil: AnyCoil) -> tuple[Floats, Floats]:
     """Return places (n, 3) in m of pieces of a coil and I dl (n, 3) in A m, for forces on it."""
     longest = 1 / 100  # part of a turn that a piece may be
+    turns: Sequence[Floats] | Floats
     if coil.kind == "polygon":
         shares, turns = np.ones(1), [closed_polygon(coil)]
     elif coil.kind == "racetrack":

@@ -177,7 +177,8 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
         return None
     bodies: list[Tube | Pole | Ball] = []
     for body in iron.each:
-        if body.kind in ("stl", "revolved") or getattr(body, "holes", ()):
+        if body.kind == "stl" or body.kind == "revolved" or (
+                body.kind == "prism" and body.holes):
             raise StudyError(must_be(
                 "`iron.bodies`", f"study {study.name}", "of boxes, prisms without holes, tubes and "
                 "spheres to simulate a campaign", "a body of an STL file, a profile or with holes",
