@@ -284,6 +284,11 @@ def test_a_plate_pulls_as_an_image_does(tmp_path):
     assert ratio == pytest.approx(0.5, abs=0.05)  # (mu_r - 1) / (mu_r + 1)
 
 
+def test_iron_of_any_shape_needs_the_method_reaction(tmp_path):
+    with pytest.raises(StudyError, match="reaction, for the forces beside this iron"):
+        found_of(beside(PLATE) | {"solver": {"method": "direct"}}, tmp_path)
+
+
 SPHERES = [{"kind": "sphere", "radius_m": 0.01, "centre_m": [0.0, 0.0, z]} for z in (0.5, 0.56)]
 
 

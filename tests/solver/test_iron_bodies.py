@@ -29,6 +29,7 @@ from halbach_fe.solver.formulation_choice import (
 )
 from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
+from halbach_fe.solver.session import RunSize
 from halbach_fe.study.reader import parse_study
 from halbach_fe.study.solver import MeshSettings
 from halbach_fe.synthetic.bodies import magnet_of
@@ -306,6 +307,11 @@ def test_other_refusals(session, monkeypatch):
     monkeypatch.setattr(iron_bodies, "available_memory", lambda: 0.01)
     with pytest.raises(StudyError, match=r"fits into the 0.01 GiB of memory that are left"):
         solve_nominal(build_magnet(study_with(box)), POINTS, session)
+    # the same of a mesh that is larger than it was estimated to be, as narrow gaps make it
+    monkeypatch.setattr(iron_bodies, "size_of", lambda *_: RunSize("scalar_potential", 1, 1, 1))
+    with pytest.raises(StudyError, match=r"fits into the 0.01 GiB of memory that are left"):
+        solve_nominal(build_magnet(study_with(box, mesh={"block_size_m": 0.02, "growth": 4.0})),
+                      POINTS, session)
 
 
 def test_size_is_foretold(sphere):
