@@ -20,6 +20,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Annulus, Polygon, Rectangle
+from matplotlib.path import Path as Outline
 from scipy.spatial import ConvexHull
 
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -57,6 +58,7 @@ def main(folder: Path) -> None:
              for path in sorted(STUDIES.glob("*/study.toml"))}
     drawn |= {f"magnets/{name}": picture(magnet_of(text, page), points=False)
               for name, text in fragments(page).items() if f"magnets/{name}.png" in page}
+    drawn["team-13"] = measured_plates((DOCS / "accuracy.md").read_text(encoding="utf-8"))
     for name, figure in drawn.items():
         target = folder / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -64,6 +66,23 @@ def main(folder: Path) -> None:
             target, dpi=90, pil_kwargs={"optimize": True},
             metadata={"Software": None})  # the same file from every version of Matplotlib
         print(f"{target}: {target.stat().st_size / 1024:.0f} kB")  # noqa: T201
+
+
+def measured_plates(page: str) -> Figure:
+    """Draw the mean flux densities of the table of TEAM problem 13 on the page of accuracy."""
+    table = page[page.index("| section | at |"):].split("\n\n")[0].splitlines()[2:]
+    rows = np.array([[line.split("|")[column] for column in (1, 3, 4)] for line in table], float)
+    figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(rows[:, 0], rows[:, 1], "k_", ms=14, mew=2, label="measured")
+    axis.plot(rows[:, 0], rows[:, 2], "o", color="#1f77b4", ms=5, label="computed")
+    for last, name in ((0, "plate"), (7, "arm of the channel"), (18, "back")):
+        axis.axvline(last + 0.5, color="#999999", lw=0.6)
+        axis.text(last + 0.7, 0.05, name)
+    axis.set(xlabel="section", ylabel="mean flux density in T", ylim=(0, 1.6), xlim=(0.5, 25.5))
+    axis.legend(loc="lower right")
+    axis.grid(alpha=0.3)
+    return figure
 
 
 def picture(magnet: Magnet, points: bool = True) -> Figure:
@@ -96,6 +115,10 @@ def cross_section(axis: Axes, magnet: Magnet) -> None:
     Of equal rings the first one is drawn.
     """
     for body in magnet.iron:
+        if body.triangles is not None:  # which leave holes along z open
+            for triangle in np.stack(body.surface[:2], axis=2):
+                axis.add_patch(Polygon(MM * triangle, color=IRON, lw=0.3))
+            continue
         if body.sphere or not body.in_place:
             hull = np.column_stack([part.ravel() for part in body.surface[:2]])
             axis.add_patch(Polygon(MM * hull[ConvexHull(hull).vertices], color=IRON))
@@ -145,7 +168,10 @@ def side_view(axis: Axes, magnet: Magnet) -> None:
     for body in magnet.iron:
         if body.sphere or not body.in_place:
             across = np.column_stack([part.ravel() for part in body.surface[:2]])
-            low, high = radii(across[ConvexHull(across).vertices])
+            hull = across[ConvexHull(across).vertices]
+            low, high = radii(hull)
+            if Outline(hull).contains_point((0.0, 0.0)):  # it lies across the axis
+                low = 0.0
             start, end = body.surface[2].min(), body.surface[2].max()
         else:
             low, high, start, end = body.inner_radius, body.outer_radius, body.z_min, body.z_max

@@ -14,7 +14,7 @@ import gmsh
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import MeshError, StudyError, must_be
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions
@@ -37,6 +37,8 @@ class Sizes:
         Largest size relative to the radius of a round body.
     edge : float
         Size along the edges, where the field is singular, relative to that in the body.
+    gap : float
+        Size along edges at a narrow gap between two bodies, relative to the gap's width.
     growth : float
         Change of the size per unit of distance in the air.
     """
@@ -45,6 +47,7 @@ class Sizes:
     thickness: float
     curvature: float
     edge: float
+    gap: float
     growth: float
 
     @classmethod
@@ -52,14 +55,14 @@ class Sizes:
         """Return those of a study; a larger ``coarseness`` is for error bars."""
         usual = 0.4  # growth - 1 for which the numbers below are
         relative = coarseness * (mesh.growth - 1) / usual
-        return cls(coarseness * mesh.block_size_m, 1.2 * relative, 0.25 * relative, 0.4,
-                   0.35 * relative**0.6)
+        return cls(coarseness * mesh.block_size_m, 1.2 * relative, min(0.25 * relative, 1.0), 0.4,
+                   0.3 * relative, 0.35 * relative**0.6)
 
     def of_body(self, body: IronSolid) -> float:
         """Return the size in m in a body."""
         volume, surface, _ = body.measures
-        round_body = np.inf if body.outline or body.triangles is not None else (
-            self.curvature * body.outer_radius)
+        flat = body.outline or (body.triangles is not None and body.profile is None)
+        round_body = np.inf if flat else self.curvature * body.outer_radius
         return min(self.iron, self.thickness * volume / surface, round_body)
 
     def count(self, bodies: Sequence[IronSolid]) -> tuple[int, int]:
@@ -142,6 +145,13 @@ def _draw(name: str, bodies: Sequence[IronSolid]) -> tuple[list[list[int]], Shel
     """
     occ = gmsh.model.occ
     drawn = [_volume(body) for body in bodies]
+    rounding = 0.01  # of the chords that stand for circles in `IronSolid.measures`
+    for number, (body, volume) in enumerate(zip(bodies, drawn, strict=True)):
+        found, expected = occ.getMass(*volume), body.measures[0]
+        if not abs(found - expected) <= rounding * expected:
+            raise MeshError(
+                f"Gmsh draws body {number + 1} of iron of study '{name}' with {found:.4g} m^3, but "
+                f"it has {expected:.4g} m^3. Please report this with the study.")
     shell = _shell(drawn)
     whole = sum(occ.getMass(*volume) for volume in drawn)
     inner, outer = (occ.addSphere(*shell.middle, radius) for radius in (shell.inner, shell.outer))
@@ -183,6 +193,7 @@ def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes
         used.append(field.add("MathEval"))
         field.setString(used[-1], "F", f"{size:.9g}+{sizes.growth:.9g}*F{distance}")
 
+    narrow: dict[int, set[int]] = {}
     for body, volumes in zip(bodies, iron, strict=True):
         solid = [(3, tag) for tag in volumes]
         faces = gmsh.model.getBoundary(solid, oriented=False)
@@ -192,13 +203,60 @@ def _set_sizes(bodies: Sequence[IronSolid], iron: Sequence[Sequence[int]], sizes
                  if _is_sharp(one)]
         if edges:
             limit("CurvesList", edges, sizes.edge * size)
+            others = [(3, tag) for other in iron for tag in other if tag not in volumes]
+            widest = sizes.edge * size / sizes.gap
+            for width, points in _narrow_gaps(edges, solid, others, widest).items():
+                narrow.setdefault(width, set()).update(points)
         used.append(field.add("Constant"))
         field.setNumbers(used[-1], "VolumesList", list(volumes))
         field.setNumber(used[-1], "VIn", size)
         field.setNumber(used[-1], "VOut", shell.inner / 3)
+    gmsh.model.occ.synchronize()
+    for width, some in narrow.items():
+        limit("PointsList", [(0, tag) for tag in some], sizes.gap * 2.0 ** width)
     least = field.add("Min")
     field.setNumbers(least, "FieldsList", used)
     field.setAsBackgroundMesh(least)
+
+
+def _narrow_gaps(
+    edges: Sequence[tuple[int, int]], solid: Sequence[tuple[int, int]],
+    others: Sequence[tuple[int, int]], widest: float,
+) -> dict[int, list[int]]:
+    """Add points along edges of a solid where another one is nearer to them than ``widest`` in m.
+
+    The points are listed by the width of the gap, as its logarithm to base 2, rounded down. Solids
+    that touch have no gap, and the narrowest are as one of an eighth of ``widest``.
+    """
+    occ, narrowest = gmsh.model.occ, widest / 8
+    boxes = [np.array(occ.getBoundingBox(*one)) for one in solid]
+    near = [other for other in others if any(
+        _apart(box, np.array(occ.getBoundingBox(*other))) < widest for box in boxes) and all(
+        widest > occ.getDistance(*one, *other)[0] > 0 for one in solid)]
+    found: dict[int, list[int]] = {}
+    for edge in sorted(set(edges)):
+        for other in near:
+            width = occ.getDistance(*edge, *other)[0]
+            if width >= widest:
+                continue
+            (low,), (high,) = gmsh.model.getParametrizationBounds(*edge)
+            count = 2 + round(occ.getMass(*edge) / max(width, narrowest))
+            places = gmsh.model.getValue(*edge, np.linspace(low, high, count))
+            for place in np.reshape(places, (-1, 3)):
+                point = occ.addPoint(*place)
+                width = occ.getDistance(0, point, *other)[0]
+                octave = int(np.floor(np.log2(max(width, narrowest))))
+                if width < widest:
+                    found.setdefault(octave, []).append(point)
+                else:
+                    occ.remove([(0, point)])
+    return found
+
+
+def _apart(first: Floats, second: Floats) -> float:
+    """Return the distance in m of two boxes, each by its low and high corners (6,)."""
+    return float(np.linalg.norm(np.maximum(np.maximum(first[:3] - second[3:],
+                                                      second[:3] - first[3:]), 0.0)))
 
 
 def _is_sharp(curve: tuple[int, int]) -> bool:
@@ -233,19 +291,33 @@ def _within(triangles: Floats) -> int:
     return int(occ.addVolume([occ.addSurfaceLoop(faces)]))
 
 
+def _loop(places: Sequence[tuple[float, float, float]]) -> int:
+    """Add a closed loop of lines through places in m to the model."""
+    occ = gmsh.model.occ
+    points = [occ.addPoint(*place) for place in places]
+    return int(occ.addCurveLoop([occ.addLine(start, end)
+                                 for start, end in pairwise([*points, points[0]])]))
+
+
 def _volume(body: IronSolid) -> tuple[int, int]:
     """Add a body to the Gmsh model in its place; return its dimension and tag."""
     occ = gmsh.model.occ
     if body.sphere:
         volume = 3, occ.addSphere(0.0, 0.0, 0.0, body.outer_radius)
-    elif body.triangles is not None:
-        volume = 3, _within(body.triangles)
+    elif body.profile is not None:
+        face = occ.addPlaneSurface([_loop([(r, 0.0, z) for r, z in body.profile])])
+        found = occ.revolve([(2, face)], 0, 0, 0, 0, 0, 1, 2 * np.pi)
+        volume = next(each for each in found if each[0] == 3)
     elif body.outline is not None:
-        starts = [occ.addPoint(*edge.start, body.z_min) for edge in body.outline]
-        lines = [occ.addLine(start, end) for start, end in pairwise([*starts, starts[0]])]
-        face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
+        loops = [_loop([(*edge.start, body.z_min) for edge in body.outline])]
+        for rim in body.holes:
+            loops.append(_loop([(x, y, body.z_min) for x, y in rim[::-1]]) if rim.ndim == 2 else (
+                occ.addCurveLoop([occ.addCircle(*rim[:2], body.z_min, rim[2])])))
+        face = occ.addPlaneSurface(loops)
         found = occ.extrude([(2, face)], 0, 0, body.z_max - body.z_min)
         volume = next(each for each in found if each[0] == 3)
+    elif body.triangles is not None:
+        volume = 3, _within(body.triangles)
     else:
         ends = 0.0, 0.0, body.z_min, 0.0, 0.0, body.z_max - body.z_min
         volume = 3, occ.addCylinder(*ends, body.outer_radius)

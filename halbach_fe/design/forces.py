@@ -13,8 +13,9 @@ error bar.
 
 Blocks of another permeability than vacuum, or with irreversible losses, have the polarization that
 the method of moments finds in the finished magnet, as its mean over the block. How it varies inside
-a block is left out. The force of coaxial iron is that of its reaction to all blocks. A block that
-is inserted feels the blocks before it and external fields; iron is not there yet.
+a block is left out. The force of iron is that of its reaction to all blocks, with the change from a
+coarser mesh as its error bar; `halbach_fe.design.iron_forces` has the forces on the iron. A block
+that is inserted feels the blocks before it and external fields; iron is not there yet.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -31,13 +33,18 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
+from halbach_fe.design.iron_forces import IronLoads, iron_loads
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.solver.exact_block_field import external_field, field_of
-from halbach_fe.solver.separate_blocks import solve_separate
+from halbach_fe.solver.separate_blocks import SeparateReaction, applies, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.materials import MU_0
+
+if TYPE_CHECKING:
+    from halbach_fe.solver.axisymmetric_iron import IronReaction
+    from halbach_fe.solver.iron_bodies import BodiesReaction
 
 SMALL = 0.1
 """Forces smaller than this share of the largest one have the error that it would have: symmetry
@@ -98,6 +105,9 @@ class Forces(ShownInNotebook):
         Magnitude of the sum of the forces of blocks on blocks, which Newton's third law makes zero.
     mass_kg : ndarray, shape (blocks,)
     price_per_kg : float or None
+    iron : IronLoads or None
+        Forces on the iron of the finished magnet; None without iron, and beside dipoles and
+        neighbours, whose part in them is not computed.
     """
 
     magnet: Magnet
@@ -108,6 +118,7 @@ class Forces(ShownInNotebook):
     imbalance_N: float
     mass_kg: Floats
     price_per_kg: float | None = None
+    iron: IronLoads | None = None
 
     @property
     def cost(self) -> float | None:
@@ -150,8 +161,8 @@ def forces(
     Raises
     ------
     StudyError
-        If the study is a cross-section, the iron is not coaxial, a number is out of its range, or
-        ``order`` does not name every block once.
+        If the study is a cross-section, beside iron of any shape its method is ``direct``, a number
+        is out of its range, or ``order`` does not name every block once.
 
     Examples
     --------
@@ -164,26 +175,45 @@ def forces(
     if magnet.dimension == 2:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}",
                                  "3, for the forces on blocks", "2"))
-    if not magnet.iron_is_axisymmetric:
+    if not (magnet.iron_is_axisymmetric or applies(magnet)):
         raise StudyError(must_be(
-            "`iron`", f"study {magnet.name}", "coaxial tubes or discs, for the forces on blocks",
-            "another body", "Leave it out: the forces of the blocks on each other remain."))
+            "`solver.method`", f"study {magnet.name}", "reaction, for the forces beside this iron",
+            magnet.study.solver.method, "Leave it out."))
     if density_kg_per_m3 is not None:
         check_number("density_kg_per_m3", "forces", density_kg_per_m3, *DENSITY)
     if price_per_kg is not None:
         check_number("price_per_kg", "forces", price_per_kg, 0)
     names = {block.name: block for block in present_blocks(magnet.blocks)}
     sequence = _sequence(list(names), order, magnet.name)
-    blocks, iron = _polarized(magnet, session)
+    blocks, reaction = _polarized(magnet, session)
+    iron = None if reaction is None else reaction.iron
     rank = np.empty(len(blocks), int)
     rank[sequence] = np.arange(len(blocks))
     mutual, in_place, inserted = _converged(
-        blocks, rank, lambda points: external_field(magnet, points), iron)
+        blocks, rank, lambda points: external_field(magnet, points),
+        None if iron is None else iron.field)
+    of_iron = None
+    if iron is not None:
+        charges = [Charges.of(blocks, order) for order in NEAR_ORDERS[1::-1]]
+        in_place = _with_error_of_iron(in_place, charges[1], blocks, iron)
+        if not (magnet.external.dipoles or magnet.external.neighbours):
+            of_iron = iron_loads(magnet, [(each.points, each.charge) for each in charges], iron)
     density = _densities(magnet, density_kg_per_m3)
     return Forces(
         magnet, tuple(names.values()), in_place, inserted, sequence,
         float(np.linalg.norm(mutual.sum(axis=0))),
-        density * np.array([block.volume for block in blocks]), price_per_kg)
+        density * np.array([block.volume for block in blocks]), price_per_kg, of_iron)
+
+
+def _with_error_of_iron(loads: Loads, charges: Charges, blocks: Sequence[MagnetBlock],
+                        iron: IronReaction | BodiesReaction) -> Loads:
+    """Add what a coarser mesh of the iron changes to the error bars of loads."""
+    if iron.coarse is None:
+        return loads
+    field = iron.field(charges.points) - iron.coarse.field(charges.points)
+    change = charges.loads(field, np.array([_middle(block) for block in blocks]), len(blocks))
+    force, torque = (np.linalg.norm(part, axis=1) for part in np.hsplit(change, 2))
+    return replace(loads, error_N=loads.error_N + force, error_Nm=loads.error_Nm + torque)
 
 
 def _sequence(names: Sequence[str], order: Sequence[str] | None, study: str) -> Ints:
@@ -203,12 +233,14 @@ def _sequence(names: Sequence[str], order: Sequence[str] | None, study: str) -> 
     return np.array([known[name] for name in order])
 
 
-def _polarized(magnet: Magnet, session: Session) -> tuple[tuple[MagnetBlock, ...], Field | None]:
-    """Return the blocks that are there with their mean polarization, and the field of the iron."""
+def _polarized(
+    magnet: Magnet, session: Session
+) -> tuple[tuple[MagnetBlock, ...], SeparateReaction | None]:
+    """Return the blocks that are there with their mean polarization, and the reaction."""
     blocks = present_blocks(magnet.blocks)
     if magnet.is_vacuum:
         return blocks, None
-    reaction = solve_separate(magnet, session, estimate=False)
+    reaction = solve_separate(magnet, session, estimate=bool(magnet.iron))
     if reaction.blocks:
         induced = reaction.blocks[0].block_moments()
         found = []
@@ -217,7 +249,7 @@ def _polarized(magnet: Magnet, session: Session) -> tuple[tuple[MagnetBlock, ...
             size = float(np.linalg.norm(mean))
             found.append(replace(block, remanence=size, easy_axis=vector(mean / size)))
         blocks = tuple(found)
-    return blocks, None if reaction.iron is None else reaction.iron.field
+    return blocks, reaction
 
 
 def _densities(magnet: Magnet, given: float | None) -> Floats:

@@ -195,7 +195,7 @@ def _convex(corners: Floats) -> list[Floats]:
                          f"instead they do, in the outline that has a corner at ({corners[0, 0]:g},"
                          f" {corners[0, 1]:g}) m. Give the corners in their order around it.")
     return [corners[list(triangle)]
-            for triangle in _triangles(tuple(map(tuple, corners.tolist())))]
+            for triangle in triangles_of_polygon(tuple(map(tuple, corners.tolist())))]
 
 
 def _simplified(corners: Floats) -> Floats:
@@ -221,7 +221,7 @@ def _crosses_itself(corners: Floats) -> bool:
 
 
 @lru_cache(maxsize=256)  # copies of a pole, and of a non-convex block
-def _triangles(polygon: tuple[tuple[float, float], ...]) -> list[tuple[int, int, int]]:
+def triangles_of_polygon(polygon: tuple[tuple[float, float], ...]) -> list[tuple[int, int, int]]:
     """Triangulate a simple polygon, counter-clockwise, by cutting off ears.
 
     An ear is a convex corner whose triangle with its neighbours holds no other corner (G. H.

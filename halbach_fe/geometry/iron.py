@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
+from halbach_fe.geometry.convex_pieces import triangles_of_polygon
 from halbach_fe.geometry.free_blocks import counter_clockwise
 from halbach_fe.geometry.outline import Outline, closed_outline
 from halbach_fe.geometry.surface import (
@@ -20,7 +21,15 @@ from halbach_fe.geometry.surface import (
     contact_of_triangles,
     contact_of_tube,
 )
-from halbach_fe.study.iron import Iron, IronBody, IronCurve, IronMaterial, IronRing, closed_surface
+from halbach_fe.study.iron import (
+    Iron,
+    IronBody,
+    IronCurve,
+    IronHole,
+    IronMaterial,
+    IronRing,
+    closed_surface,
+)
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import curve_from
 
@@ -47,6 +56,11 @@ class IronSolid:
         Whether it is a sphere of ``outer_radius``.
     triangles : ndarray, shape (n, 3, 3), in m, optional
         Of the surface of a body of any shape, with their normals outwards.
+    holes : tuple
+        Holes along z of a prism, each the corners (n, 2) in m of a polygon, or for a round one its
+        middle and radius (3,). The triangles have them too, round ones with 48 sides.
+    profile : ndarray, shape (n, 2), in m, optional
+        Corners r and z of a body of revolution; the triangles are 96 around it.
     """
 
     inner_radius: float
@@ -59,11 +73,14 @@ class IronSolid:
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sphere: bool = False
     triangles: Floats | None = field(default=None, compare=False)
+    holes: tuple[Floats, ...] = field(default=(), compare=False)
+    profile: Floats | None = field(default=None, compare=False)
 
     @property
     def in_place(self) -> bool:
         """Whether it is a tube, prism or sphere whose own axes are those of the magnet."""
-        return self.triangles is None and not any(self.origin_m) and not any(self.turn_rad)
+        return self.triangles is None and not self.holes and not any(
+            (*self.origin_m, *self.turn_rad))
 
     @property
     def is_coaxial(self) -> bool:
@@ -186,24 +203,105 @@ def iron_solids(
             found = [IronSolid(0.0, body.radius_m, -body.radius_m, body.radius_m, sphere=True)]
         elif body.kind == "stl":
             found = [_of_triangles(closed_surface(np.array(body.triangles_m)))]
+        elif body.kind == "revolved":
+            found = [_revolved(np.array(body.profile_m))]
         elif body.kind == "box":
             x, y, z = np.array(body.size_m) / 2
             found = [_prism(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), (-z, z))]
         else:
             corners = counter_clockwise(np.array(body.outline_m))
-            found = [_prism(corners @ rotation_about_z(2 * np.pi * n / body.copies)[:2, :2].T,
-                            limits(body.length_m, body.z_m)) for n in range(body.copies)]
+            found = [_prism(corners @ turn.T, limits(body.length_m, body.z_m), body.holes, turn)
+                     for turn in (rotation_about_z(2 * np.pi * n / body.copies)[:2, :2]
+                                  for n in range(body.copies))]
         law = law_of(body.own_material or iron)
         solids += [_placed(one, body, law) for one in found]
     return tuple(solids)
 
 
-def _prism(corners: Floats, ends: tuple[float, float]) -> IronSolid:
-    """Return a prism on a polygon (n, 2) in m."""
+def _prism(corners: Floats, ends: tuple[float, float], holes: tuple[IronHole, ...] = (),
+           turn: Floats | None = None) -> IronSolid:
+    """Return a prism on a polygon (n, 2) in m with holes, which are yet to be turned (2, 2)."""
     outline = closed_outline(corners)
     t = np.linspace(0.0, 1.0, 17)
     radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
-    return IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
+    solid = IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
+    if not holes or np.isinf(ends).any():  # in 2D the study is refused
+        return replace(solid, holes=tuple(hole.corners for hole in holes))
+    axes = np.eye(2) if turn is None else turn
+    drawn = tuple(hole.corners @ axes.T if hole.radius_m is None else np.array(
+        [*(axes @ (hole.x_m, hole.y_m)), hole.radius_m]) for hole in holes)
+    return replace(solid, holes=drawn, triangles=_of_prism(
+        corners, [hole.corners @ axes.T for hole in holes], ends))
+
+
+def _of_prism(corners: Floats, holes: list[Floats], ends: tuple[float, float]) -> Floats:
+    """Return the triangles (n, 3, 3) of a prism with holes, which run clockwise."""
+    flat = _slit(corners, holes)
+    cap = flat[np.array(triangles_of_polygon(tuple(map(tuple, flat.tolist()))))]
+    low, high = (np.concatenate([cap, np.full((*cap.shape[:2], 1), z)], axis=2) for z in ends)
+    sides = [low[:, ::-1], high]
+    for rim in (corners, *holes):
+        after = np.roll(rim, -1, axis=0)
+        a, b, c, d = (np.column_stack([place, np.full(len(rim), z)]) for place, z in (
+            (rim, ends[0]), (after, ends[0]), (after, ends[1]), (rim, ends[1])))
+        sides += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    return np.concatenate(sides)
+
+
+def _slit(corners: Floats, holes: list[Floats]) -> Floats:
+    """Return a polygon with slits to its holes, along the shortest ways that meet no edge."""
+    rest = list(holes)
+    while rest:
+        edges = np.concatenate([np.stack([rim, np.roll(rim, -1, axis=0)], axis=1)
+                                for rim in (corners, *rest)])
+        # from a corner without a slit: at one with a slit it matters on which side the next begins
+        _, first, times = np.unique(corners, axis=0, return_index=True, return_counts=True)
+        ways = [(float(np.hypot(*(hole[j] - corners[i]))), number, i, j)
+                for number, hole in enumerate(rest) for i in first[times == 1].tolist()
+                for j in range(len(hole))]
+        for _, number, i, j in sorted(ways):
+            if not _meets(corners[i], rest[number][j], edges):
+                hole = rest.pop(number)
+                corners = np.concatenate([
+                    corners[:i + 1], np.roll(hole, -j, axis=0), hole[j:j + 1], corners[i:]])
+                break
+        else:
+            raise StudyError("The holes of a prism of iron cannot be cut out: no straight way "
+                             "leads to one. Please report this with the study.")
+    return corners
+
+
+def _meets(start: Floats, end: Floats, edges: Floats) -> bool:
+    """Tell whether a way between two corners meets any other corner or edge of edges (n, 2, 2)."""
+    a, b, way = edges[:, 0] - start, edges[:, 1] - start, end - start
+    small = 1e-9 * float(np.abs(edges).max()) ** 2
+    own = [np.any([np.hypot(*(part - other).T) < 1e-12 for other in (np.zeros(2), way)], axis=0)
+           for part in (a, b)]
+    left, right = (way[0] * part[:, 1] - way[1] * part[:, 0] for part in (a, b))
+    along = b - a
+    near = along[:, 0] * -a[:, 1] - along[:, 1] * -a[:, 0]
+    far = along[:, 0] * (way - a)[:, 1] - along[:, 1] * (way - a)[:, 0]
+    crossed = (left * right < 0) & (near * far < 0) & ~own[0] & ~own[1]
+    share = a @ way / (way @ way)
+    touched = (np.abs(left) <= small) & (share > 0) & (share < 1) & ~own[0]
+    return bool((crossed | touched).any())
+
+
+def _revolved(profile: Floats) -> IronSolid:
+    """Return a body of revolution with the corners r and z (n, 2) in m."""
+    profile = counter_clockwise(profile)
+    angle = 2 * np.pi / 96 * np.arange(97)
+    rims = [np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(97, z)])
+            for r, z in profile]
+    found = []
+    for (first, start), (last, end) in zip(
+            zip(profile[:, 0], rims, strict=True),
+            zip(np.roll(profile[:, 0], -1), [*rims[1:], rims[0]], strict=True), strict=True):
+        if first:
+            found.append(np.stack([start[:-1], start[1:], end[1:]], axis=1))
+        if last:
+            found.append(np.stack([start[:-1], end[1:], end[:-1]], axis=1))
+    return replace(_of_triangles(np.concatenate(found)), profile=profile)
 
 
 def _of_triangles(triangles: Floats) -> IronSolid:

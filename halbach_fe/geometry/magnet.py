@@ -393,8 +393,8 @@ def build_magnet(study: Study) -> Magnet:
             "Correct remanence_T, or magnetization_factor of the exceptions."))
     if study.dimension == 2 and not magnet.iron_is_along_z:
         raise StudyError(must_be(
-            "`iron.bodies`", f"study {study.name}", "tubes and prisms along z, of one material, "
-            "since it is 2D", "a body of another shape, place or material",
+            "`iron.bodies`", f"study {study.name}", "tubes and prisms without holes along z, "
+            "of one material, since it is 2D", "a body of another shape, place or material",
             "Set dimension = 3, or leave that body out."))
     if study.iron_ring is not None:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)

@@ -177,6 +177,33 @@ def _rows(found: Forces) -> list[dict[str, str]]:
     return rows
 
 
+def _iron_rows(found: Forces) -> list[dict[str, str]]:
+    """Return a row of text for the force on each body of iron."""
+    if found.iron is None:
+        return []
+    sizes = np.linalg.norm(found.iron.force_N, axis=1)
+    return [{"iron": name, "force": with_error(size, error) + "\u00a0N",
+             "direction (x, y, z)": _numbers(force / size) if size > error else "none that is sure"}
+            for name, force, size, error in zip(
+                found.iron.names, found.iron.force_N, sizes.tolist(),
+                found.iron.error_N.tolist(), strict=True)]
+
+
+def _on_iron(found: Forces) -> list[Section]:
+    """Return the section about the forces on the iron; none without iron."""
+    rows = _iron_rows(found)
+    if found.magnet.iron and not rows:
+        return [Section(["The forces on the iron are not computed beside `external.dipoles` and "
+                         "`external.neighbours`."], "Forces on the iron")]
+    if not rows:
+        return []
+    return [Section([
+        Table(rows),
+        "What blocks, coils and the other bodies of iron do to each body in the finished magnet: "
+        "what holds it has to bear that. Bodies that touch, or that no plane separates, have one "
+        "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron")]
+
+
 def _summary(found: Forces) -> dict[str, object]:
     """Return the content of forces.json."""
     def largest(loads: Loads) -> dict[str, object]:
@@ -191,7 +218,11 @@ def _summary(found: Forces) -> dict[str, object]:
         "study": found.magnet.name, "blocks": len(found.blocks),
         "largest_in_place": largest(found.in_place), "largest_inserted": largest(found.inserted),
         "imbalance_N": found.imbalance_N, "mass_kg": float(found.mass_kg.sum()),
-        "price_per_kg": found.price_per_kg, "cost": found.cost}
+        "price_per_kg": found.price_per_kg, "cost": found.cost} | (
+        {} if found.iron is None else {"iron": [
+            {"name": name, "force_N": force, "error_N": error} for name, force, error in zip(
+                found.iron.names, found.iron.force_N.tolist(), found.iron.error_N.tolist(),
+                strict=True)]})
 
 
 def _columns(found: Forces) -> dict[str, Iterable[object]]:
@@ -300,12 +331,14 @@ def page(found: Forces) -> Page:
                 Table(rows),
                 f"Forces are those of the field of all other blocks{', of the iron' * iron} and of "
                 "external sources on a block; torques are about its middle. ± is the error of the "
-                "quadrature. The last two columns are the force on the block when it is inserted, "
-                "with only the blocks before it in place, and its place in that order"
+                f"quadrature{' and the change from a coarser mesh of the iron' * iron}. The last "
+                "two columns are the force on the block when it is inserted, with only the blocks "
+                "before it in place, and its place in that order"
                 f"{'; the iron is not there yet' * iron}. The forces of all blocks on each other "
                 f"add up to {_newton(found.imbalance_N)}; Newton's third law makes it zero.",
-                *permeable], "The largest forces in place")],
-        {"Largest forces in place": rows},
+                *permeable], "The largest forces in place"), *_on_iron(found)],
+        {"Largest forces in place": rows} | (
+            {"Forces on the iron": _iron_rows(found)} if found.iron else {}),
         figures={"forces.png": (
             partial(forces_figure, found), "Above: forces in place in the ring of the largest one; "
             "arrows show their part in the plane"

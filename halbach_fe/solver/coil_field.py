@@ -15,6 +15,8 @@ where windings begin.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import special
 
@@ -161,6 +163,37 @@ def _filaments(coil: Racetrack, chords: int) -> tuple[Floats, Floats]:
             shares.append(share * part)
             found.append(turn + np.array([0.0, 0.0, height]))
     return np.array(shares), np.array(found)
+
+
+def current_elements(coil: AnyCoil) -> tuple[Floats, Floats]:
+    """Return places (n, 3) in m of pieces of a coil and I dl (n, 3) in A m, for forces on it."""
+    longest = 1 / 100  # part of a turn that a piece may be
+    turns: Sequence[Floats] | Floats
+    if coil.kind == "polygon":
+        shares, turns = np.ones(1), [closed_polygon(coil)]
+    elif coil.kind == "racetrack":
+        shares, turns = _filaments(coil, 12)
+    else:
+        angle = np.linspace(0, 2 * np.pi, round(1 / longest) + 1)
+        circle = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+        # a polygon of the same area
+        circle *= np.sqrt(angle[1] / np.sin(angle[1]))
+        rules = [_gauss(side, 4) for side in coil.section_m]
+        shares = np.outer(*(rule[1] for rule in rules)).ravel()
+        turns = [(coil.radius_m + across) * circle + np.array([0.0, 0.0, height])
+                 for across in rules[0][0] for height in rules[1][0]]
+    places, along = [], []
+    for share, turn in zip(shares, turns, strict=True):
+        sides = np.diff(turn, axis=0)
+        lengths = np.linalg.norm(sides, axis=1)
+        counts = np.maximum(np.ceil(lengths / (longest * lengths.sum())).astype(int), 1)
+        number = np.repeat(np.arange(len(sides)), counts)
+        within = (np.arange(len(number)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5)
+        places.append(turn[number] + (within / counts[number])[:, None] * sides[number])
+        along.append(share * sides[number] / counts[number][:, None])
+    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
+    return (np.vstack(places) @ axes.T + coil.centre_m,
+            coil.current_A * coil.turns * np.vstack(along) @ axes.T)
 
 
 def _straight(shares: Floats, corners: Floats, points: Floats) -> Floats:

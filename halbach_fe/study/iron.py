@@ -174,7 +174,8 @@ class PlacedIron(StudyModel):
         images = self.images
         # shapes are compared by what mirrors change of them; all else is common to the images
         if len({repr([getattr(one, key, None) for key in (
-                "centre_m", "rotation_deg", "z_m", "outline_m", "triangles_m")])
+                "centre_m", "rotation_deg", "z_m", "outline_m", "holes", "profile_m",
+                "triangles_m")])
                 for one in images}) < len(images):
             raise ValueError("repeats and mirrored must make bodies in different places; give "
                              "step_m, and leave out of mirrored what leads to the same place")
@@ -205,6 +206,10 @@ class PlacedIron(StudyModel):
                 (sign * self.triangles_m)[:, ::-1].tolist()) if self.triangles_m else ()
         if axis < 2 and hasattr(self, "outline_m"):
             update["outline_m"] = tuple(map(tuple, (sign[:2] * self.outline_m).tolist()))
+        if axis < 2 and hasattr(self, "holes"):
+            update["holes"] = tuple(hole.mirrored(sign[:2]) for hole in self.holes)
+        if axis == 2 and hasattr(self, "profile_m"):
+            update["profile_m"] = tuple((r, 0.0 - z) for r, z in self.profile_m)
         return self.model_copy(update=update)
 
     @property
@@ -237,16 +242,61 @@ class IronTube(PlacedIron):
         return self
 
 
+Polygon = Annotated[tuple[tuple[Coordinate, Coordinate], ...],
+                    Field(min_length=3, max_length=1000)]
+
+
+class IronHole(StudyModel):
+    """A hole through a prism along its z axis: a polygon ``outline_m``, or a round one.
+
+    A round one has ``radius_m`` about ``x_m`` and ``y_m``.
+    """
+
+    outline_m: Polygon | None = None
+    x_m: Coordinate = 0.0
+    y_m: Coordinate = 0.0
+    radius_m: Length | None = None
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> IronHole:
+        if (self.outline_m is None) == (self.radius_m is None):
+            raise ValueError("give either radius_m, with x_m and y_m, or outline_m")
+        if self.outline_m is not None and (self.x_m or self.y_m):
+            raise ValueError("x_m and y_m are the middle of a round hole; leave them out beside "
+                             "outline_m")
+        if self.outline_m is not None and crossing(np.array([self.outline_m]))[0]:
+            raise ValueError("outline_m must have edges that do not cross, and some area")
+        return self
+
+    @property
+    def corners(self) -> Floats:
+        """Corners (n, 2) in m, clockwise; 48 around a circle for a round hole."""
+        if self.radius_m is not None:
+            angle = -2 * np.pi / 48 * np.arange(48)
+            return np.asarray(np.column_stack([self.x_m + self.radius_m * np.cos(angle),
+                                               self.y_m + self.radius_m * np.sin(angle)]))
+        corners = np.array(self.outline_m)
+        x, y = corners.T
+        return corners if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0 else corners[::-1]
+
+    def mirrored(self, sign: Floats) -> IronHole:
+        """Return the hole with its x and y times signs (2,)."""
+        x, y = (sign * (self.x_m, self.y_m) + 0.0).tolist()
+        return self.model_copy(update={
+            "x_m": x, "y_m": y, "outline_m": None if self.outline_m is None else tuple(
+                map(tuple, (sign * self.outline_m).tolist()))})
+
+
 class IronPrism(PlacedIron):
     """A prism along its own z axis with the polygonal section ``outline_m``, for poles and yokes.
 
-    ``copies`` of it stand at equal angles about that axis. ``length_m`` is along z, centred at
-    ``z_m`` (default: as long as the array; without meaning in 2D).
+    ``copies`` of it stand at equal angles about that axis, with the ``holes`` of each. ``length_m``
+    is along z, centred at ``z_m`` (default: as long as the array; without meaning in 2D).
     """
 
     kind: Literal["prism"]
-    outline_m: Annotated[tuple[tuple[Coordinate, Coordinate], ...],
-                         Field(min_length=3, max_length=1000)]
+    outline_m: Polygon
+    holes: Annotated[tuple[IronHole, ...], Field(max_length=200)] = ()
     copies: Annotated[int, Field(ge=1, le=512)] = 1
     length_m: Length | None = None
     z_m: Coordinate = 0.0
@@ -258,6 +308,71 @@ class IronPrism(PlacedIron):
         if np.hypot(*np.array(self.outline_m).T).max() >= MAX_LENGTH_M:
             raise ValueError(f"outline_m must be within {MAX_LENGTH_M:g} m of the axis; is it in "
                              "mm? Then write 0.01 for 10 mm")
+        _check_holes(np.array(self.outline_m), [hole.corners for hole in self.holes])
+        return self
+
+
+def _check_holes(outline: Floats, holes: list[Floats]) -> None:
+    """Refuse holes that do not lie apart, within the outline (n, 2).
+
+    Raises
+    ------
+    ValueError
+    """
+    for number, hole in enumerate(holes):
+        others = [outline, *holes[:number]]
+        if any(_edges_meet(hole, other) for other in others) or not _within(
+                hole[:1], outline)[0] or any(_within(hole[:1], other)[0] or _within(
+                    other[:1], hole)[0] for other in holes[:number]):
+            x, y = hole.mean(axis=0).round(6) + 0.0
+            raise ValueError(f"holes[{number}], about ({x:g}, {y:g}) m, must lie within outline_m, "
+                             "and neither touch its edges nor another hole; what opens to a side "
+                             "belongs into outline_m")
+
+
+def _within(points: Floats, polygon: Floats) -> Floats:
+    """Tell which points (n, 2) lie within a polygon (m, 2)."""
+    (x, y), (u, v) = points.T[:, :, None], polygon.T
+    after, above = np.roll(polygon, -1, axis=0), v > y
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = x < u + (y - v) * (after[:, 0] - u) / (after[:, 1] - v)
+    return np.asarray(((above != (after[:, 1] > y)) & left).sum(axis=1) % 2 == 1)
+
+
+def _edges_meet(first: Floats, second: Floats) -> bool:
+    """Tell whether any edges of two polygons (n, 2) and (m, 2) cross or touch."""
+    a, b = first @ [1, 1j], np.roll(first, -1, axis=0) @ [1, 1j]
+    c, d = second @ [1, 1j], np.roll(second, -1, axis=0) @ [1, 1j]
+
+    def sides(start: Floats, end: Floats, points: Floats) -> Floats:
+        along = (end - start)[:, None]
+        return np.sign((np.conj(along) * (points[None] - start[:, None])).imag.round(15))
+
+    of_second = sides(a, b, c) * sides(a, b, d)
+    of_first = (sides(c, d, a) * sides(c, d, b)).T
+    return bool(((of_first <= 0) & (of_second <= 0)).any())
+
+
+class IronRevolved(PlacedIron):
+    """A body of revolution about its own z axis, by its section ``profile_m``: corners r and z.
+
+    The section is closed; it may have one side on the axis, r = 0. A tapered pole, a cap or a
+    flanged tube is one body.
+    """
+
+    kind: Literal["revolved"]
+    profile_m: Annotated[tuple[tuple[Gap, Coordinate], ...], Field(min_length=3, max_length=200)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> IronRevolved:
+        profile = np.array(self.profile_m)
+        if crossing(profile[None])[0]:
+            raise ValueError("profile_m must have edges that do not cross, and some area; its "
+                             "corners are r and z")
+        on_axis = profile[:, 0] == 0
+        if on_axis.any() and not (on_axis.sum() == 2 and (on_axis & np.roll(on_axis, 1)).any()):
+            raise ValueError("profile_m must have no corner on the axis, r = 0, or two that follow "
+                             "one another")
         return self
 
 
@@ -406,7 +521,7 @@ def read_stl(path: Path) -> Floats:
     return found
 
 
-IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere | IronMesh,
+IronBody = Annotated[IronTube | IronPrism | IronBox | IronSphere | IronRevolved | IronMesh,
                      Field(discriminator="kind")]
 
 

@@ -177,10 +177,11 @@ def iron_of_study(study: Study, half_length: float) -> TrueIron | None:
         return None
     bodies: list[Tube | Pole | Ball] = []
     for body in iron.each:
-        if body.kind == "stl":
+        if body.kind == "stl" or body.kind == "revolved" or (
+                body.kind == "prism" and body.holes):
             raise StudyError(must_be(
-                "`iron.bodies`", f"study {study.name}", "of boxes, prisms, tubes and spheres to "
-                "simulate a campaign", "a body of an STL file",
+                "`iron.bodies`", f"study {study.name}", "of boxes, prisms without holes, tubes and "
+                "spheres to simulate a campaign", "a body of an STL file, a profile or with holes",
                 "The field of the magnet can be computed with it."))
         own = body.own_material
         placed: dict[str, Any] = {

@@ -15,7 +15,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.forces import round_below
+from halbach_fe.report.forces import page, round_below
 from halbach_fe.report.result_files import write_report
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
@@ -253,6 +253,90 @@ def test_iron_pulls_the_nearest_block(tmp_path):
     # the blocks are inserted before the iron, and a symmetric tube feels no net force
     assert around.inserted.force_N == pytest.approx(alone.inserted.force_N)
     assert np.linalg.norm(around.in_place.force_N.sum(axis=0)) < 1e-3 * change.sum()
+
+
+PLATE = {"kind": "box", "size_m": [0.06, 0.06, 0.01], "centre_m": [0.0, 0.0, -0.013]}
+
+
+def beside(*bodies, external=None, permeability=10_000.0, growth=2.4):
+    """A cube of 12 mm, magnetized along z, 2 mm above a plate, or beside other iron."""
+    return free_blocks([[0, 0, 0, 0, 0, 1.2]]) | {
+        "mesh": {"block_size_m": 0.006, "growth": growth},
+        "iron": {"relative_permeability": permeability, "bodies": list(bodies)}} | (
+        {"external": external} if external else {})
+
+
+def test_a_plate_pulls_as_an_image_does(tmp_path):
+    """A large plate of high permeability pulls a block as its mirror image does, and the block the
+    plate; magpylib has the force of two blocks. A plate of permeability 3 pulls half as much.
+    """
+    found = found_of(beside(PLATE), tmp_path / "plate")
+    image, cube = magpylib_cubes([[0, 0, -0.016], [0, 0, 0]], [[0, 0, 1.2], [0, 0, 1.2]])
+    force = magpylib.getFT(image, cube, meshing=1000)[0]
+    error = np.linalg.norm(found.in_place.force_N[0] - force)
+    assert error < 0.05 * np.linalg.norm(force)  # 1.2 % were measured on a finer mesh
+    assert error < 2 * found.in_place.error_N[0]
+    assert found.iron.names == ("iron 1",)
+    np.testing.assert_allclose(found.iron.force_N[0], -found.in_place.force_N[0],
+                               atol=0.01 * np.linalg.norm(force))
+    weak = found_of(beside(PLATE, permeability=3.0), tmp_path / "weak")
+    ratio = weak.in_place.force_N[0, 2] / force[2]
+    assert ratio == pytest.approx(0.5, abs=0.05)  # (mu_r - 1) / (mu_r + 1)
+
+
+def test_iron_of_any_shape_needs_the_method_reaction(tmp_path):
+    with pytest.raises(StudyError, match="reaction, for the forces beside this iron"):
+        found_of(beside(PLATE) | {"solver": {"method": "direct"}}, tmp_path)
+
+
+SPHERES = [{"kind": "sphere", "radius_m": 0.01, "centre_m": [0.0, 0.0, z]} for z in (0.5, 0.56)]
+
+
+def test_two_spheres_pull_one_another(tmp_path):
+    """In a uniform field, far from the block: nearly as two dipoles 60 mm apart."""
+    found = found_of(beside(*SPHERES, external={"background_T": [0.0, 0.0, 0.5]}, growth=1.8),
+                     tmp_path)
+    moment = 4 * np.pi * 0.01**3 * 0.5 / MU_0  # of a sphere of high permeability
+    # each magnetizes the other by 2 (a / d)^3 more, of which a hundredth remains here
+    expected = 6 * MU_0 / (4 * np.pi) * (moment * (1 + 2 * (1 / 6) ** 3)) ** 2 / 0.06**4
+    assert found.iron.names == ("iron 1", "iron 2")
+    assert found.iron.force_N[0, 2] == pytest.approx(expected, rel=0.08)  # 5 % by this mesh
+    np.testing.assert_allclose(found.iron.force_N[1], -found.iron.force_N[0],
+                               atol=0.01 * expected)
+    assert np.abs(found.iron.force_N[0, :2]).max() < 0.01 * expected
+    assert (np.abs(found.iron.force_N[0, 2] - expected) < 2 * found.iron.error_N).all()
+    shown = page(found)
+    rows = shown.tables["Forces on the iron"]
+    assert [row["iron"] for row in rows] == ["iron 1", "iron 2"]
+    assert "+1.00" in rows[0]["direction (x, y, z)"]
+    assert shown.summary["iron"][0]["force_N"][2] == found.iron.force_N[0, 2]
+
+
+def test_a_coil_pulls_a_sphere(tmp_path):
+    """As the dipole that its field induces is pulled: alpha grad B^2 / (2 mu_0)."""
+    coil = {"kind": "round", "radius_m": 0.05, "section_m": [0.0, 0.0], "current_A": 1e4,
+            "centre_m": [0.0, 0.0, 0.4]}
+    sphere = {"kind": "sphere", "radius_m": 0.005, "centre_m": [0.0, 0.0, 0.44]}
+    found = found_of(beside(sphere, external={"coils": [coil]}, growth=1.8), tmp_path)
+    z = 0.04 + np.array([-1e-5, 1e-5])
+    field = MU_0 * 1e4 * 0.05**2 / 2 / (0.05**2 + z**2) ** 1.5
+    force = 4 * np.pi * 0.005**3 * np.diff(field**2)[0] / 2e-5 / 2 / MU_0
+    # the field is not quite uniform over the sphere: (a / R)^2 is 1 %
+    assert found.iron.force_N[0] == pytest.approx([0, 0, force], abs=0.05 * abs(force))
+    assert force < 0
+
+
+def test_bodies_that_no_plane_separates_feel_one_force(tmp_path):
+    """A ball in a bowl; and beside dipoles, whose part is not computed, there is no number."""
+    bowl = {"kind": "revolved", "centre_m": [0.0, 0.0, 0.1], "profile_m": [
+        [0, 0], [0.03, 0], [0.03, 0.03], [0.02, 0.03], [0.02, 0.01], [0, 0.01]]}
+    ball = {"kind": "sphere", "radius_m": 0.008, "centre_m": [0.0, 0.0, 0.12]}
+    study = beside(bowl, ball)
+    found = found_of(study, tmp_path / "bowl")
+    assert found.iron.names == ("iron 1 and 2",)
+    assert found.iron.force_N[0, 2] < 0
+    dipole = {"position_m": [0.1, 0.0, 0.0], "moment_A_m2": [0.0, 0.0, 1.0]}
+    assert found_of(study | {"external": {"dipoles": [dipole]}}, tmp_path / "dipole").iron is None
 
 
 def test_external_fields(tmp_path):

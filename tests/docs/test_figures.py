@@ -40,6 +40,9 @@ QUOTED = {
     ("docs/accuracy.md", "18 000 solves to 1e-9 T"): ("nonlinear.seconds_18000",),
     ("docs/accuracy.md", "all 32 columns of the Jacobian"): ("nonlinear.jacobian_over_newton",),
     ("docs/accuracy.md", "largest difference to GetDP's Newton"): ("nonlinear.engine_error_T",),
+    ("docs/accuracy.md", "sphere of permeability 1000"): ("iron_any.error_sphere",),
+    ("docs/accuracy.md", "five cubes on a plate"): ("iron_any.error_back_plate",),
+    ("docs/accuracy.md", "two blocks on the arms of a C"): ("iron_any.error_c_yoke",),
     ("docs/accuracy.md", "nominal magnet after registration"): (
         "real.nominal_mT", "real_mri.nominal_mT"),
     ("docs/accuracy.md", "chi² of the update per reading"): (

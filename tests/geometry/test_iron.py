@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 from time import perf_counter
 
+import gmsh
 import numpy as np
 import pytest
 import tomlkit
 
-from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.core.errors import HalbachWarning, MeshError, StudyError
+from halbach_fe.geo.iron_bodies import _volume, check_apart
+from halbach_fe.geo.session import gmsh_session
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.iron import closed_surface
@@ -111,6 +115,66 @@ def test_repeated_and_mirrored(short_dipole, generator, body):
             magnet_of(short_dipole, placed | wrong)
     with pytest.raises(StudyError, match="bodies in different places"):
         magnet_of(short_dipole, BOX | {"mirrored": ["x"]})  # its middle is at x = 0
+
+
+HOLED = prism(
+    outline_m=[[0, 0], [0.4, 0], [0.4, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]], length_m=0.1,
+    holes=[{"x_m": 0.05, "y_m": 0.2, "radius_m": 0.02}, {"x_m": 0.3, "y_m": 0.05,
+           "radius_m": 0.02}, {"outline_m": [[0.12, 0.03], [0.18, 0.03], [0.18, 0.06],
+                                             [0.12, 0.06]]}],
+    centre_m=[0.3, 0.1, 0.4], rotation_deg=[0.0, 0.0, 30.0])
+TAPER = {"kind": "revolved", "profile_m": [[0, 0], [0.2, 0], [0.2, 0.05], [0.1, 0.2], [0, 0.2]],
+         "centre_m": [0.5, 0.1, 0.1], "rotation_deg": [0.0, 20.0, 0.0]}
+CONE = np.pi * (0.2**2 * 0.05 + 0.15 / 3 * (0.2**2 + 0.2 * 0.1 + 0.1**2))
+
+
+@pytest.mark.parametrize(("body", "volume", "within", "outside"), [
+    # area of the L and of the window, less two circles; 48 chords leave 0.3 % of a circle
+    (HOLED, 0.1 * (0.06 - 0.0018 - 2 * np.pi * 0.02**2), (0.01, 0.01, 0.02),
+     [(0.05, 0.2, 0.0), (0.3, 0.05, 0.049), (0.15, 0.045, 0.0), (0.2, 0.2, 0.0)]),
+    (TAPER, CONE, (0.0, 0.0, 0.1), [(0.18, 0.0, 0.1), (0.0, 0.0, -0.001)])])
+def test_holes_and_profiles(short_dipole, body, volume, within, outside):
+    """Volumes by hand, points in holes, and images; Gmsh draws the same volume."""
+    for extra in ({}, {"mirrored": ["x"]}, {"mirrored": ["y", "z"]}):
+        for solid in magnet_of(short_dipole, body | extra).iron:
+            assert solid.measures[0] == pytest.approx(volume, rel=3e-3)
+            with gmsh_session("test"):
+                assert gmsh.model.occ.getMass(*_volume(solid)) == pytest.approx(volume, rel=1e-9)
+    (solid,) = magnet_of(short_dipole, body).iron
+    points = np.array([within, *outside]) @ rotation_matrix(solid.turn_rad).T + solid.origin_m
+    assert solid.contains(points).tolist() == [True] + [False] * len(outside)
+    filled = magnet_of(short_dipole, {key: value for key, value in body.items() if key != "holes"})
+    assert filled.iron[0].contains(points).sum() == (4 if body is HOLED else 1)  # the control
+
+
+def test_a_wrong_drawing_is_told(short_dipole):
+    """A hole that Gmsh fills would be a silent error of the field."""
+    (solid,) = magnet_of(short_dipole, HOLED).iron
+    with pytest.raises(MeshError, match="draws body 1 of iron of study 'test' with"):
+        check_apart("test", [replace(solid, holes=solid.holes[:2])])
+    check_apart("test", [solid])
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"holes": [{"x_m": 0.05, "y_m": 0.2, "radius_m": 0.05}]}, "must lie within outline_m"),
+    ({"holes": [{"x_m": 0.25, "y_m": 0.2, "radius_m": 0.02}]}, "must lie within outline_m"),
+    ({"holes": [{"x_m": 0.05, "y_m": 0.2, "radius_m": 0.02}] * 2}, "nor touch|neither touch"),
+    ({"holes": [{"x_m": 0.05, "y_m": 0.2, "radius_m": 0.02},
+                {"x_m": 0.05, "y_m": 0.2, "radius_m": 0.01}]}, r"holes\[1\], about"),
+    ({"holes": [{"x_m": 0.05, "y_m": 0.2}]}, "either radius_m"),
+    ({"holes": [{"outline_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}]}, "do not cross")])
+def test_holes_that_are_refused(short_dipole, change, said):
+    with pytest.raises(StudyError, match=said):
+        magnet_of(short_dipole, HOLED | change)
+
+
+@pytest.mark.parametrize(("profile", "said"), [
+    ([[0, 0], [0.2, 0], [0, 0.1], [0.2, 0.2]], "no corner on the axis|do not cross"),
+    ([[0, 0], [0.2, -0.1], [0.2, 0.1]], "no corner on the axis"),
+    ([[-0.1, 0], [0.2, -0.1], [0.2, 0.1]], "greater than or equal to 0")])
+def test_profiles_that_are_refused(short_dipole, profile, said):
+    with pytest.raises(StudyError, match=said):
+        magnet_of(short_dipole, TAPER | {"profile_m": profile})
 
 
 def triangles_of_box(size):

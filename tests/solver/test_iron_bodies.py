@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from functools import partial
+from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.geo.iron_bodies import Sizes
+from halbach_fe.geo.iron_bodies import Sizes, mesh_iron
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -26,6 +29,7 @@ from halbach_fe.solver.formulation_choice import (
 )
 from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
+from halbach_fe.solver.session import RunSize
 from halbach_fe.study.reader import parse_study
 from halbach_fe.study.solver import MeshSettings
 from halbach_fe.synthetic.bodies import magnet_of
@@ -128,6 +132,49 @@ def test_a_body_of_triangles_is_as_a_box(session):
     scale = np.abs(found[0]).max()
     assert np.abs(found[1] - found[0]).max() < 0.03 * scale
     assert np.abs(found[2] - found[0]).max() > 0.05 * scale
+
+
+def test_a_profile_is_as_a_tube(session):
+    """In a uniform field, on coarse meshes; without its bore as the control."""
+    mesh = {"block_size_m": 0.02, "growth": 2.0}
+    uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    points = np.array([[0, 0, 0], [0.01, 0.02, 0.02], [0.04, 0, 0.05], [0, -0.035, 0.09]])
+    place = {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
+    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform,
+                          session.within(name), estimate=False).field(points)
+             for name, body in (
+        ("tube", {"kind": "tube", "inner_radius_m": 0.01, "outer_radius_m": 0.02,
+                  "length_m": 0.03}),
+        ("profile", {"kind": "revolved", "profile_m": [
+            [0.01, -0.015], [0.01, 0.015], [0.02, 0.015], [0.02, -0.015]]}),
+        ("full", {"kind": "revolved", "profile_m": [
+            [0.0, -0.015], [0.0, 0.015], [0.02, 0.015], [0.02, -0.015]]}))]
+    scale = np.abs(found[0]).max()
+    assert np.abs(found[1] - found[0]).max() < 0.01 * scale  # 0.3 % were measured
+    assert np.abs(found[2] - found[0]).max() > 0.02 * scale
+
+
+def nodes_of(*bodies):
+    """Return the number of nodes of the mesh."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "iron.msh"
+        mesh_iron("gap", build_magnet(study_with(*bodies)).iron, Sizes.of(
+            MeshSettings(block_size_m=0.02, growth=2.2)), path)
+        return len(meshio.read(path).points)
+
+
+def test_edges_at_narrow_gaps_have_small_elements():
+    """They carry the flux from body to body. Bodies that touch, or are far apart, have none; and a
+    gap of glue is no finer than an eighth of the widest that counts.
+    """
+    lower = {"kind": "box", "size_m": [0.02, 0.02, 0.01], "centre_m": [0.05, 0.0, 0.0]}
+    upper = {"kind": "box", "size_m": [0.02, 0.01, 0.01]}
+    touching, glued, narrow, wide = (
+        nodes_of(lower, upper | {"centre_m": [0.05, 0.0, 0.01 + gap]})
+        for gap in (0.0, 1e-5, 1e-3, 0.02))
+    assert narrow > 1.3 * wide
+    assert touching < 1.1 * wide
+    assert narrow < glued < 10 * wide
 
 
 def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
@@ -260,6 +307,11 @@ def test_other_refusals(session, monkeypatch):
     monkeypatch.setattr(iron_bodies, "available_memory", lambda: 0.01)
     with pytest.raises(StudyError, match=r"fits into the 0.01 GiB of memory that are left"):
         solve_nominal(build_magnet(study_with(box)), POINTS, session)
+    # the same of a mesh that is larger than it was estimated to be, as narrow gaps make it
+    monkeypatch.setattr(iron_bodies, "size_of", lambda *_: RunSize("scalar_potential", 1, 1, 1))
+    with pytest.raises(StudyError, match=r"fits into the 0.01 GiB of memory that are left"):
+        solve_nominal(build_magnet(study_with(box, mesh={"block_size_m": 0.02, "growth": 4.0})),
+                      POINTS, session)
 
 
 def test_size_is_foretold(sphere):

@@ -79,8 +79,8 @@ def test_every_kind_of_error_has_a_sentence():
     ({"array__block": {}}, "Add the key, as one of 'sector', 'trapezoid', 'cuboid'."),
     ({"array__block__shape": "hexagon"}, "`array.block.shape` of study must be one of"),
     ({"iron": {"relative_permeability": 9, "bodies": [{"kind": "tub"}]}},
-     "`iron.bodies[0].kind` of study must be one of 'tube', 'prism', 'box', 'sphere', 'stl'; "
-     "instead received 'tub'. "
+     "`iron.bodies[0].kind` of study must be one of 'tube', 'prism', 'box', 'sphere', "
+     "'revolved', 'stl'; instead received 'tub'. "
      "Did you mean 'tube'?"),
     ({"array": {"free_blocks": "blocks.csv"}}, "free_blocks = { file ="),
     ({"array": []}, "`array` of study must be a table of keys; instead received a list of 0."),

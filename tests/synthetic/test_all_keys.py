@@ -282,7 +282,7 @@ def test_place_and_material_of_a_body_of_iron(base, key, generator):
 
 @pytest.mark.parametrize("key", [
     key for key in dict.fromkeys([*IronTube.model_fields, *IronPrism.model_fields])
-    if key not in PlacedIron.model_fields])
+    if key not in PlacedIron.model_fields and key != "holes"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_every_key_of_a_body_of_iron(key, dimension, generator):
     """The iron fills the same space as the model's, and another one than without the key."""
@@ -301,6 +301,17 @@ def test_every_key_of_a_body_of_iron(key, dimension, generator):
             inside[-1], np.any([each.contains(points) for each in theirs], axis=0))
     assert 10 < inside[0].sum() < 10_000
     assert (inside[0] != inside[1]).any() == (dimension == 3 or key not in ("length_m", "z_m"))
+
+
+@pytest.mark.parametrize("body", [
+    POLE | {"holes": [{"x_m": 0.225, "y_m": -0.025, "radius_m": 0.005}]},
+    {"kind": "revolved", "profile_m": [[0, 0.2], [0.1, 0.2], [0, 0.3]]}])
+def test_iron_that_no_truth_knows(body):
+    """It is refused, not left out."""
+    with pytest.raises(StudyError, match="of boxes, prisms without holes, tubes and spheres"):
+        magnet_of(study_of(RING | {"rings": 1}, 3, iron={"bodies": [body]} | IRON))
+    with pytest.raises(StudyError, match="without holes along z, of one material, since it is 2D"):
+        build_magnet(study_of(RING | {"rings": 1}, 2, iron={"bodies": [body]} | IRON))
 
 
 def test_material_of_iron():

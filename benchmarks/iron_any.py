@@ -1,0 +1,227 @@
+"""Iron of any shape: against closed forms, NGSolve, and the measured plates of TEAM problem 13.
+
+The bars are those of every reading. NGSolve meshes blocks and iron together with curved elements of
+order 3, and shares no code with the field that it judges.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.note import Note
+from halbach_fe.cli import common
+from halbach_fe.core.arrays import Floats
+from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.solver.exact_block_field import external_field, field_of
+from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.iron_bodies import BodiesReaction
+from halbach_fe.solver.separate_blocks import solve_separate
+from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import Curve
+from halbach_fe.study.reader import parse_study
+from halbach_fe.synthetic.bodies import magnet_of
+from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
+
+Truth = Callable[[Magnet, Floats], Floats]
+"""What the iron and the blocks' permeability add (n, 3) in T at points (n, 3) in m."""
+
+
+def study_of(name: str, blocks: dict[str, list[Any]], iron: dict[str, Any], size_m: float,
+             growth: float, **changes: Any) -> dict[str, Any]:
+    """Return a study of free cuboids and bodies of iron."""
+    count = len(blocks["x_m"])
+    return {"name": name, "dimension": 3, "mesh": {"block_size_m": size_m, "growth": growth},
+            "array": {"free_blocks": {"name": [f"b{n}" for n in range(count)],
+                                      "shape": ["cuboid"] * count, **blocks}},
+            "iron": iron, "observation": {"quantity": "flux_density", "positions": {
+                "kind": "points", "points_m": [[0.0, 0.0, 0.5]]}}} | changes
+
+
+NO_BLOCK = {"x_m": [0.4], "y_m": [0.0], "z_m": [0.0], "remanence_T": [1e-6],
+            **{f"size_{axis}_m": [0.001] for axis in "xyz"}}
+"""A block that does nothing, as every study has one."""
+
+
+def sphere() -> tuple[dict[str, Any], Floats, Truth]:
+    """A sphere of permeability 1000 in a uniform field, in closed form (J. D. Jackson, 5.11)."""
+    radius, background = 0.02, np.array([0.3, -0.2, 1.0])
+    study = study_of("sphere", NO_BLOCK, {"relative_permeability": 1000.0, "bodies": [
+        {"kind": "sphere", "radius_m": radius}]}, 0.02, 1.4,
+        external={"background_T": background.tolist()})
+    generator = np.random.default_rng(1)
+    directions = generator.normal(size=(60, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    points = directions * (radius + generator.uniform(0.002, 0.02, 60))[:, None]
+
+    def truth(_magnet: Magnet, points: Floats) -> Floats:
+        distance = np.linalg.norm(points, axis=1)[:, None]
+        dipole = 999 / 1002 * radius**3 * background
+        return np.asarray((3 * (points @ dipole)[:, None] * points / distance**2 - dipole)
+                          / distance**3)
+
+    return study, points, truth
+
+
+def by_ngsolve(size_m: float) -> Truth:
+    """Return the truth with elements of a size, of order 3."""
+    return lambda magnet, points: reaction_field(
+        magnet_of(magnet.study), points, Elements(size=size_m, order=3))
+
+
+def back_plate() -> tuple[dict[str, Any], Floats, Truth]:
+    """A linear Halbach array of five cubes of 10 mm on a steel plate of 5 mm that they touch."""
+    x = np.array([-0.02, -0.01, 0.0, 0.01, 0.02])
+    axes = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (0, 1)])
+    zero = np.zeros(5).tolist()
+    blocks: dict[str, list[Any]] = {
+        "x_m": x.tolist(), "y_m": zero, "z_m": zero, "recoil_permeability": [1.05] * 5,
+        **{f"size_{axis}_m": [0.01] * 5 for axis in "xyz"}, "remanence_z_T": zero,
+        "remanence_x_T": (1.2 * axes[:, 0]).tolist(), "remanence_y_T": (1.2 * axes[:, 1]).tolist()}
+    study = study_of("back-plate", blocks, {"relative_permeability": 1000.0, "bodies": [
+        {"kind": "box", "size_m": [0.06, 0.005, 0.02], "centre_m": [0.0, -0.0075, 0.0]}]},
+        0.01, 1.5)
+    points = np.array([[x, y, z] for x in np.linspace(-0.024, 0.024, 9) for y in (0.008, 0.012)
+                       for z in (0.0, 0.004)])
+    return study, points, by_ngsolve(0.0025)
+
+
+def c_yoke() -> tuple[dict[str, Any], Floats, Truth]:
+    """Two blocks of 20 x 20 x 8 mm that face each other 24 mm apart on the arms of a steel C."""
+    outer, thick, high = 0.045, 0.012, 0.032
+    outline = [(-outer, -high), (0.012, -high), (0.012, -high + thick), (-outer + thick,
+               -high + thick), (-outer + thick, high - thick), (0.012, high - thick),
+               (0.012, high), (-outer, high)]
+    middle = high - thick - 0.004
+    blocks: dict[str, list[Any]] = {
+        "x_m": [0.0, 0.0], "y_m": [-middle, middle], "z_m": [0.0, 0.0],
+        "size_x_m": [0.02] * 2, "size_y_m": [0.008] * 2, "size_z_m": [0.02] * 2,
+        "remanence_x_T": [0.0] * 2, "remanence_y_T": [1.2] * 2, "remanence_z_T": [0.0] * 2,
+        "recoil_permeability": [1.05] * 2}
+    study = study_of("c-yoke", blocks, {"relative_permeability": 1000.0, "bodies": [
+        {"kind": "prism", "outline_m": outline, "length_m": 0.024}]}, 0.02, 1.6)
+    points = np.array([[x, y, z] for x in (-0.008, -0.003, 0.003, 0.008)
+                       for y in (-0.006, 0.0, 0.006) for z in (-0.008, 0.0, 0.008)])
+    return study, points, by_ngsolve(0.005)
+
+
+CASES = {"sphere": sphere, "back_plate": back_plate, "c_yoke": c_yoke}
+
+
+def run(note: Note) -> None:
+    """Measure and note the error and the bars of every magnet."""
+    worst, ratios = {}, []
+    for name, case in CASES.items():
+        document, points, truth = case()
+        magnet = build_magnet(parse_study(document))
+        started = time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            solved = solve_separate(magnet, Session(find_getdp(), Path(folder)))
+            found, bars = solved.field_with_errors(points)
+        seconds = time.process_time() - started
+        exact = truth(magnet, points)
+        main = np.linalg.norm(
+            exact + field_of(magnet.blocks, points) + external_field(magnet, points), axis=1).max()
+        error, bar = np.linalg.norm(found - exact, axis=1), bars.max(axis=1)
+        worst[name] = float(error.max() / main)
+        ratios.append(error / bar)
+        common.say(
+            f"{name}: main field {main:.3f} T, reaction {np.abs(exact).max():.4f} T, error "
+            f"{worst[name]:.1e} of it at most, {np.sqrt(np.mean(error**2)) / main:.1e} rms, "
+            f"{np.mean(error <= 2 * bar):.2f} within 2 bars, bar over error "
+            f"{np.sqrt(np.mean(bar**2) / np.mean(error**2)):.1f}, {seconds:.0f} s of processor")
+        note(f"iron_any.error_{name}", worst[name], "of the main field",
+             f"largest at {len(points)} points; "
+             + ("closed form" if name == "sphere" else "NGSolve, curved, order 3"))
+    ratio = np.concatenate(ratios)
+    note("iron_any.error", max(worst.values()), "of the main field",
+         f"largest of {', '.join(worst)}")
+    note("iron_any.coverage", float(np.mean(ratio <= 2)), "ratio",
+         f"{len(ratio)} readings within 2 bars")
+
+
+# --- TEAM problem 13 ---------------------------------------------------------------------------
+
+STEEL_H = (0, 16, 30, 54, 93, 143, 191, 210, 222, 233, 247, 258, 272, 289, 313, 342, 377, 433, 509,
+           648, 933, 1228, 1934, 2913, 4993, 7189, 9423, 14752, 20996, 28904, 41976)
+STEEL_B = (0, 0.0025, 0.005, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0,
+           1.1, 1.2, 1.3, 1.4, 1.5, 1.55, 1.6, 1.65, 1.7, 1.75, 1.8, 1.9, 2.0, 2.1, 2.2)
+MEASURED_T = (1.33, 1.329, 1.286, 1.225, 1.129, 0.985, 0.655, 0.259, 0.453, 0.554, 0.637, 0.698,
+              0.755, 0.809, 0.901, 0.945, 0.954, 0.956, 0.96, 0.965, 0.97, 0.974, 0.981, 0.984,
+              0.985)
+"""H in A/m and B in T of the steel, and the measured mean of B over 25 sections of the plates at
+1000 ampere turns: T. Nakata, K. Fujiwara, Summary of results for benchmark problem 13 (3-D
+nonlinear magnetostatic model), COMPEL 11 (1992) 345; Compumag, TEAM workshop problem 13."""
+
+THICK, TOP, INNER, OUTER = 0.0032, 0.0632, 0.0021, 0.1253
+
+
+def plates(growth: float) -> dict[str, Any]:
+    """The study of problem 13: a plate, a channel on either side of it, 0.5 mm away, and a coil."""
+    channel = [(INNER, -TOP), (OUTER, -TOP), (OUTER, TOP), (INNER, TOP), (INNER, TOP - THICK),
+               (OUTER - THICK, TOP - THICK), (OUTER - THICK, THICK - TOP), (INNER, THICK - TOP)]
+    bodies: list[dict[str, Any]] = [{"kind": "box", "size_m": [THICK, 0.05, 2 * TOP]}]
+    for sign in (1.0, -1.0):
+        bodies.append({"kind": "prism", "outline_m": [(sign * x, z) for x, z in channel],
+                       "length_m": 0.05, "rotation_deg": [90.0, 0.0, 0.0],
+                       "centre_m": [0.0, sign * 0.04, 0.0]})
+    return study_of(
+        "team-13", NO_BLOCK, {"bodies": bodies, "curve": {
+            "kind": "table", "H_A_per_m": STEEL_H, "B_T": STEEL_B}}, 0.02, growth,
+        external={"coils": [{"kind": "racetrack", "size_m": [0.175, 0.175],
+                             "corner_radius_m": 0.0375, "section_m": [0.025, 0.1],
+                             "current_A": 1000.0}]})
+
+
+def sections() -> tuple[Floats, Floats, list[int]]:
+    """Return Gauss points (25, n, 3) of the sections in m, weights (n,), and the axes across."""
+    (u, of_u), (v, of_v) = (np.polynomial.legendre.leggauss(count) for count in (4, 16))
+    thin, wide = THICK / 2 * u, 0.025 * v
+    along = np.arange(0, 61, 10) / 1000
+    inside = 1e-7  # of the channel's end face
+    found, axes = [], []
+    for axis, place, thin_axis, middle in (
+            *((2, z, 0, (0.0, 0.0)) for z in along),
+            *((0, x / 1000 + inside * (x == 2.1), 2, (TOP - THICK / 2, 0.04))
+              for x in (2.1, 10, 20, 30, 40, 50, 60, 80, 100, 110, 122.1)),
+            *((2, z, 0, (OUTER - THICK / 2, 0.04)) for z in along[::-1])):
+        points = np.empty((4, 16, 3))
+        points[..., axis], points[..., 1] = place, middle[1] + wide
+        points[..., thin_axis] = middle[0] + thin[:, None]
+        found.append(points.reshape(-1, 3))
+        axes.append(axis)
+    return np.array(found), np.outer(of_u, of_v).ravel() / 4, axes
+
+
+def mean_flux(iron: BodiesReaction) -> Floats:
+    """Return the mean of B across the sections, (25,) in T."""
+    points, weights, axes = sections()
+    strength = iron.problem.strength(iron.total, points.reshape(-1, 3))[0]
+    curve = iron.problem.bodies[0].law
+    assert isinstance(curve, Curve)
+    flux = curve.permeability.coefficient((strength**2).sum(axis=1))[:, None] * strength
+    across = np.take_along_axis(flux.reshape(points.shape), np.array(axes)[:, None, None], axis=2)
+    return np.abs(across[..., 0] @ weights)
+
+
+def team13(note: Note) -> None:
+    """Compare the mean flux density in the steel with the measured one."""
+    magnet = build_magnet(parse_study(plates(2.0)))
+    with tempfile.TemporaryDirectory() as folder:
+        iron = solve_separate(magnet, Session(find_getdp(), Path(folder))).iron
+    assert isinstance(iron, BodiesReaction)
+    assert iron.coarse is not None
+    found, coarse, measured = mean_flux(iron), mean_flux(iron.coarse), np.array(MEASURED_T)
+    common.say(f"{len(iron.total)} and {len(iron.coarse.total)} unknowns")
+    for number, row in enumerate(zip(measured, found, coarse, strict=True), start=1):
+        common.say("{:2d}: measured {:.3f} T, computed {:.3f} T, on the coarser mesh {:.3f} T"
+                   .format(number, *row))
+    off = np.abs(found - measured)
+    note("iron_any.team13", float(np.sqrt(np.mean(off**2))), "T",
+         "rms difference of the mean flux density in 25 sections from the measured one, 1000 AT")
+    note("iron_any.team13_largest", float(off.max()), "T", "the largest of them")
