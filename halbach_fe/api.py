@@ -23,6 +23,7 @@ from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
 from halbach_fe.core.pace import Progress
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
@@ -190,7 +191,7 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     MeasurementError
         If the format is unknown, or needs a regular grid that the map is not.
     OutputError
-        If the file cannot be written.
+        If the file cannot be written, or was there before and not written by this function.
 
     Examples
     --------
@@ -204,12 +205,14 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
             raise MeasurementError(must_be(
                 "format", "hf.export", "left out for a magnet, of which the table of its blocks is "
                 "written", f"'{format}'", "Its field is a map: hf.solve(magnet).field_map."))
-        write_free_blocks(blocks_table(content), path)
     elif format not in WRITERS:
         raise MeasurementError(must_be("format", "hf.export", f"one of {', '.join(WRITERS)}",
                                        f"'{format}'"))
-    else:
-        export_map(content, format, path)
+    with single_file(path, "halbach-fe export"):
+        if isinstance(content, Magnet):
+            write_free_blocks(blocks_table(content), path)
+        else:
+            export_map(content, format, path)
     return path
 
 

@@ -18,9 +18,10 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import refuse_unknown, typed
-from halbach_fe.core.errors import HalbachWarning, OutputError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
@@ -228,16 +229,11 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     """
     study = magnet.study if isinstance(magnet, Magnet) else magnet
     path, table = Path(path), study.array.free_blocks
-    blocks = f"{path.stem}.blocks.csv"
-    ours = path.is_file() and path.read_bytes().startswith(WRITTEN.encode())
-    for file in (path, *([] if table is None else [path.with_name(blocks)])):
-        if file.exists() and not ours:
-            raise OutputError(must_be(
-                "path", "write_study", "a new file, or one that this function wrote",
-                f"{str(file)!r}, which would be lost", "Choose another name, or remove it."))
-    if table is not None:
-        write_free_blocks(table, path.with_name(blocks))
-    write_text(path, WRITTEN + study_text(study, blocks))
+    blocks = path.with_name(f"{path.stem}.blocks.csv")
+    with single_file(path, "hf.write_study", *([] if table is None else [blocks])):
+        if table is not None:
+            write_free_blocks(table, blocks)
+        write_text(path, WRITTEN + study_text(study, blocks.name))
 
 
 def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:

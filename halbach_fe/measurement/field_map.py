@@ -41,9 +41,10 @@ from halbach_fe.core.errors import (
     OutputError,
     must_be,
 )
-from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes, refuse_other_table
+from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.measurement.tables import (
     _check_printable,
     check_columns,
@@ -299,10 +300,12 @@ def points_of(data: xr.Dataset) -> Floats:
 
 
 @typed
+@typed
 def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 
-    The file is written atomically: it is either complete, or not there.
+    The file is written atomically: it is either complete, or not there. A file that this function
+    has not written as it is now is not replaced.
 
     Parameters
     ----------
@@ -316,7 +319,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     Raises
     ------
     OutputError
-        If the suffix is unknown, the file cannot be written, or another table would be lost.
+        If the suffix is unknown, or the file cannot be written or would be lost.
 
     Examples
     --------
@@ -325,13 +328,18 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     >>> hf.read_map("point.csv").sizes["point"]
     1
     """
-    path = Path(path)
+    path = as_path(path)
+    with single_file(path, "hf.write_map"):
+        save_map(data, path)
+
+
+def save_map(data: xr.Dataset, path: Path) -> None:
+    """Write a map as `write_map` does, whatever was in the file before."""
     writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
         ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))
-    refuse_other_table(path, (*FIELD_COLUMNS, TOTAL_COLUMN, UNDIRECTED_COLUMN))
     with atomic(path) as temporary:
         writers[path.suffix](data, temporary)
 

@@ -16,6 +16,7 @@ import halbach_fe as hf
 from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError
+from halbach_fe.magnets import WRITTEN
 from halbach_fe.study.reader import parse_study
 from tests.conftest import ROOT
 from tests.support.short_dipole import TEXT, measured, truth
@@ -125,24 +126,65 @@ def test_a_study_is_written_and_read_back(tmp_path):
     assert hf.read_study(tmp_path / "few.toml") == other.study
 
 
-def test_a_study_that_somebody_wrote_is_not_replaced(tmp_path):
-    """Its comments would be lost. Control: what the function wrote itself is replaced."""
-    magnet, path = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04), tmp_path / "a.toml"
-    hf.write_study(magnet, path)
-    hf.write_study(magnet.with_(array__remanence_T=1.1), path)
-    assert hf.read_study(path).array.remanence_T == 1.1
-    mine = "# our magnet\n" + path.read_text().partition("\n")[2]
-    path.write_text(mine)
-    with pytest.raises(hf.HalbachError, match="which would be lost"):
-        hf.write_study(magnet, path)
-    assert path.read_text() == mine
-    table = tmp_path / "b.blocks.csv"  # of which the study b.toml would write one
-    table.write_text("mine")
-    with pytest.raises(hf.HalbachError, match=r"b\.blocks\.csv.* would be lost"):
-        hf.write_study(hf.magnet_of_blocks({
-            "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
-            "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]}), tmp_path / "b.toml")
-    assert table.read_text() == "mine"
+GRID_M = np.stack(np.meshgrid([0.0, 1e-3], [0.0, 1e-3], [0.0, 1e-3], indexing="ij"), -1)
+
+
+def block_magnet(path):
+    return hf.magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
+        "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]})
+
+
+def a_map(path):
+    return hf.field_map(GRID_M.reshape(-1, 3), 0.1 + GRID_M.reshape(-1, 3))
+
+
+def exported(content, kind):
+    return lambda path: hf.export(content(path), path, kind)
+
+
+def solved(path):
+    """Solve by GetDP in the folder of a path; a second time with another mesh."""
+    finer = 1.0 - 0.1 * path.exists()
+    hf.solve(hf.halbach_ring(**{**RING, "length_m": None}).with_(
+        array__recoil_permeability=1.05, mesh__block_size_m=0.01 * finer),
+        hf.Session.open(path.parent))
+
+
+REPLACING = {
+    "a.csv": lambda path: hf.write_map(a_map(path), path),
+    "a.h5": lambda path: hf.write_map(a_map(path), path),
+    "a.vtu": lambda path: hf.write_map(a_map(path), path),
+    "bdsim.dat": exported(a_map, "bdsim"), "geant4.table": exported(a_map, "geant4"),
+    "openpmd.h5": exported(a_map, "openpmd"), "b.csv": exported(a_map, "csv"),
+    "b.vtu": exported(a_map, "vtu"), "blocks.csv": exported(block_magnet, "csv"),
+    "blocks.h5": exported(block_magnet, "csv"),
+    "a.toml": lambda path: hf.write_study(hf.halbach_ring(**RING), path),
+    "b.blocks.csv": lambda path: hf.write_study(block_magnet(path), path.parent / "b.toml"),
+    "report.html": lambda path: hf.write_report(hf.solve(hf.halbach_ring(**RING)), path.parent),
+    "mesh.msh": solved, "regions.json": solved}
+"""What writes a file of a name. `halbach_fe.new` replaces nothing, its own files neither."""
+
+
+@pytest.mark.parametrize("name", REPLACING)
+def test_a_file_of_somebody_else_is_not_replaced(tmp_path, name):
+    """Nor one that was changed since. Control: what the function wrote itself is replaced."""
+    path = tmp_path / name
+    for text in ("# map of a day\nx_m,y_m,z_m,Bx_T\n0,0,0,1\n", "", WRITTEN + "mine"):
+        path.write_text(text)
+        with pytest.raises(hf.HalbachError, match=rf"{name} .*would replace it"):
+            REPLACING[name](path)
+        assert path.read_text() == text
+        assert {one.name for one in tmp_path.iterdir()} <= {name, "run.json"}
+    path.unlink()
+    for _ in range(2):
+        REPLACING[name](path)
+    if name in ("mesh.msh", "regions.json"):  # checked by their content whenever they are read
+        return
+    path.write_bytes(mine := path.read_bytes() + b"# mine\n")
+    with pytest.raises(hf.HalbachError, match="changed after .* would replace it"):
+        REPLACING[name](path)
+    assert path.read_bytes() == mine
 
 
 class Quantity:
