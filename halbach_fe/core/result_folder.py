@@ -349,8 +349,9 @@ def is_run_folder(path: Path) -> bool:
 def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     """Let a command write one file in the block, but replace only one that it has written itself.
 
-    The same holds for files ``beside`` it, in the same folder. It is known by its SHA-256 in a hidden file beside it, one of each command in a folder. Within
-    a run that has a record of its own, that decides.
+    The same holds for files ``beside`` it, in the same folder. It is known by its SHA-256 in a
+    hidden file beside it, one of each command in a folder. Within a run that has a record of its
+    own, that decides.
 
     Raises
     ------

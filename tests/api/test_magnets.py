@@ -182,7 +182,7 @@ def test_a_file_of_somebody_else_is_not_replaced(tmp_path, name):
     if name in ("mesh.msh", "regions.json"):  # checked by their content whenever they are read
         return
     path.write_bytes(mine := path.read_bytes() + b"# mine\n")
-    with pytest.raises(hf.HalbachError, match="changed after .* would replace it"):
+    with pytest.raises(hf.HalbachError, match=r"changed after .* would replace it"):
         REPLACING[name](path)
     assert path.read_bytes() == mine
 

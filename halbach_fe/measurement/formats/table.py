@@ -139,6 +139,12 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         points = points + declared.origin_m
     total = si.get(names.TOTAL, np.full(count, np.nan))
     read = ~(np.isnan(flux_density).all(axis=1) & np.isnan(total))
+    if not read.any():
+        empty = _quoted([columns[used[name]].text or name for name in used
+                         if name in (*names.FIELDS, names.TOTAL)])
+        raise MeasurementError(must_be(
+            "content", table.where, "at least one reading",
+            f"{count} rows without a number in {empty}" if count else "none"))
     data = _checked(points[read], flux_density[read], total[read], table.where)
     noise = _noise(si, used, table, columns)
     if noise is not None and not np.isnan(flux_density).all():
@@ -722,8 +728,6 @@ def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) ->
     MeasurementError
         If values are too large for a permanent magnet.
     """
-    if not len(points):
-        raise MeasurementError(must_be("content", where, "at least one reading", "none"))
     largest = float(np.nanmax(np.abs(np.column_stack([flux_density, total]))))
     farthest = float(np.abs(points).max())
     if not largest <= MAX_FIELD_T:
