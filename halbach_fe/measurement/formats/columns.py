@@ -37,6 +37,7 @@ from halbach_fe.measurement.formats.text import (
     comments_of,
     delimiter_of,
     is_comment,
+    joining,
     lines_of,
     numbers_among,
     rows_of,
@@ -123,6 +124,11 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     values = _without_empty_end(values, texts, lines[:start], delimiter)
     count = values.shape[1]
     _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
+    named = [text for text in declared.columns if text != "-"]
+    if (apart := len(named) // count) > 1 and len(declared.columns) == apart * count:
+        raise MeasurementError(must_be(
+            "--columns", where, f"of {count} columns, as the file has", len(declared.columns),
+            joining(apart, body[0][0], delimiter) + " Else name each column; - ignores a column."))
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
     own = {column.text for column in columns} <= OWN_COLUMNS
     stated = [names.parse(text, stated=True) for text in declared.columns] or columns
