@@ -266,12 +266,12 @@ def rows_of(
 
 
 def _joined(lines: Sequence[Line], delimiter: str | None) -> str:
-    """Return what to do if rows of other lengths follow each other again and again; else nothing.
-    """
+    """Return what to do if rows of some lengths follow each other again and again, else ""."""
     lengths = [len(cells_of(text, delimiter)) for _, text in lines[:3 * MOST_LINES]
                if not is_comment(text)]
     period = next((n for n in range(2, MOST_LINES + 1)
-                   if lengths == (lengths[:n] * len(lengths))[:len(lengths)]), 0)
+                   if len(lengths) >= 2 * n and lengths == (lengths[:n] * len(lengths))[
+                       :len(lengths)]), 0)
     return joining(period, lines[0][0], delimiter) if period else ""
 
 
