@@ -198,7 +198,9 @@ class FreeBlocks(StudyModel):
             for shape, sizes in SIZES.items():
                 self._refuse((shapes == shape) & (given != (column in sizes)), (
                     f"a {shape}, needs {column}" if column in sizes
-                    else f"a {shape}, has no {column}; leave the cell empty"))
+                    else f"a {shape}, has no {column}; leave the cell empty" + (
+                        ", and give a direction of the magnetization as a rotation"
+                        if column == "angle_deg" else "")))
         self._refuse(np.hypot(self.numbers("x_m", 0.0), self.numbers("y_m", 0.0)) >= MAX_LENGTH_M,
                      f"is {MAX_LENGTH_M:g} m or more from the z axis; are x_m and y_m in mm? "
                      "Then write 0.01 for 10 mm")

@@ -91,8 +91,11 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
              for number, line in lines]
     try:
         start = _first_numbers(lines, declared, where)
-    except MeasurementError:  # unless the numbers of all rows run together
-        start = _first_numbers(apart, declared, where)
+    except MeasurementError as error:  # unless the numbers of all rows run together
+        try:
+            start = _first_numbers(apart, declared, where)
+        except MeasurementError:
+            raise error from None
         lines = apart
     if delimiter_of(lines[start][1], declared) is None:
         while start and _are_alike(apart[start - 1][1], apart[start][1]) and (
@@ -396,4 +399,6 @@ def _refuse_other_length(
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",
                 str(len(cells)), "State what separates them by --delimiter, correct the header, or "
-                "state the columns: --columns NAME,NAME,... takes its place."))
+                "state the columns: --columns NAME,NAME,... takes its place."
+                + (" If commas are decimal commas too, write the file anew with semicolons."
+                   if delimiter == "," and count > len(cells) else "")))

@@ -529,7 +529,8 @@ def _missing(
                        + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
                           if others else "")
                        + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "")
-                       + (f"; {PPM}" if any("ppm" in text.lower() for text in others) else "")
+                       + (f"; {PPM}" if any("ppm" in column.text.lower() for column in columns)
+                          else "")
                        + ")")
     whole = ["Br", *(["Btheta"] if spherical else []), "Bphi"]
     half = [name for name in whole if name not in used]
@@ -613,6 +614,7 @@ def _units(
     """
     found: dict[str, str] = {}
     unknown = []
+    foreign: dict[str, list[str]] = {}
     option = {"length": declared.length_unit, "field": declared.field_unit,
               "angle": declared.angle_unit, "time": ""}[kind]
     common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
@@ -634,11 +636,7 @@ def _units(
         unit = text if kind == "time" and text in units.TIMES else units.unit_symbol(text)
         if not units.states_no_unit(text) and (not unit or (
                 kind != "time" and units.kind_of(unit) != kind)):
-            stated = next(iter(units.KINDS[kind]))
-            if units.unit_symbol(f"{text} {stated}"):  # a factor
-                stated = f"{text} {stated}"
-            missing.append(f"the unit of {name}, as '{text[:20]}' is none of "
-                           f"{', '.join(units.KINDS[kind])} (--columns ...{name}[{stated}])")
+            foreign.setdefault(text, []).append(name)
             continue
         if unit and option and unit != option and name not in names.NOISE:
             raise _contradiction(table, f"unit of {name}", unit, f"--{kind}-unit {option}")
@@ -648,9 +646,23 @@ def _units(
             found[name] = unit or (of if name in names.NOISE else "") or option
         else:
             unknown.append(name)
+    missing += [f"the unit of {', '.join(of)}, as '{text[:20]}' is none of "
+                f"{', '.join(units.KINDS[kind])} (--columns ...{of[0]}[{_stated(text, kind)})"
+                for text, of in foreign.items()]
     if unknown:
         missing.append(f"the unit of {', '.join(unknown)} ({OPTIONS[kind]})")
     return found
+
+
+def _stated(text: str, kind: str) -> str:
+    """Return how to state a unit in place of another ``text``, which may be a factor, with the
+    bracket that ends it.
+    """
+    one = next(iter(units.KINDS[kind]))
+    if units.unit_symbol(f"{text} {one}"):
+        return f"{text} {one}]"
+    return f"{one}]" if kind in ("time", "angle") else (
+        f"N {one}], with the size N of this unit in {one}")
 
 
 def _kind(name: str) -> str:
