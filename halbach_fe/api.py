@@ -101,7 +101,8 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
     Returns
     -------
     Dataset
-        The map, as of `halbach_fe.read_map`.
+        The map, as of `halbach_fe.read_map`. What the file says and the map does not, a symmetry or
+        the place of the magnet, is said in a warning.
 
     Raises
     ------
@@ -124,7 +125,10 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
                                        f"'{format}'"))
     if "columns" in declared:
         declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
-    return read_foreign_map(as_path(path), DeclaredFormat(**declared), format).data  # type: ignore[arg-type]
+    found = read_foreign_map(as_path(path), DeclaredFormat(**declared), format)  # type: ignore[arg-type]
+    if remarks := found.imported.remarks:
+        warnings.warn(f"Of {path}: {' '.join(remarks)}", HalbachWarning, stacklevel=3)
+    return found.data
 
 
 @typed
