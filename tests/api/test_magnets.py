@@ -395,3 +395,23 @@ def test_options_of_other_names_are_refused(tmp_path):
             call(lenght=1)
     with pytest.raises(hf.HalbachError, match=r"format .*'stl'"):
         hf.export(hf.field_map([[0, 0, 0]], [[1, 0, 0]], sigma_T=1e-5), tmp_path / "a", "stl")
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_a_posterior_that_was_changed(tmp_path, generator, value):
+    """By an assignment to its arrays, of which nothing follows any more. Control: as it was."""
+    magnet = hf.halbach_ring(**RING)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    points = 0.02 * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    result = hf.infer(magnet, points, magnet.field_T(points) + generator.normal(0, 1e-4, (24, 3)),
+                      sigma_T=1e-4)
+    calls = [lambda: hf.multipoles(magnet, posterior=result),
+             lambda: hf.homogeneity(magnet, posterior=result), lambda: hf.shim(result, swaps=1),
+             lambda: hf.magnetic_axis(magnet, hf.Session.temporary(), result.posterior),
+             lambda: hf.write_report(result, tmp_path / "page")]
+    for call in calls[:1]:
+        call()
+    result.posterior.mean[:] = value
+    for call in calls:
+        with pytest.raises(hf.HalbachError, match="Was the array changed"):
+            call()
