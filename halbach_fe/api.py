@@ -470,7 +470,7 @@ def field(
     True
     """
     known = (assembled_prior(magnet, magnet.nominal_magnetization) if posterior is None
-             else distributions_of(magnet, posterior)["posterior"])
+             else list(distributions_of(magnet, posterior).values())[-1])
     found = field_on_lines(magnet, lines, known, session, inside)
     most = 0.01
     if (spacing := found.relative_spacing) > most:
@@ -850,11 +850,10 @@ def simulate_measurement(
 
     Raises
     ------
-    ValueError
-        If a text in ``hide`` does not describe an effect.
     StudyError
-        If the magnet cannot be built, or the study does not state the noise of its readings,
-        measures at a point inside a material, or cannot have one of the effects.
+        If a text in ``hide`` does not describe an effect, the magnet cannot be built, or the study
+        does not state the noise of its readings, measures at a point inside a material, or cannot
+        have one of the effects.
     ExtraMissingError
         If magpylib or NGSolve is not installed.
 
@@ -873,6 +872,10 @@ def simulate_measurement(
     build_magnet(study)  # refuses what cannot be built
     if magnitude:
         check_total_field(study.instrument)
-    return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress, placed=placed,
-                             magnitude=magnitude)
+    try:
+        hidden = [parse_hidden_effect(text) for text in hide]
+    except ValueError as error:
+        raise StudyError(must_be("hide", "simulate_measurement", "names of effects, with their "
+                                 "values", f"what is none: {error}")) from None
+    return simulate_campaign(study, seed, hide=hidden, hide_random=hide_random,
+                             progress=progress, placed=placed, magnitude=magnitude)

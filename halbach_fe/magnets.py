@@ -43,6 +43,7 @@ WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
 """First line of the studies that `write_study` writes."""
 
 
+@typed
 def halbach_ring(
     order: int = 1, blocks: int = 16, *, inner_radius_m: float, outer_radius_m: float,
     length_m: float | None = None, rings: int = 1, remanence_T: float | None = None,
@@ -113,6 +114,7 @@ def halbach_ring(
                         else recoil_permeability)
 
 
+@typed
 def magnet_of_blocks(
     table: FreeBlocks | Mapping[str, Sequence[Any]], order: int = 1, name: str = "magnet"
 ) -> Magnet:
@@ -236,6 +238,7 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
         write_text(path, WRITTEN + study_text(study, blocks.name))
 
 
+@typed
 def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:
     """Return the magnet of magpylib's Cuboids, Cylinders and CylinderSegments.
 

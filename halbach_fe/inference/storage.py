@@ -74,10 +74,10 @@ def distributions_of(
                           "posterior", f"study {posterior.study.name}")
         return {name: magnetized(magnet, one, name) for name, one in (
             ("prior", posterior.prior), ("posterior", posterior.posterior))}
-    if not isinstance(posterior, Mapping):
+    if not isinstance(posterior, Mapping) or not posterior:
         raise MeasurementError(must_be(
             "posterior", f"study {magnet.name}", "the result of hf.infer, or distributions by name",
-            f"a {type(posterior).__name__}"))
+            f"a {type(posterior).__name__}{' without any' if posterior == {} else ''}"))
     return {name: distribution_of(magnet, one, name) for name, one in posterior.items()}
 
 

@@ -82,6 +82,7 @@ COPIES = 0.1
 """Share of rows from which rows that are alike in all numbers are copies, and no chance."""
 
 
+@typed
 def field_map(
     points_m: ArrayLike, B_T: ArrayLike, sigma_T: ArrayLike | None = None,
     attributes: Mapping[str, str] | None = None, components: Sequence[str] = COMPONENTS,
@@ -119,7 +120,7 @@ def field_map(
     """
     try:
         points, given = plain(points_m), plain(B_T, components)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
     if given.ndim == len(components) == 1:
@@ -150,7 +151,7 @@ def field_map(
     if sigma_T is not None:
         try:
             sigma = plain(sigma_T, components)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
                                            f"what is none: {error}")) from None
         if sigma.shape == (len(points),) != (len(components),):
