@@ -13,7 +13,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar
 
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -30,11 +30,11 @@ MOST = 1000
 
 
 def typed(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function that refuses, by a StudyError, missing and unknown arguments and those of
-    other kinds than it is annotated with: objects of classes, numbers, texts, lists, mappings,
-    functions.
+    """Decorate a function that refuses missing and unknown arguments, and those of other kinds than
+    it is annotated with: objects of classes, numbers, texts, lists, mappings, functions.
 
-    Whether a number or a name is one that the function takes, it tells itself.
+    It raises a StudyError, of a map a MeasurementError. Whether a number or a name is one that the
+    function takes, it tells itself.
     """
     signature = inspect.signature(function)
 
@@ -55,10 +55,12 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
                              f"{error}.") from None
         for name, value in bound.arguments.items():
             if name in hints() and not _fits(value, hints()[name]):
-                wanted = [one for one in _kinds(hints()[name]) if one]
-                raise StudyError(must_be(
+                wanted = _kinds(hints()[name])
+                text = isinstance(value, str) and "a number" in wanted
+                error = MeasurementError if "a Dataset" in wanted else StudyError
+                raise error(must_be(
                     name, called, " or ".join(wanted),
-                    repr(value) if isinstance(value, str) else value if isinstance(value, Real)
+                    repr(value) if text else value if isinstance(value, Real)
                     else f"a {type(value).__name__}",
                     READERS.get(wanted[0].split()[-1], "")))
         return function(*arguments, **options)

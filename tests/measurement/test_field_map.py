@@ -9,7 +9,7 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from halbach_fe.core.errors import MeasurementError, OutputError, StudyError
+from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
@@ -252,7 +252,7 @@ def test_sigma_of_one_number_holds_for_all_components():
 def test_arguments_in_another_order(tmp_path):
     data = field_map([[0, 0, 0], [0, 0, 0.01]], [[0, 0.1, 0], [0, 0.2, 0]])
     write_map(data, tmp_path / "map.csv")
-    with pytest.raises(StudyError, match="path of write_map must be a path; instead received a Da"):
+    with pytest.raises(MeasurementError, match="data of write_map must be a Dataset; instead"):
         write_map(tmp_path / "map.csv", data)
     with pytest.raises(MeasurementError, match="must be arrays of numbers"):
         field_map("map.csv", data)
