@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
-from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
+from halbach_fe.study.free_blocks_file import outline_of, validated_blocks, write_free_blocks
 from halbach_fe.study.model import Study
 from halbach_fe.study.template import (
     OUTER_RADIUS,
@@ -155,6 +156,10 @@ def magnet_of_blocks(
                 "every block", f"a {type(table).__name__} that is none",
                 'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.'))
         columns = {column: _plain(table[column]) for column in table}
+        if "outline_m" in columns:  # as in a table that was read from a file
+            with suppress(ValueError):
+                columns["outline_m"] = [outline_of(cell) if isinstance(cell, str) else cell
+                                        for cell in columns["outline_m"]]
         count = max((len(values) for values in columns.values()), default=0)
         columns.setdefault("name", [f"b{number}" for number in range(1, count + 1)])
         table = validated_blocks(columns, f"the blocks of {name}")

@@ -23,6 +23,7 @@ READERS = {"BlockTable": "Read the file by hf.read_blocks.",
            "Magnet": "hf.build_magnet makes one of a study.",
            "Session": "hf.Session.open makes one.",
            "Dataset": "Read the file by read_map, and the maps that a study lists by read_maps.",
+           "FreeBlocks": 'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.',
            "path": "Give it as text."}
 """How to come by an object of a class."""
 MOST = 1000
@@ -57,8 +58,8 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
             if name in hints() and not _fits(value, hints()[name]):
                 wanted = _kinds(hints()[name])
                 text = isinstance(value, str) and "a number" in wanted
-                error = MeasurementError if "a Dataset" in wanted else StudyError
-                raise error(must_be(
+                refusal = MeasurementError if "a Dataset" in wanted else StudyError
+                raise refusal(must_be(
                     name, called, " or ".join(wanted),
                     repr(value) if text else value if isinstance(value, Real)
                     else f"a {type(value).__name__}",
@@ -88,8 +89,9 @@ def _fits(value: object, hint: Any) -> bool:
         return isinstance(value, Iterable) and not isinstance(value, bytes | Mapping) and (
             getattr(value, "shape", None) != () and all(
                 _fits(one, part) for part in parts[:1] for one in islice(value, MOST)))
-    if origin is Mapping:
-        return isinstance(value, Mapping)
+    if origin is Mapping:  # or a DataFrame
+        return isinstance(value, Mapping) or (
+            hasattr(value, "keys") and not isinstance(value, type))
     if origin is Callable:
         return callable(value)
     try:

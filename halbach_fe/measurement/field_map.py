@@ -19,6 +19,7 @@ scans and attributes.
 from __future__ import annotations
 
 import hashlib
+import re
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -154,6 +155,10 @@ def field_map(
         except (TypeError, ValueError, OverflowError) as error:
             raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
                                            f"what is none: {error}")) from None
+        if (sigma <= 0).any():
+            raise MeasurementError(must_be("sigma_T", "field_map", "positive numbers in T",
+                                           f"{sigma.min():g}", "Leave it out if it is not known: "
+                                           "the study's [[noise.regions]] then hold."))
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
@@ -707,6 +712,11 @@ def _check_length(data: xr.Dataset, where: str) -> None:
             f"{TOTAL_COLUMN}: beside components it only tests them."))
 
 
+def is_placeholder(value: float) -> bool:
+    """Tell whether a number consists of nines, as those that stand for no reading."""
+    return re.fullmatch(r"9{3,}(\.9*)?", f"{abs(value):.12g}") is not None
+
+
 def check_magnitudes(data: xr.Dataset) -> None:
     """Raise MeasurementError if a map's values are too large to be in m and T, or sigmas absurd.
 
@@ -737,6 +747,12 @@ def check_magnitudes(data: xr.Dataset) -> None:
             f"in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
             f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
             "halbach-fe import-map.")
+        if is_placeholder(largest):
+            raise MeasurementError(must_be(
+                f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T",
+                f"{largest:g}, which looks like a placeholder, one of {len(beyond)} of "
+                f"{len(values)} rows that are not",
+                "Where nothing was read, leave the cell empty, or remove the row."))
         if len(beyond) < PLACEHOLDERS * len(values):
             raise MeasurementError(must_be(
                 f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
@@ -805,7 +821,7 @@ def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
     said = must_be(
         f"reading {copies[0] + 1}", where, "no copy of another row", f"({x:g}, {y:g}, {z:g}) m "
         f"with the same readings again, as {len(copies)} of {len(points)} rows are",
-        "Remove them, or distinguish repeated readings by time_s or scan.")
+        "Remove them: what is read again differs by its noise.")
     if len(copies) > COPIES * len(points):
         raise MeasurementError(said)
     # without times, few digits make some readings of a place alike

@@ -258,7 +258,7 @@ def _parsed(column: str, cells: list[Any], rows: Callable[[int], str], where: st
     expected = "printable text"
     quick: list[Cell] | None = None
     if column == "outline_m":
-        kind, expected = _outline, "corners as `x y; x y; x y`"
+        kind, expected = outline_of, "corners as `x y; x y; x y`"
     elif column in WHOLE:
         kind, expected = _whole, "a whole number"
     elif column not in TEXTS:
@@ -313,7 +313,8 @@ def _text(cell: object) -> str:
     return text
 
 
-def _outline(cell: object) -> tuple[tuple[float, ...], ...]:
+def outline_of(cell: object) -> tuple[tuple[float, ...], ...]:
+    """Return the corners in m that a text lists, `x y; x y; x y`; else raise ValueError."""
     text = _text(cell)
     number = float if OUTLINE.issuperset(text) else parse_number
     corners = tuple(tuple(map(number, corner.split())) for corner in text.split(";"))

@@ -10,6 +10,7 @@ import magpylib
 import numpy as np
 import pandas
 import pytest
+import xarray as xr
 from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
@@ -198,7 +199,7 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
 
 @pytest.mark.parametrize(("call", "said"), [
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": "30 mm"}), "inner_radius_m.*number"),
-    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "finite number"),
+    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "a number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": None}), "inner_radius_m.*number"),
     (lambda frame: hf.halbach_ring(**RING).field_T(frame[["z", "y", "x"]]), "z, y, x in place of"),
     (lambda frame: hf.halbach_ring(**RING).field_T(Quantity()), "unit of their own"),
@@ -214,7 +215,7 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
     (lambda frame: hf.write_study("ring.toml", hf.halbach_ring(**RING)), "be a Magnet"),
     (lambda frame: hf.field_map(frame, frame, "50 uT"), "sigma_T.*numbers in T"),
     (lambda frame: hf.infer(hf.halbach_ring(**RING), hf.Session.temporary(),
-                            hf.field_map(frame, frame)), "must be a Session; instead")])
+                            hf.field_map(frame, frame)), "must be a Dataset or a dict")])
 def test_arrays_that_say_what_they_are(call, said):
     """Columns by name and numbers with units are not read as if they were plain."""
     frame = pandas.DataFrame([[0.0, 0.001, 0.0], [0.0, 0.0, 0.001]], columns=["x", "y", "z"])
@@ -300,7 +301,7 @@ def test_a_study_of_keys_names_all_that_are_missing():
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T(
         np.ma.masked_less([[0.0, -1.0, 0.0]], 0)), "values that are not finite"),
     (lambda: hf.magnet_of_blocks({"shape": "cuboid", "x_m": 0.0}), "columns by name"),
-    (lambda: hf.magnet_of_blocks([{"shape": "cuboid", "x_m": 0.0}]), "a list that is none"),
+    (lambda: hf.magnet_of_blocks([{"shape": "cuboid", "x_m": 0.0}]), "One block is"),
     (lambda: hf.magnet_of_blocks({"shape": ["sphere"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0],
                                   "radius_m": [0.01], "remanence_T": [1.3]}), "received 'sphere'"),
     (lambda: hf.field_map(np.zeros((9, 3)), np.zeros((9, 3)), np.full(8, 1e-5)), "sigma_T"),
@@ -415,3 +416,41 @@ def test_a_posterior_that_was_changed(tmp_path, generator, value):
     for call in calls:
         with pytest.raises(hf.HalbachError, match="Was the array changed"):
             call()
+
+
+def test_labelled_arrays(generator):
+    """Their labels say what is what, in any order. Control: labels that are missing are refused."""
+    ring = hf.halbach_ring(**RING)
+    points = 0.01 * generator.uniform(-1, 1, (4, 3)) * [1, 1, 0]
+    field = ring.field_T(points)
+    labelled = xr.DataArray(points, dims=("point", "component"), coords={
+        "component": ["x", "y", "z"]})
+    turned = labelled.sel(component=["z", "x", "y"])
+    for one in (labelled, labelled.T, turned, turned.T):
+        assert np.array_equal(ring.field_T(one), field)
+    read = xr.DataArray(field, dims=("point", "component"), coords={
+        "component": ["x", "y", "z"]})
+    for one in (read, read.T, read.sel(component=["z", "y", "x"])):
+        assert np.array_equal(hf.field_map(turned.T, one)["B_T"], field)
+        assert np.array_equal(hf.field_map(points, one, components=["y"])["B_T"][:, 1], field[:, 1])
+    for wrong in (read.sel(component=["x", "y"]), read.assign_attrs(units="mT")):
+        with pytest.raises(hf.HalbachError, match=r"labelled x, y, of which z|numbers in mT"):
+            hf.field_map(points, wrong)
+
+
+def test_a_table_that_was_written_and_read(tmp_path):
+    """By pandas, which reads outlines as text."""
+    prism = hf.magnet_of_blocks({
+        "shape": ["prism"], "x_m": [0.03], "y_m": [0.0], "z_m": [0.0], "size_z_m": [0.01],
+        "outline_m": [((0.0, 0.0), (0.02, 0.0), (0.0, 0.01))], "remanence_T": [1.3]})
+    path = hf.export(prism, tmp_path / "blocks.csv")
+    found = hf.magnet_of_blocks(pandas.read_csv(path))
+    assert found.field_T(POINTS) == pytest.approx(prism.field_T(POINTS), rel=1e-12)
+    with pytest.raises(hf.HalbachError, match="outline_m"):
+        hf.magnet_of_blocks(pandas.read_csv(path).assign(outline_m="0 0; 1"))
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1e-5, [1e-5, -1e-5]])
+def test_noise_that_is_none(sigma):
+    with pytest.raises(hf.HalbachError, match="sigma_T of field_map must be positive"):
+        hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)

@@ -256,3 +256,20 @@ def test_arguments_in_another_order(tmp_path):
         write_map(tmp_path / "map.csv", data)
     with pytest.raises(MeasurementError, match="must be arrays of numbers"):
         field_map("map.csv", data)
+
+
+def test_placeholders_and_copies(tmp_path):
+    """9999 is no field in gauss, and copies are no readings, whatever times are given to them."""
+    points = np.column_stack([np.zeros(21), np.zeros(21), 0.001 * np.arange(21)])
+    field = np.random.default_rng(1).normal(0.1, 0.01, (21, 3))
+    field[::7, 0] = 9999
+    with pytest.raises(MeasurementError, match=r"placeholder, one of 3 of 21 .* leave the cell"):
+        check_magnitudes(field_map(points, field))
+    field[::7, 0] = 3210.0
+    with pytest.raises(MeasurementError, match="Are they in gauss"):
+        check_magnitudes(field_map(points, field))
+    field[::7, 0] = 0.1
+    write_map(field_map(np.tile(points, (2, 1)), np.tile(field, (2, 1))), tmp_path / "map.csv")
+    with pytest.raises(MeasurementError, match=r"Remove them: what is read again differs") as said:
+        read_map(tmp_path / "map.csv")
+    assert "time_s" not in str(said.value)

@@ -163,6 +163,10 @@ MEASURED = "serial,type,moment_x{0},moment_y{0},moment_z{0},sigma{0}{1}\n{2}a,1,
      r"the unit of moment_x, moment_y, moment_z, sigma \(one of Am\^2"),
     ("x,y,z,size_x,size_y,size_z,Br[T]\n0,0,0,10,10,10,1.3\n",
      r"the unit of at_x, at_y, at_z, size_x, size_y, size_z \(one of m, .*: --length-unit"),
+    ("serial,type,jx[T],jy[T],jz[T],sigma[%],volume[cm^3]\na,1,1300,0,0,0.1,1\n",
+     "polarization in line 2 .* below 10 T; .* 1300 T"),
+    ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,0,0,0.1,1\n",
+     "moment in line 2 .* below 10 T"),
     ("r[mm],phi[deg],z[mm],Br[T]\n9,0,0,1.3\n", r"x of each .*\(x = r cos\(phi\)"),
     ("x[m],y[m],z[m],shape,size_x[m],size_y[m],size_z[m],Br[T],angle[deg]\n"
      "0,0,0,cuboid,0.01,0.01,0.01,1.3,45\n", "direction of the magnetization as a rotation")])

@@ -381,6 +381,7 @@ def _measured_blocks(
     vectors = _turned(table.vector(strength), declared.axes)
     volume = _volume(table)
     moment = vectors if strength == "moment" else vectors * (volume / MU_0)[:, None]
+    _check_strength(moment * (MU_0 / volume)[:, None], strength, table)
     if table.unit["sigma"] == "%":
         sigma = np.array([_number(cell, "sigma", line, table) for cell, line in zip(
             table.cells["sigma"], table.lines, strict=True)])
@@ -399,6 +400,18 @@ def _measured_blocks(
     return BlockTable(tuple(table.cells["serial"]), tuple(table.cells.get("type", [""] * count)),
                       place["ring"], place["slot"], moment, sigma, volume, temperature,
                       dict(attributes), table.where)
+
+
+def _check_strength(polarization: Floats, strength: str, table: _Table) -> None:
+    """Raise MeasurementError for polarizations (n, 3) in T that no magnet has; NaN is unknown."""
+    most_T = 10.0  # no material has a quarter of it, and mT or kG taken for T are beyond
+    size = np.nan_to_num(np.linalg.norm(polarization, axis=1))
+    if (size > most_T).any():
+        row = int(np.argmax(size > most_T))
+        raise MeasurementError(must_be(
+            f"{strength} in line {table.lines[row]}", table.where,
+            f"a polarization below {most_T:g} T", f"one of {size[row]:.4g} T",
+            "Are the units of its columns, and of the volume, right?"))
 
 
 def _whole(cell: str, name: str, line: int, table: _Table) -> int:

@@ -6,7 +6,6 @@ all missing statements and the options that provide them.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +15,13 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import in_a_row
-from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected, with_total_field
+from halbach_fe.measurement.field_map import (
+    MAX_FIELD_T,
+    field_map,
+    is_placeholder,
+    undirected,
+    with_total_field,
+)
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
@@ -195,11 +200,12 @@ def _refuse_placeholder(values: Floats, name: str, where: str) -> None:
     size = np.nan_to_num(np.abs(values))
     row = int(np.argmax(size))
     far_above = 3.0  # times the next largest number, from which one of nines alone is no reading
-    nines = name.startswith("B") and re.fullmatch(r"9{3,}(\.9*)?", f"{size[row]:.12g}")
+    nines = name.startswith("B") and is_placeholder(float(size[row]))
     if size[row] > MAX_NUMBER or (nines and size[row] > far_above * max(
             size[size < size[row]], default=size[row])):
         raise MeasurementError(must_be(
-            f"{name} of reading {row + 1}", where, f"a reading, below {MAX_NUMBER:g}",
+            f"{name} of reading {row + 1}", where,
+            "a reading" if nines else f"a reading, below {MAX_NUMBER:g}",
             f"{values[row]:g}, which looks like a placeholder", PLACEHOLDER))
 
 
