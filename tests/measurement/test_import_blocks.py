@@ -168,7 +168,7 @@ MEASURED = "serial,type,moment_x{0},moment_y{0},moment_z{0},sigma{0}{1}\n{2}a,1,
     ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,0,0,0.1,1\n",
      "moment in line 2 .* below 10 T"),
     ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,0,0,0.1,0\n",
-     "moment in line 2 .* of the volume, right"),
+     "volume_m3 of block a .* must be positive"),
     ("r[mm],phi[deg],z[mm],Br[T]\n9,0,0,1.3\n", r"x of each .*\(x = r cos\(phi\)"),
     ("x[m],y[m],z[m],shape,size_x[m],size_y[m],size_z[m],Br[T],angle[deg]\n"
      "0,0,0,cuboid,0.01,0.01,0.01,1.3,45\n", "direction of the magnetization as a rotation")])

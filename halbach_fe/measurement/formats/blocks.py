@@ -381,7 +381,7 @@ def _measured_blocks(
     vectors = _turned(table.vector(strength), declared.axes)
     volume = _volume(table)
     moment = vectors if strength == "moment" else vectors * (volume / MU_0)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a volume of zero is refused too
+    with np.errstate(divide="ignore", invalid="ignore"):  # zero is refused below
         _check_strength(moment * (MU_0 / volume)[:, None], strength, table)
     if table.unit["sigma"] == "%":
         sigma = np.array([_number(cell, "sigma", line, table) for cell, line in zip(
