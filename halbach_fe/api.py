@@ -23,6 +23,7 @@ from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
 from halbach_fe.core.pace import Progress
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
 from halbach_fe.design.measurement_plan import MeasurementPlan, plan_measurement
@@ -100,7 +101,8 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
     Returns
     -------
     Dataset
-        The map, as of `halbach_fe.read_map`.
+        The map, as of `halbach_fe.read_map`. What the file says and the map does not, a symmetry or
+        the place of the magnet, is said in a warning.
 
     Raises
     ------
@@ -123,7 +125,10 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
                                        f"'{format}'"))
     if "columns" in declared:
         declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
-    return read_foreign_map(as_path(path), DeclaredFormat(**declared), format).data  # type: ignore[arg-type]
+    found = read_foreign_map(as_path(path), DeclaredFormat(**declared), format)  # type: ignore[arg-type]
+    if remarks := found.imported.remarks:
+        warnings.warn(f"Of {path}: {' '.join(remarks)}", HalbachWarning, stacklevel=3)
+    return found.data
 
 
 @typed
@@ -190,7 +195,7 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     MeasurementError
         If the format is unknown, or needs a regular grid that the map is not.
     OutputError
-        If the file cannot be written.
+        If the file cannot be written, or was there before and not written by this function.
 
     Examples
     --------
@@ -204,12 +209,14 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
             raise MeasurementError(must_be(
                 "format", "hf.export", "left out for a magnet, of which the table of its blocks is "
                 "written", f"'{format}'", "Its field is a map: hf.solve(magnet).field_map."))
-        write_free_blocks(blocks_table(content), path)
     elif format not in WRITERS:
         raise MeasurementError(must_be("format", "hf.export", f"one of {', '.join(WRITERS)}",
                                        f"'{format}'"))
-    else:
-        export_map(content, format, path)
+    with single_file(path, "halbach-fe export"):
+        if isinstance(content, Magnet):
+            write_free_blocks(blocks_table(content), path)
+        else:
+            export_map(content, format, path)
     return path
 
 
@@ -463,7 +470,7 @@ def field(
     True
     """
     known = (assembled_prior(magnet, magnet.nominal_magnetization) if posterior is None
-             else distributions_of(magnet, posterior)["posterior"])
+             else list(distributions_of(magnet, posterior).values())[-1])
     found = field_on_lines(magnet, lines, known, session, inside)
     most = 0.01
     if (spacing := found.relative_spacing) > most:
@@ -640,6 +647,7 @@ def shim(
         raise StudyError("Input stock must go with replacements, the number of blocks that may be "
                          "replaced; instead replacements is 0. Give replacements.")
     result = result.of_blocks
+    distributions_of(result.magnet, result)
     check_objective(result.magnet, reference, limit_units, limit_ppm)
     model = objective_of(result.magnet, reference, session.within("objective"),
                          result.posterior.mean)
@@ -842,11 +850,10 @@ def simulate_measurement(
 
     Raises
     ------
-    ValueError
-        If a text in ``hide`` does not describe an effect.
     StudyError
-        If the magnet cannot be built, or the study does not state the noise of its readings,
-        measures at a point inside a material, or cannot have one of the effects.
+        If a text in ``hide`` does not describe an effect, the magnet cannot be built, or the study
+        does not state the noise of its readings, measures at a point inside a material, or cannot
+        have one of the effects.
     ExtraMissingError
         If magpylib or NGSolve is not installed.
 
@@ -865,6 +872,10 @@ def simulate_measurement(
     build_magnet(study)  # refuses what cannot be built
     if magnitude:
         check_total_field(study.instrument)
-    return simulate_campaign(study, seed, hide=[parse_hidden_effect(text) for text in hide],
-                             hide_random=hide_random, progress=progress, placed=placed,
-                             magnitude=magnitude)
+    try:
+        hidden = [parse_hidden_effect(text) for text in hide]
+    except ValueError as error:
+        raise StudyError(must_be("hide", "simulate_measurement", "names of effects, with their "
+                                 "values", f"what is none: {error}")) from None
+    return simulate_campaign(study, seed, hide=hidden, hide_random=hide_random,
+                             progress=progress, placed=placed, magnitude=magnitude)

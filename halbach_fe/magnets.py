@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,16 +19,17 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import refuse_unknown, typed
-from halbach_fe.core.errors import HalbachWarning, OutputError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.free_blocks import blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
-from halbach_fe.study.free_blocks_file import validated_blocks, write_free_blocks
+from halbach_fe.study.free_blocks_file import outline_of, validated_blocks, write_free_blocks
 from halbach_fe.study.model import Study
 from halbach_fe.study.template import (
     OUTER_RADIUS,
@@ -42,6 +44,7 @@ WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
 """First line of the studies that `write_study` writes."""
 
 
+@typed
 def halbach_ring(
     order: int = 1, blocks: int = 16, *, inner_radius_m: float, outer_radius_m: float,
     length_m: float | None = None, rings: int = 1, remanence_T: float | None = None,
@@ -112,6 +115,7 @@ def halbach_ring(
                         else recoil_permeability)
 
 
+@typed
 def magnet_of_blocks(
     table: FreeBlocks | Mapping[str, Sequence[Any]], order: int = 1, name: str = "magnet"
 ) -> Magnet:
@@ -152,6 +156,10 @@ def magnet_of_blocks(
                 "every block", f"a {type(table).__name__} that is none",
                 'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.'))
         columns = {column: _plain(table[column]) for column in table}
+        if "outline_m" in columns:  # as in a table that was read from a file
+            with suppress(ValueError):
+                columns["outline_m"] = [outline_of(cell) if isinstance(cell, str) else cell
+                                        for cell in columns["outline_m"]]
         count = max((len(values) for values in columns.values()), default=0)
         columns.setdefault("name", [f"b{number}" for number in range(1, count + 1)])
         table = validated_blocks(columns, f"the blocks of {name}")
@@ -228,18 +236,14 @@ def write_study(magnet: Magnet | Study, path: str | Path) -> None:
     """
     study = magnet.study if isinstance(magnet, Magnet) else magnet
     path, table = Path(path), study.array.free_blocks
-    blocks = f"{path.stem}.blocks.csv"
-    ours = path.is_file() and path.read_bytes().startswith(WRITTEN.encode())
-    for file in (path, *([] if table is None else [path.with_name(blocks)])):
-        if file.exists() and not ours:
-            raise OutputError(must_be(
-                "path", "write_study", "a new file, or one that this function wrote",
-                f"{str(file)!r}, which would be lost", "Choose another name, or remove it."))
-    if table is not None:
-        write_free_blocks(table, path.with_name(blocks))
-    write_text(path, WRITTEN + study_text(study, blocks))
+    blocks = path.with_name(f"{path.stem}.blocks.csv")
+    with single_file(path, "hf.write_study", *([] if table is None else [blocks])):
+        if table is not None:
+            write_free_blocks(table, blocks)
+        write_text(path, WRITTEN + study_text(study, blocks.name))
 
 
+@typed
 def from_magpylib(sources: Any, order: int = 1, name: str = "magnet") -> Magnet:
     """Return the magnet of magpylib's Cuboids, Cylinders and CylinderSegments.
 

@@ -6,12 +6,14 @@ import functools
 import inspect
 import os
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import islice
+from numbers import Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -20,23 +22,28 @@ READERS = {"BlockTable": "Read the file by hf.read_blocks.",
            "Study": "Read the file by hf.read_study.",
            "Magnet": "hf.build_magnet makes one of a study.",
            "Session": "hf.Session.open makes one.",
+           "Dataset": "Read the file by read_map, and the maps that a study lists by read_maps.",
+           "FreeBlocks": 'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.',
            "path": "Give it as text."}
 """How to come by an object of a class."""
+MOST = 1000
+"""Most elements of a list whose kinds are looked at."""
 
 
 def typed(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function that refuses, by a StudyError, missing arguments and those of other
-    classes than its own.
+    """Decorate a function that refuses missing and unknown arguments, and those of other kinds than
+    it is annotated with: objects of classes, numbers, texts, lists, mappings, functions.
 
-    Only arguments that are annotated by classes of halbach-fe, by ``str | Path``, or by such a
-    class or None, are checked.
+    It raises a StudyError, of a map a MeasurementError. Whether a number or a name is one that the
+    function takes, it tells itself.
     """
     signature = inspect.signature(function)
 
     @functools.cache
-    def classes() -> dict[str, tuple[type, ...]]:
-        return {name: found for name, hint in typing.get_type_hints(function).items()
-                if name != "return" and (found := _own_classes(hint))}
+    def hints() -> dict[str, Any]:
+        named = typing.get_type_hints(function)
+        return {name: named[name] for name, one in signature.parameters.items()
+                if name in named and one.kind is not one.VAR_KEYWORD}
 
     @functools.wraps(function)
     def checked(*arguments: P.args, **options: P.kwargs) -> R:
@@ -48,26 +55,75 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
             raise StudyError(f"Arguments of {called} must be {', '.join(names)}; instead: "
                              f"{error}.") from None
         for name, value in bound.arguments.items():
-            expected = classes().get(name)
-            if expected and not isinstance(value, expected):
-                wanted = "path" if expected[0] is str else expected[0].__name__
-                article = "an" if wanted[0] in "AEIO" else "a"
-                raise StudyError(must_be(name, called, f"{article} {wanted}",
-                                         f"a {type(value).__name__}", READERS.get(wanted, "")))
+            if name in hints() and not _fits(value, hints()[name]):
+                wanted = _kinds(hints()[name])
+                text = isinstance(value, str) and "a number" in wanted
+                refusal = MeasurementError if "a Dataset" in wanted else StudyError
+                raise refusal(must_be(
+                    name, called, " or ".join(wanted),
+                    repr(value) if text else value if isinstance(value, Real)
+                    else f"a {type(value).__name__}",
+                    READERS.get(wanted[0].split()[-1], "")))
         return function(*arguments, **options)
 
     return checked
 
 
-def _own_classes(hint: Any) -> tuple[type, ...]:
-    """Return the classes of an annotation that are halbach-fe's, paths or None; else nothing."""
-    if typing.get_args(hint) == (str, Path):
-        return str, os.PathLike
-    parts = typing.get_args(hint) if isinstance(hint, UnionType) else (hint,)
-    own = tuple(part for part in parts if isinstance(part, type)
-                and part.__module__.startswith("halbach_fe."))
-    return (*own, NoneType) if own and {*parts} - {*own} == {NoneType} else (
-        own if len(own) == len(parts) else ())
+def _fits(value: object, hint: Any) -> bool:
+    """Tell whether a value is of the kind that an annotation names, as far as that is known."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if hint in (int, float):
+        return _is_number(value)
+    if hint is bool:
+        return isinstance(value, bool) or (type(value).__module__ == "numpy" and (
+            str(getattr(value, "dtype", "")) == "bool"))
+    if hint is str or origin is Literal:
+        return isinstance(value, str)
+    if hint is Path:
+        return isinstance(value, os.PathLike)
+    if origin in (Sequence, list, tuple):
+        if isinstance(value, str):
+            return str in parts or any(str in typing.get_args(part) for part in parts)
+        return isinstance(value, Iterable) and not isinstance(value, bytes | Mapping) and (
+            getattr(value, "shape", None) != () and all(
+                _fits(one, part) for part in parts[:1] for one in islice(value, MOST)))
+    if origin is Mapping:  # or a DataFrame
+        return isinstance(value, Mapping) or (
+            hasattr(value, "keys") and not isinstance(value, type))
+    if origin is Callable:
+        return callable(value)
+    try:
+        return not isinstance(hint, type) or isinstance(value, hint)
+    except TypeError:  # some protocols cannot be asked for
+        return True
+
+
+def _is_number(value: object) -> bool:
+    """Tell whether a value is a real number, or an array of one alone."""
+    try:
+        float(typing.cast(Any, value))
+    except (TypeError, ValueError, OverflowError):
+        return False
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return kind in "iuf" if kind else isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _kinds(hint: Any) -> list[str]:
+    """Return the kinds that an annotation names, in words; None is left out."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if parts == (str, Path):
+        return ["a path"]
+    if origin in (typing.Union, UnionType):
+        return list(dict.fromkeys(kind for part in parts for kind in _kinds(part)))
+    if hint is NoneType:
+        return []
+    words = {int: "a number", float: "a number", bool: "True or False", str: "text",
+             Literal: "text", Path: "a path", Sequence: "a list", list: "a list", tuple: "a list",
+             Mapping: "a dict", Callable: "a function"}
+    name = getattr(hint, "__name__", str(hint))
+    return [words.get(origin or hint) or f"{'an' if name[0] in 'AEIO' else 'a'} {name}"]
 
 
 def refuse_unknown(given: Mapping[str, object], names: Sequence[str], where: str) -> None:

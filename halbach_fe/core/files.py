@@ -18,7 +18,7 @@ import socket
 import stat
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cached_property
@@ -197,6 +197,11 @@ def telling(writing: Writing) -> Iterator[None]:
         _WRITING.reset(token)
 
 
+def is_told() -> bool:
+    """Tell whether what is written now is written within a block of `telling`."""
+    return _WRITING.get() is not None
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` when the block succeeds.
@@ -225,26 +230,6 @@ def atomic(path: Path) -> Iterator[Path]:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from None
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def refuse_other_table(path: Path, columns: Sequence[str]) -> None:
-    """Refuse to replace a CSV file that is no table with one of some columns: one of blocks by a
-    map, say.
-
-    Raises
-    ------
-    OutputError
-    """
-    if path.suffix != ".csv" or not path.is_file():
-        return
-    with path.open("rb") as file:
-        header = next((line for line in file if not line.startswith(b"#")), b"")
-    if header.strip() and not {*header.strip().split(b",")} & {
-            column.encode() for column in columns}:
-        raise OutputError(must_be(
-            "path", str(path), "a new file, or a table with a column "
-            + " or ".join(columns),
-            "another table, which would be lost", "Choose another name, or remove it."))
 
 
 def _write_bytes(content: bytes, path: Path) -> None:

@@ -17,7 +17,7 @@ import fcntl
 import hashlib
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -30,7 +30,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
-from halbach_fe.core.files import make_folder, telling
+from halbach_fe.core.files import is_told, make_folder, telling
 
 RECORD = "run.json"
 
@@ -307,7 +307,7 @@ def result_folder(
                     f"Input {path} is a result of an earlier run in folder {folder}, which this "
                     "run would replace. Name another folder, or copy the input to another place.")
         writer = _Writer(base, before.model_copy(deep=True), "folder", file)
-        writer.refuse(_writable_paths(base, command, solving))
+        writer.refuse(_writable_paths(base, _results_of(command), solving))
         writer.record.inputs, writer.record.ended = _inputs(inputs), ""
         writer.record.named = {
             word: printable(path, MAX_QUOTED) for word, path in named.items()}
@@ -321,14 +321,18 @@ def result_folder(
         writer.remove_stale()
 
 
-def _writable_paths(base: Path, command: str, solving: bool) -> Iterator[Path]:
-    """Yield the paths in a folder that a command may write; a study's own may write any result.
+def _results_of(command: str) -> tuple[str, ...]:
+    """Return the names of the results of a command; a study's own may write any result."""
+    every = tuple(name for names in WRITES.values() for name in names)
+    return (*WRITES.get(command.removeprefix("halbach-fe "), every), "page.json")
+
+
+def _writable_paths(base: Path, results: Sequence[str], solving: bool) -> Iterator[Path]:
+    """Yield the paths in a folder of results, and of what a block that is ``solving`` writes.
 
     A folder within that has a record of its own belongs to another run.
     """
-    every = tuple(name for names in WRITES.values() for name in names)
-    for name in (*WRITES.get(command.removeprefix("halbach-fe "), every), "page.json",
-                 *(_OF_RUNS if solving else ())):
+    for name in (*results, *(_OF_RUNS if solving else ())):
         if "*" not in name:
             yield base / name
         else:
@@ -342,21 +346,28 @@ def is_run_folder(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def single_file(path: Path, command: str) -> Iterator[None]:
+def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     """Let a command write one file in the block, but replace only one that it has written itself.
 
-    It is known by its SHA-256 in a hidden file beside it, one of each command in a folder.
+    The same holds for files ``beside`` it, in the same folder. It is known by its SHA-256 in a
+    hidden file beside it, one of each command in a folder. Within a run that has a record of its
+    own, that decides.
 
     Raises
     ------
     OutputError
         If the file is a result of a run, or the command has not written it as it is.
     """
-    keep_results(path)
+    if is_told():
+        yield
+        return
+    for one in (path, *beside):
+        keep_results(one)
     whole = path.absolute()
     notes = whole.with_name(f".{command.replace(' ', '-')}.json")
     new = Record(command=command, study="", kept=[])
-    _Writer(whole.parent, _record_at(notes) or new, "file").refuse([whole])
+    _Writer(whole.parent, _record_at(notes) or new, "file").refuse(
+        [whole, *(one.absolute() for one in beside)])
 
     @contextlib.contextmanager
     def writing(target: Path, temporary: Path) -> Iterator[None]:
@@ -452,21 +463,27 @@ def inputs_behind(path: Path) -> dict[str, str]:
 
 @contextlib.contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a folder while the block writes into it.
+    """Keep other runs out of a folder while the block writes what later runs may read into it.
 
-    Unlike `result_folder`, it leaves no record. A folder inside one that this run has locked
-    belongs to it.
+    Unlike a `result_folder`, it belongs to no command: its record has files `KEPT` only. A folder
+    inside one that this run has locked belongs to it.
 
     Raises
     ------
     OutputError
-        If another run, or another thread of this process, is using the folder.
+        If another run, or another thread of this process, is using the folder, or it has a file
+        that would be replaced and that no run has written.
     """
     whole = folder.resolve()
     if any(whole.is_relative_to(held) for held in _HELD.get()):
         yield
-    else:
-        with _locked(folder):
+        return
+    with _locked(folder) as file:
+        record = _read_or_refuse(file, folder / RECORD) or Record(
+            command="halbach-fe", study="", kept=[])
+        writer = _Writer(folder.absolute(), record, "folder", file)
+        writer.refuse(_writable_paths(writer.base, (), solving=True))
+        with telling(writer):
             yield
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -16,7 +17,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
@@ -35,7 +36,7 @@ from halbach_fe.study.iron import Iron, IronRing
 from halbach_fe.study.magnet import AnyCoil, External, Neighbour
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
-from halbach_fe.study.types import COMPONENTS
+from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 SOLVED_BY = "halbach_fe.solver.formulation_choice"
 """The module that solves for the field of a magnet."""
@@ -400,7 +401,16 @@ def build_magnet(study: Study) -> Magnet:
         check_iron_ring(study.iron_ring, magnet.array_outer_radius)
     _check_overlaps(study.dimension, study.array, study.iron_ring, study.iron)
     _check_external(study)
+    _doubt_metres(magnet)
     return magnet
+
+
+def _doubt_metres(magnet: Magnet) -> None:
+    """Warn of blocks so large that their lengths may be in mm."""
+    reach = magnet.array_outer_radius
+    if look_like_mm(np.array([[reach, 0.0, 0.0]]))[0]:
+        warnings.warn(f"Blocks of {magnet.name} reach {reach:.3g} m from the z axis. Are their "
+                      "lengths in mm? Then write 0.01 for 10 mm.", HalbachWarning, stacklevel=3)
 
 
 def _check_external(study: Study) -> None:

@@ -21,7 +21,7 @@ from halbach_fe.core.numbers import csv_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Reservation
 from halbach_fe.measurement.instrument import row_order_note
-from halbach_fe.response.block_variation import distribution_of
+from halbach_fe.response.block_variation import distribution_of, magnetized
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.study.model import Study, differences, magnet_description
 
@@ -72,11 +72,12 @@ def distributions_of(
     if isinstance(posterior, InferenceResult):
         check_same_magnet(magnet, posterior.study, posterior.magnet.nominal_magnetization,
                           "posterior", f"study {posterior.study.name}")
-        return {"prior": posterior.prior, "posterior": posterior.posterior}
-    if not isinstance(posterior, Mapping):
+        return {name: magnetized(magnet, one, name) for name, one in (
+            ("prior", posterior.prior), ("posterior", posterior.posterior))}
+    if not isinstance(posterior, Mapping) or not posterior:
         raise MeasurementError(must_be(
             "posterior", f"study {magnet.name}", "the result of hf.infer, or distributions by name",
-            f"a {type(posterior).__name__}"))
+            f"a {type(posterior).__name__}{' without any' if posterior == {} else ''}"))
     return {name: distribution_of(magnet, one, name) for name, one in posterior.items()}
 
 

@@ -19,6 +19,7 @@ scans and attributes.
 from __future__ import annotations
 
 import hashlib
+import re
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -41,9 +42,10 @@ from halbach_fe.core.errors import (
     OutputError,
     must_be,
 )
-from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes, refuse_other_table
+from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
 from halbach_fe.core.hdf5 import _hdf5
 from halbach_fe.core.numbers import decimals
+from halbach_fe.core.result_folder import single_file
 from halbach_fe.measurement.tables import (
     _check_printable,
     check_columns,
@@ -81,6 +83,7 @@ COPIES = 0.1
 """Share of rows from which rows that are alike in all numbers are copies, and no chance."""
 
 
+@typed
 def field_map(
     points_m: ArrayLike, B_T: ArrayLike, sigma_T: ArrayLike | None = None,
     attributes: Mapping[str, str] | None = None, components: Sequence[str] = COMPONENTS,
@@ -118,7 +121,7 @@ def field_map(
     """
     try:
         points, given = plain(points_m), plain(B_T, components)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
     if given.ndim == len(components) == 1:
@@ -149,9 +152,13 @@ def field_map(
     if sigma_T is not None:
         try:
             sigma = plain(sigma_T, components)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
                                            f"what is none: {error}")) from None
+        if (sigma <= 0).any():
+            raise MeasurementError(must_be("sigma_T", "field_map", "positive numbers in T",
+                                           f"{sigma.min():g}", "Leave it out if it is not known: "
+                                           "the study's [[noise.regions]] then hold."))
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
@@ -299,10 +306,12 @@ def points_of(data: xr.Dataset) -> Floats:
 
 
 @typed
+@typed
 def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 
-    The file is written atomically: it is either complete, or not there.
+    The file is written atomically: it is either complete, or not there. A file that this function
+    has not written as it is now is not replaced.
 
     Parameters
     ----------
@@ -316,7 +325,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     Raises
     ------
     OutputError
-        If the suffix is unknown, the file cannot be written, or another table would be lost.
+        If the suffix is unknown, or the file cannot be written or would be lost.
 
     Examples
     --------
@@ -325,13 +334,18 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
     >>> hf.read_map("point.csv").sizes["point"]
     1
     """
-    path = Path(path)
+    path = as_path(path)
+    with single_file(path, "hf.write_map"):
+        save_map(data, path)
+
+
+def save_map(data: xr.Dataset, path: Path) -> None:
+    """Write a map as `write_map` does, whatever was in the file before."""
     writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
         ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))
-    refuse_other_table(path, (*FIELD_COLUMNS, TOTAL_COLUMN, UNDIRECTED_COLUMN))
     with atomic(path) as temporary:
         writers[path.suffix](data, temporary)
 
@@ -698,6 +712,11 @@ def _check_length(data: xr.Dataset, where: str) -> None:
             f"{TOTAL_COLUMN}: beside components it only tests them."))
 
 
+def is_placeholder(value: float) -> bool:
+    """Tell whether a number consists of nines, as those that stand for no reading."""
+    return re.fullmatch(r"9{3,}(\.9*)?", f"{abs(value):.12g}") is not None
+
+
 def check_magnitudes(data: xr.Dataset) -> None:
     """Raise MeasurementError if a map's values are too large to be in m and T, or sigmas absurd.
 
@@ -728,6 +747,12 @@ def check_magnitudes(data: xr.Dataset) -> None:
             f"in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
             f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
             "halbach-fe import-map.")
+        if is_placeholder(largest):
+            raise MeasurementError(must_be(
+                f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T",
+                f"{largest:g}, which looks like a placeholder, one of {len(beyond)} of "
+                f"{len(values)} rows that are not",
+                "Where nothing was read, leave the cell empty, or remove the row."))
         if len(beyond) < PLACEHOLDERS * len(values):
             raise MeasurementError(must_be(
                 f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
@@ -796,7 +821,7 @@ def _check_duplicates(data: xr.Dataset, points: Floats, where: str) -> None:
     said = must_be(
         f"reading {copies[0] + 1}", where, "no copy of another row", f"({x:g}, {y:g}, {z:g}) m "
         f"with the same readings again, as {len(copies)} of {len(points)} rows are",
-        "Remove them, or distinguish repeated readings by time_s or scan.")
+        "Remove them: what is read again differs by its noise.")
     if len(copies) > COPIES * len(points):
         raise MeasurementError(said)
     # without times, few digits make some readings of a place alike

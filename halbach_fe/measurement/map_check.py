@@ -24,6 +24,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
@@ -415,6 +416,7 @@ def _finite(value: object) -> object:
     return None if value != value else value
 
 
+@typed
 def check_map(
     data: xr.Dataset, say: Callable[[str], None] = lambda _: None,
     progress: Progress | None = None,

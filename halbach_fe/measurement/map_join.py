@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
@@ -377,6 +378,7 @@ class Checked:
         return np.asarray(((points > low - margin) & (points < high + margin)).all(axis=1))
 
 
+@typed
 def join_maps(
     maps: Mapping[str, xr.Dataset], say: Callable[[str], None] = lambda _: None,
     progress: Progress | None = None, turn_rad: float = TURN_RAD,

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
-from halbach_fe.inference.storage import inference_summary, write_inference
+from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
@@ -298,8 +298,9 @@ def _by_readings(result: InferenceResult, directions: Floats, of: Floats) -> lis
 @page_of.register
 def page(result: InferenceResult) -> Page:
     """Return the page of an updated magnet."""
+    known = distributions_of(result.magnet, result)
     multipoles: list[MultipoleTable] = [
-        (model, {"prior": model.of(result.prior), "posterior": model.of(result.posterior)})
+        (model, {name: model.of(distribution) for name, distribution in known.items()})
         for model in ([] if result.is_campaign else circle_models(
             result.magnet, result.observation, result.response))]
     rows, axis, stray = (score_table(result), axis_rows(result.magnetic_axis),

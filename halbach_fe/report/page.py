@@ -30,7 +30,7 @@ from tomlkit.items import Array, Trivia, Whitespace
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import version
-from halbach_fe.core.errors import must_be
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import with_paths_from
@@ -190,10 +190,10 @@ def page_of(result: object) -> Page:
 
     Raises
     ------
-    TypeError
+    StudyError
         If there is no page for such an object.
     """
-    raise TypeError(must_be(
+    raise StudyError(must_be(
         "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
         f"a {type(result).__name__}"))
 

@@ -65,7 +65,7 @@ Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
     OutputError
         If a file cannot be written, another run is using the folder, or it holds results of
         another command or study.
-    TypeError
+    StudyError
         If ``result`` is of any other type.
 
     Examples
@@ -90,7 +90,7 @@ def html_of(result: object) -> str:
 
     Raises
     ------
-    TypeError
+    StudyError
         If the result is of a type without a page.
     """
     if isinstance(result, Magnet):

@@ -336,7 +336,7 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
     Raises
     ------
     MeasurementError
-        If it is none, or has another number of parameters.
+        If it is none, has another number of parameters, or is of a magnet without a field.
     """
     if not isinstance(distribution, Gaussian):
         raise MeasurementError(must_be(
@@ -348,4 +348,19 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
         raise MeasurementError(must_be(
             name, f"study {magnet.name}", f"of the {expected} parameters of its magnet",
             str(len(distribution.mean)), "Is it that of another magnet?"))
+    return magnetized(magnet, distribution, name)
+
+
+def magnetized(magnet: Magnet, distribution: Gaussian, name: str) -> Gaussian:
+    """Return a distribution of parameters, those of the blocks first, if there is a field of them.
+
+    Raises
+    ------
+    MeasurementError
+    """
+    blocks = distribution.mean[:len(magnet.nominal_magnetization)]
+    if not np.isfinite(distribution.mean).all() or not blocks.any():
+        raise MeasurementError(must_be(
+            f"mean of {name}", f"study {magnet.name}", "finite, and of blocks with a magnetization",
+            "zeros" if not blocks.any() else "what is not finite", "Was the array changed?"))
     return distribution

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import in_a_row
 from halbach_fe.study.grades import Material, columns_with_grades
 from halbach_fe.study.types import (
     MAX_LENGTH_M,
@@ -44,6 +45,9 @@ SIZES: dict[Shape, tuple[str, ...]] = {
 
 REMANENCE_VECTOR = ("remanence_x_T", "remanence_y_T", "remanence_z_T")
 """Components of the remanence along x, y and z of the magnet."""
+
+NEEDED = ("name", "shape", "x_m", "y_m", "z_m")
+NEEDED_BY_ALL = f"every block needs {in_a_row(NEEDED)}"
 
 MAX_BLOCKS = 1_000_000
 
@@ -143,9 +147,13 @@ class FreeBlocks(StudyModel):
         """Fill in what the grades say, and leave out columns without any value."""
         if not isinstance(given, dict):
             return given
+        empty = [column for column, values in given.items() if isinstance(values, list | tuple)
+                 and values and all(value is None for value in values)]
+        if needed := [column for column in NEEDED if column in empty]:
+            raise ValueError(f"column {needed[0]} has no value: give it, as {NEEDED_BY_ALL}")
         return columns_with_grades({
-            column: values for column, values in given.items()
-            if not isinstance(values, list | tuple) or any(value is not None for value in values)})
+            column: values for column, values in given.items() if column not in empty and (
+                not isinstance(values, list | tuple) or values)})
 
     @model_validator(mode="after")
     def _consistent(self) -> FreeBlocks:
@@ -158,10 +166,8 @@ class FreeBlocks(StudyModel):
             raise ValueError("there is no block; give a file, or columns")
         for column in COLUMNS:
             values = getattr(self, column)
-            needed = column in ("name", "shape", "x_m", "y_m", "z_m")
-            if needed and not values:
-                raise ValueError(f"there is no column {column}: add it, as every block needs name, "
-                                 "shape, x_m, y_m and z_m")
+            if column in NEEDED and not values:
+                raise ValueError(f"there is no column {column}: add it, as {NEEDED_BY_ALL}")
             if len(values) != len(self) and values:
                 raise ValueError(f"column {column} has {len(values)} rows, and there are "
                                  f"{len(self)} names of blocks")
@@ -192,7 +198,9 @@ class FreeBlocks(StudyModel):
             for shape, sizes in SIZES.items():
                 self._refuse((shapes == shape) & (given != (column in sizes)), (
                     f"a {shape}, needs {column}" if column in sizes
-                    else f"a {shape}, has no {column}; leave the cell empty"))
+                    else f"a {shape}, has no {column}; leave the cell empty" + (
+                        ", and give a direction of the magnetization as a rotation"
+                        if column == "angle_deg" else "")))
         self._refuse(np.hypot(self.numbers("x_m", 0.0), self.numbers("y_m", 0.0)) >= MAX_LENGTH_M,
                      f"is {MAX_LENGTH_M:g} m or more from the z axis; are x_m and y_m in mm? "
                      "Then write 0.01 for 10 mm")

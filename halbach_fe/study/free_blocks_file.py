@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from halbach_fe.core import untrusted
 from halbach_fe.core.errors import OutputError, StudyError, must_be
-from halbach_fe.core.files import refuse_other_table, workbook_in, workbook_sentence, write_text
+from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
 from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.core.numbers import MAX_CELL, WITH_COMMAS, csv_text, other_separator, parse_number
 from halbach_fe.study import sentences
@@ -109,7 +109,7 @@ def write_free_blocks(blocks: FreeBlocks | Mapping[str, Sequence[Any]], path: st
     Raises
     ------
     OutputError
-        If the suffix is another one, the file cannot be written, or another table would be lost.
+        If the suffix is another one, or the file cannot be written.
     StudyError
         If the columns do not make a table of free blocks.
     """
@@ -118,7 +118,6 @@ def write_free_blocks(blocks: FreeBlocks | Mapping[str, Sequence[Any]], path: st
     if path.suffix not in (".csv", *HDF5):
         raise OutputError(must_be("suffix", where, f".csv, {', '.join(HDF5)}",
                                   f"'{path.suffix}'"))
-    refuse_other_table(path, ("shape",))
     table = validated_blocks(blocks, where)
     columns: dict[str, Sequence[Any]] = {
         column: getattr(table, column) for column in COLUMNS if table.given(column).any()}
@@ -259,7 +258,7 @@ def _parsed(column: str, cells: list[Any], rows: Callable[[int], str], where: st
     expected = "printable text"
     quick: list[Cell] | None = None
     if column == "outline_m":
-        kind, expected = _outline, "corners as `x y; x y; x y`"
+        kind, expected = outline_of, "corners as `x y; x y; x y`"
     elif column in WHOLE:
         kind, expected = _whole, "a whole number"
     elif column not in TEXTS:
@@ -314,7 +313,8 @@ def _text(cell: object) -> str:
     return text
 
 
-def _outline(cell: object) -> tuple[tuple[float, ...], ...]:
+def outline_of(cell: object) -> tuple[tuple[float, ...], ...]:
+    """Return the corners in m that a text lists, `x y; x y; x y`; else raise ValueError."""
     text = _text(cell)
     number = float if OUTLINE.issuperset(text) else parse_number
     corners = tuple(tuple(map(number, corner.split())) for corner in text.split(";"))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from halbach_fe.measurement.field_map import write_map
+from halbach_fe.measurement.field_map import save_map
 from halbach_fe.study.measurement import FluxDensity, LinePositions
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.simulate import simulate_campaign, write_campaign
@@ -28,7 +28,7 @@ def main() -> None:
         kind="line", start_m=(0, 0, -0.775), end_m=(0, 0, 0.775), count=156))
     profile = simulate_campaign(study.with_(observation=axis),
                                 SEED)  # the same magnet
-    write_map(profile.readings, HERE / "twin" / "axis.csv")
+    save_map(profile.readings, HERE / "twin" / "axis.csv")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, save_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -31,7 +31,7 @@ def main() -> None:
     points = points_from(study.observation.positions)
     magnet = draw_magnet(study, magnet_of(study), np.random.default_rng(SEED)).mounted
     field = true_field(magnet, points, ELEMENTS).astype(np.float32)  # to 3e-8 T, to be stored
-    write_map(field_map(points, field, attributes={
+    save_map(field_map(points, field, attributes={
         "source": ", ".join(model_of(magnet).values()) + f", magnetizations of seed {SEED}"}),
         HERE / "field.h5")
     np.savetxt(HERE / "truth.csv", [body.magnetization for body in magnet.bodies], "%.6f", ",",

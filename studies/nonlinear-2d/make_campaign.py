@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, save_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -43,7 +43,7 @@ def main() -> None:
         field = true_field(magnet_of(study).with_magnetizations(truth), points, Elements(0.01))
         field[:, :2] += sigma * generator.standard_normal((len(points), 2))
         field[:, 2] = np.nan
-        write_map(field_map(points, field, attributes={
+        save_map(field_map(points, field, attributes={
             "source": f"magpylib and NGSolve, order 5, {name} magnetizations",
             "noise": f"{sigma:g} T, seed {SEED}"}), HERE / f"map-{name}.csv")
         np.savetxt(HERE / f"truth-{name}.csv", truth, "%.6f", ",", header="Mx_A_per_m,My_A_per_m",

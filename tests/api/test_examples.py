@@ -221,6 +221,9 @@ def test_forces_of_no_magnet(short_dipole, session):
             hf.forces(magnet, session, **options)
 
 
+DATA = hf.field_map([[0, 0, 0]], [[0.1, 0, 0]])
+
+
 @pytest.mark.parametrize(("use", "said"), [
     (lambda magnet, session: hf.build_magnet("study.toml"), "a Study; .* by hf.read_study"),
     (lambda magnet, session: hf.read_study(magnet), "path of read_study must be a path"),
@@ -230,8 +233,8 @@ def test_forces_of_no_magnet(short_dipole, session):
     (lambda magnet, session: hf.campaign_report("solved", "page.html"), "a list of folders"),
     (lambda magnet, session: hf.solve(session, magnet), "magnet of solve must be a Magnet"),
     (lambda magnet, session: hf.solve(magnet.study, session), "hf.build_magnet makes one"),
-    (lambda magnet, session: hf.infer(magnet, None, "results"), "hf.Session.open makes one"),
-    (lambda magnet, session: hf.infer(magnet, None, session, "b.csv"), "by hf.read_blocks"),
+    (lambda magnet, session: hf.infer(magnet, DATA, "results"), "hf.Session.open makes one"),
+    (lambda magnet, session: hf.infer(magnet, DATA, session, "b.csv"), "by hf.read_blocks"),
     (lambda magnet, session: hf.sort(magnet, "b.csv", session), "by hf.read_blocks"),
     (lambda magnet, session: hf.cad(magnet, "b.csv"), "by hf.read_blocks"),
     (lambda magnet, session: hf.shim(magnet, session), "result of shim must be an InferenceRes"),

@@ -10,12 +10,14 @@ import magpylib
 import numpy as np
 import pandas
 import pytest
+import xarray as xr
 from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
 from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError
+from halbach_fe.magnets import WRITTEN
 from halbach_fe.study.reader import parse_study
 from tests.conftest import ROOT
 from tests.support.short_dipole import TEXT, measured, truth
@@ -125,24 +127,65 @@ def test_a_study_is_written_and_read_back(tmp_path):
     assert hf.read_study(tmp_path / "few.toml") == other.study
 
 
-def test_a_study_that_somebody_wrote_is_not_replaced(tmp_path):
-    """Its comments would be lost. Control: what the function wrote itself is replaced."""
-    magnet, path = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04), tmp_path / "a.toml"
-    hf.write_study(magnet, path)
-    hf.write_study(magnet.with_(array__remanence_T=1.1), path)
-    assert hf.read_study(path).array.remanence_T == 1.1
-    mine = "# our magnet\n" + path.read_text().partition("\n")[2]
-    path.write_text(mine)
-    with pytest.raises(hf.HalbachError, match="which would be lost"):
-        hf.write_study(magnet, path)
-    assert path.read_text() == mine
-    table = tmp_path / "b.blocks.csv"  # of which the study b.toml would write one
-    table.write_text("mine")
-    with pytest.raises(hf.HalbachError, match=r"b\.blocks\.csv.* would be lost"):
-        hf.write_study(hf.magnet_of_blocks({
-            "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
-            "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]}), tmp_path / "b.toml")
-    assert table.read_text() == "mine"
+GRID_M = np.stack(np.meshgrid([0.0, 1e-3], [0.0, 1e-3], [0.0, 1e-3], indexing="ij"), -1)
+
+
+def block_magnet(path):
+    return hf.magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
+        "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]})
+
+
+def a_map(path):
+    return hf.field_map(GRID_M.reshape(-1, 3), 0.1 + GRID_M.reshape(-1, 3))
+
+
+def exported(content, kind):
+    return lambda path: hf.export(content(path), path, kind)
+
+
+def solved(path):
+    """Solve by GetDP in the folder of a path; a second time with another mesh."""
+    finer = 1.0 - 0.1 * path.exists()
+    hf.solve(hf.halbach_ring(**{**RING, "length_m": None}).with_(
+        array__recoil_permeability=1.05, mesh__block_size_m=0.01 * finer),
+        hf.Session.open(path.parent))
+
+
+REPLACING = {
+    "a.csv": lambda path: hf.write_map(a_map(path), path),
+    "a.h5": lambda path: hf.write_map(a_map(path), path),
+    "a.vtu": lambda path: hf.write_map(a_map(path), path),
+    "bdsim.dat": exported(a_map, "bdsim"), "geant4.table": exported(a_map, "geant4"),
+    "openpmd.h5": exported(a_map, "openpmd"), "b.csv": exported(a_map, "csv"),
+    "b.vtu": exported(a_map, "vtu"), "blocks.csv": exported(block_magnet, "csv"),
+    "blocks.h5": exported(block_magnet, "csv"),
+    "a.toml": lambda path: hf.write_study(hf.halbach_ring(**RING), path),
+    "b.blocks.csv": lambda path: hf.write_study(block_magnet(path), path.parent / "b.toml"),
+    "report.html": lambda path: hf.write_report(hf.solve(hf.halbach_ring(**RING)), path.parent),
+    "mesh.msh": solved, "regions.json": solved}
+"""What writes a file of a name. `halbach_fe.new` replaces nothing, its own files neither."""
+
+
+@pytest.mark.parametrize("name", REPLACING)
+def test_a_file_of_somebody_else_is_not_replaced(tmp_path, name):
+    """Nor one that was changed since. Control: what the function wrote itself is replaced."""
+    path = tmp_path / name
+    for text in ("# map of a day\nx_m,y_m,z_m,Bx_T\n0,0,0,1\n", "", WRITTEN + "mine"):
+        path.write_text(text)
+        with pytest.raises(hf.HalbachError, match=rf"{name} .*would replace it"):
+            REPLACING[name](path)
+        assert path.read_text() == text
+        assert {one.name for one in tmp_path.iterdir()} <= {name, "run.json"}
+    path.unlink()
+    for _ in range(2):
+        REPLACING[name](path)
+    if name in ("mesh.msh", "regions.json"):  # checked by their content whenever they are read
+        return
+    path.write_bytes(mine := path.read_bytes() + b"# mine\n")
+    with pytest.raises(hf.HalbachError, match=r"changed after .* would replace it"):
+        REPLACING[name](path)
+    assert path.read_bytes() == mine
 
 
 class Quantity:
@@ -156,7 +199,7 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
 
 @pytest.mark.parametrize(("call", "said"), [
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": "30 mm"}), "inner_radius_m.*number"),
-    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "finite number"),
+    (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "a number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": None}), "inner_radius_m.*number"),
     (lambda frame: hf.halbach_ring(**RING).field_T(frame[["z", "y", "x"]]), "z, y, x in place of"),
     (lambda frame: hf.halbach_ring(**RING).field_T(Quantity()), "unit of their own"),
@@ -172,7 +215,7 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
     (lambda frame: hf.write_study("ring.toml", hf.halbach_ring(**RING)), "be a Magnet"),
     (lambda frame: hf.field_map(frame, frame, "50 uT"), "sigma_T.*numbers in T"),
     (lambda frame: hf.infer(hf.halbach_ring(**RING), hf.Session.temporary(),
-                            hf.field_map(frame, frame)), "must be a Session; instead")])
+                            hf.field_map(frame, frame)), "must be a Dataset or a dict")])
 def test_arrays_that_say_what_they_are(call, said):
     """Columns by name and numbers with units are not read as if they were plain."""
     frame = pandas.DataFrame([[0.0, 0.001, 0.0], [0.0, 0.0, 0.001]], columns=["x", "y", "z"])
@@ -258,7 +301,7 @@ def test_a_study_of_keys_names_all_that_are_missing():
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T(
         np.ma.masked_less([[0.0, -1.0, 0.0]], 0)), "values that are not finite"),
     (lambda: hf.magnet_of_blocks({"shape": "cuboid", "x_m": 0.0}), "columns by name"),
-    (lambda: hf.magnet_of_blocks([{"shape": "cuboid", "x_m": 0.0}]), "a list that is none"),
+    (lambda: hf.magnet_of_blocks([{"shape": "cuboid", "x_m": 0.0}]), "One block is"),
     (lambda: hf.magnet_of_blocks({"shape": ["sphere"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0],
                                   "radius_m": [0.01], "remanence_T": [1.3]}), "received 'sphere'"),
     (lambda: hf.field_map(np.zeros((9, 3)), np.zeros((9, 3)), np.full(8, 1e-5)), "sigma_T"),
@@ -361,3 +404,61 @@ def test_a_command_whose_function_has_another_name_is_told():
         hf.check  # noqa: B018
     with pytest.raises(AttributeError, match=r"no attribute 'chek'$"):
         hf.chek  # noqa: B018
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_a_posterior_that_was_changed(tmp_path, generator, value):
+    """By an assignment to its arrays, of which nothing follows any more. Control: as it was."""
+    magnet = hf.halbach_ring(**RING)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    points = 0.02 * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    result = hf.infer(magnet, points, magnet.field_T(points) + generator.normal(0, 1e-4, (24, 3)),
+                      sigma_T=1e-4)
+    calls = [lambda: hf.multipoles(magnet, posterior=result),
+             lambda: hf.homogeneity(magnet, posterior=result), lambda: hf.shim(result, swaps=1),
+             lambda: hf.magnetic_axis(magnet, hf.Session.temporary(), result.posterior),
+             lambda: hf.write_report(result, tmp_path / "page")]
+    for call in calls[:1]:
+        call()
+    result.posterior.mean[:] = value
+    for call in calls:
+        with pytest.raises(hf.HalbachError, match="Was the array changed"):
+            call()
+
+
+def test_labelled_arrays(generator):
+    """Their labels say what is what, in any order. Control: labels that are missing are refused."""
+    ring = hf.halbach_ring(**RING)
+    points = 0.01 * generator.uniform(-1, 1, (4, 3)) * [1, 1, 0]
+    field = ring.field_T(points)
+    labelled = xr.DataArray(points, dims=("point", "component"), coords={
+        "component": ["x", "y", "z"]})
+    turned = labelled.sel(component=["z", "x", "y"])
+    for one in (labelled, labelled.T, turned, turned.T):
+        assert np.array_equal(ring.field_T(one), field)
+    read = xr.DataArray(field, dims=("point", "component"), coords={
+        "component": ["x", "y", "z"]})
+    for one in (read, read.T, read.sel(component=["z", "y", "x"])):
+        assert np.array_equal(hf.field_map(turned.T, one)["B_T"], field)
+        assert np.array_equal(hf.field_map(points, one, components=["y"])["B_T"][:, 1], field[:, 1])
+    for wrong in (read.sel(component=["x", "y"]), read.assign_attrs(units="mT")):
+        with pytest.raises(hf.HalbachError, match=r"labelled x, y, of which z|numbers in mT"):
+            hf.field_map(points, wrong)
+
+
+def test_a_table_that_was_written_and_read(tmp_path):
+    """By pandas, which reads outlines as text."""
+    prism = hf.magnet_of_blocks({
+        "shape": ["prism"], "x_m": [0.03], "y_m": [0.0], "z_m": [0.0], "size_z_m": [0.01],
+        "outline_m": [((0.0, 0.0), (0.02, 0.0), (0.0, 0.01))], "remanence_T": [1.3]})
+    path = hf.export(prism, tmp_path / "blocks.csv")
+    found = hf.magnet_of_blocks(pandas.read_csv(path))
+    assert found.field_T(POINTS) == pytest.approx(prism.field_T(POINTS), rel=1e-12)
+    with pytest.raises(hf.HalbachError, match="outline_m"):
+        hf.magnet_of_blocks(pandas.read_csv(path).assign(outline_m="0 0; 1"))
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1e-5, [1e-5, -1e-5]])
+def test_noise_that_is_none(sigma):
+    with pytest.raises(hf.HalbachError, match="sigma_T of field_map must be positive"):
+        hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)

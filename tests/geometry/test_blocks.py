@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
-from halbach_fe.core.errors import StudyError
+import halbach_fe as hf
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 
 SHAPES = {
@@ -98,3 +101,13 @@ def test_iron_and_blocks_are_material_air_is_not(short_dipole):
     points = np.array([[0, 0, 0], [0, 0.15, 0.0], [0, 0.195, 0.0], [0, 0.195, 0.06],
                        [0, 0.188, 0.0], [0, 0.15, 0.2]])
     assert build_magnet(study).contains(points).tolist() == [False, True, True, False, False, False]
+
+
+@pytest.mark.parametrize(("scale", "asked"), [(0.01, False), (0.8, False), (8.0, True)])
+def test_blocks_that_are_in_mm_are_asked_about(scale, asked):
+    """Blocks of 8 mm, of which 8 m were written."""
+    with pytest.warns(HalbachWarning, match="in mm") if asked else nullcontext():
+        hf.magnet_of_blocks({
+            "shape": ["cuboid", "cuboid"], "x_m": [-scale, scale], "y_m": [0.0, 0.0],
+            "z_m": [0.0, 0.0], "remanence_T": [1.3, 1.3]} | {
+                f"size_{axis}_m": [scale, scale] for axis in "xyz"})

@@ -65,15 +65,15 @@ def test_results_of_another_magnet(inferred, dipole, short_dipole, session):
     update, _ = inferred
     alike = build_magnet(dipole(array__remanence_T=1.07, array__recoil_permeability=1.0))
     larger = build_magnet(short_dipole(noise=NOISE, array__recoil_permeability=1.0))
-    known = {"posterior": update.posterior}
+    known, data = {"posterior": update.posterior}, field_map([[0, 0, 0]], [[0.1, 0, 0]])
     for use, said in (
         (lambda: multipoles(alike, session, posterior=update), "with another `array.remanence_T`"),
         (lambda: multipoles(larger, session, posterior=known), "96 parameters.*received 32"),
         (lambda: multipoles(alike, session, posterior="posterior.h5"), "received a str"),
         (lambda: homogeneity(larger, session, posterior=update), "another `dimension`"),
         (lambda: homogeneity(larger, session, posterior=known), "96 parameters"),
-        (lambda: infer(larger, None, session, prior=update.posterior), "96 parameters"),
-        (lambda: infer(alike, None, session, prior=np.zeros(32)), "a Gaussian.*a ndarray"),
+        (lambda: infer(larger, data, session, prior=update.posterior), "96 parameters"),
+        (lambda: infer(alike, data, session, prior=np.zeros(32)), "a Gaussian.*a ndarray"),
     ):
         with pytest.raises((MeasurementError, StudyError), match=said):
             use()

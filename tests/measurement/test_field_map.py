@@ -9,7 +9,7 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from halbach_fe.core.errors import MeasurementError, OutputError, StudyError
+from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.registration import register
 from halbach_fe.measurement.campaign import maps_of
@@ -23,7 +23,6 @@ from halbach_fe.measurement.field_map import (
 )
 from halbach_fe.measurement.map_check import check_map
 from halbach_fe.solver.session import Session
-from halbach_fe.study.free_blocks_file import write_free_blocks
 
 HEADER = "x_m,y_m,z_m,Bx_T,By_T,Bz_T\n"
 finite = st.floats(-9, 9, allow_nan=False)
@@ -182,7 +181,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match="No space left"):
         write_map(field_map(np.eye(3), np.zeros((3, 3))), path)
     assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
+    assert {one.name for one in tmp_path.iterdir()} == {path.name, ".hf.write_map.json"}
 
 
 def test_single_rows_that_are_no_readings():
@@ -199,20 +198,6 @@ def test_single_rows_that_are_no_readings():
         check_magnitudes(field_map(points, np.tile(tail[:, None], 3)))
 
 
-def test_another_table_is_not_replaced(tmp_path):
-    """A map replaces a map, and a table of blocks such a table, and neither the other."""
-    table, path = tmp_path / "blocks.csv", tmp_path / "map.csv"
-    data = field_map([[0.0, 0.0, 0.1]], [[0.1, 0.2, 0.3]])
-    blocks = {"name": ["a"], "shape": ["cuboid"], "remanence_T": [1.3]} | {
-        f"{axis}_m": [0.0] for axis in "xyz"} | {f"size_{axis}_m": [0.01] for axis in "xyz"}
-    for _ in range(2):
-        write_map(data, path)
-        write_free_blocks(blocks, table)
-    before = table.read_bytes(), path.read_bytes()
-    for write in (lambda: write_map(data, table), lambda: write_free_blocks(blocks, path)):
-        with pytest.raises(OutputError, match="which would be lost"):
-            write()
-    assert (table.read_bytes(), path.read_bytes()) == before
 
 
 def test_unknown_suffix_and_unwritable_folder(tmp_path):
@@ -267,7 +252,24 @@ def test_sigma_of_one_number_holds_for_all_components():
 def test_arguments_in_another_order(tmp_path):
     data = field_map([[0, 0, 0], [0, 0, 0.01]], [[0, 0.1, 0], [0, 0.2, 0]])
     write_map(data, tmp_path / "map.csv")
-    with pytest.raises(StudyError, match="path of write_map must be a path; instead received a Da"):
+    with pytest.raises(MeasurementError, match="data of write_map must be a Dataset; instead"):
         write_map(tmp_path / "map.csv", data)
     with pytest.raises(MeasurementError, match="must be arrays of numbers"):
         field_map("map.csv", data)
+
+
+def test_placeholders_and_copies(tmp_path):
+    """9999 is no field in gauss, and copies are no readings, whatever times are given to them."""
+    points = np.column_stack([np.zeros(21), np.zeros(21), 0.001 * np.arange(21)])
+    field = np.random.default_rng(1).normal(0.1, 0.01, (21, 3))
+    field[::7, 0] = 9999
+    with pytest.raises(MeasurementError, match=r"placeholder, one of 3 of 21 .* leave the cell"):
+        check_magnitudes(field_map(points, field))
+    field[::7, 0] = 3210.0
+    with pytest.raises(MeasurementError, match="Are they in gauss"):
+        check_magnitudes(field_map(points, field))
+    field[::7, 0] = 0.1
+    write_map(field_map(np.tile(points, (2, 1)), np.tile(field, (2, 1))), tmp_path / "map.csv")
+    with pytest.raises(MeasurementError, match=r"Remove them: what is read again differs") as said:
+        read_map(tmp_path / "map.csv")
+    assert "time_s" not in str(said.value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from contextlib import nullcontext
 from time import process_time
 
@@ -89,6 +90,10 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + "0 0.1 0\n" * 45, "OPAL.*skip-lines 4"),
     ("2 0.02\n2 -0.01 0.01\n2 -0.01 0.01\n1\n" + "0.1\n" * 27, "TraceWin.*x changes fastest"),
     ("x[m] y[m] z[m] mf.Bx[T]\n" + "0 0 1 0.1+0i\n" * 2, r"real\(mf.Bx\)"),
+    (HEADER + "10,0,0,0.1+0.0i,0+0i,0.2+0i\n" * 2, "Write real parts alone"),
+    ("x[mm],y[mm],z[mm],dB [ppm]\n0,0,0,12\n", r"\(1 \+ ppm / 1e6\) times"),
+    (HEADER.replace("mm", "ft") + "1,0,0,1,0,0\n" * 2, r"the unit of x, y, z, .*x\[N m\], with"),
+    (HEADER + "1,5,2,0,3,0,0,1,0,2,0,3\n" * 2, "decimal commas too, write the file anew"),
     ("x_mm,y_mm,z_mm,component,B_mT\n0,0,0,x,1\n0,0,0,y,2\n", "pivot table"),
     ("x[mm],-1,0,1\ny[mm],0,0,0\nBx[T],1,2,3\n", "a row of its own, make it a column"),
     ("\n".join(" ".join(str(n * m % 7) for m in range(40)) for n in range(6)), "row of its own"),
@@ -292,3 +297,52 @@ def test_positions_of_another_length(tmp_path):
         positions.write_text(text)
         with pytest.raises(MeasurementError, match=asked):
             import_map(path, DeclaredFormat(positions=positions))
+
+
+def carried_out(path, sentence):
+    """Run the command that a sentence advises, from FILE to NEW; return the path of NEW."""
+    (command,) = re.findall(r": (.* NEW)\.", sentence)
+    new = path.with_name("new.txt")
+    subprocess.run(["sh", "-c", re.sub(r"\bFILE\b", str(path), command).replace("NEW", str(new))],
+                   check=True)
+    return new
+
+
+def without_letter(value):
+    """Return a number as programs of old print it: 1.23450-05."""
+    return f"{value:.9e}".replace("e", "")
+
+
+def over_lines(number, separator=" "):
+    """Return the rows of `table` with a new line after every so many numbers."""
+    rows = [row.split(separator) for row in table(separator, number="{:.9f}").splitlines()]
+    return "".join(separator.join(row[n:n + number]) + "\n"
+                   for row in rows for n in range(0, len(row), number))
+
+
+@pytest.mark.parametrize(("text", "columns"), [
+    (HEADER + "".join(",".join(map(without_letter, row)) + "\n"
+                      for row in np.column_stack(mm_T())), False),
+    (over_lines(3), True), (over_lines(2, ","), True), (over_lines(4, ","), True),
+    ("# of Tuesday\n" + over_lines(3, "\t"), True),
+    ("# " + HEADER + over_lines(4, ","), False)])
+def test_commands_that_are_advised_work(tmp_path, text, columns):
+    """Numbers without the letter of their exponent, and readings of several lines."""
+    path = tmp_path / "file.txt"
+    path.write_text(text)
+    stated = DeclaredFormat() if not columns else DeclaredFormat(
+        columns=("x", "y", "z", "Bx", "By", "Bz"), length_unit="mm", field_unit="T")
+    with pytest.raises(MeasurementError) as caught:
+        import_map(path, stated)
+    assert same(import_map(carried_out(path, str(caught.value)), stated).data)
+
+
+@pytest.mark.parametrize("text", [
+    HEADER + table(",") + "1,2,3,4\n5,6\n",  # cut short, not spread
+    HEADER + table(",").replace("10,10,10,", "10,10,10,,", 1)])
+def test_rows_of_other_lengths_are_not_spread(tmp_path, text):
+    """Control: their advice is another."""
+    path = tmp_path / "file.txt"
+    path.write_text(text)
+    with pytest.raises(MeasurementError, match="cut short"):
+        import_map(path, DeclaredFormat())

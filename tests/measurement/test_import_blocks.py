@@ -153,6 +153,40 @@ def test_free_blocks_without_names_and_with_edges_of_own_names(tmp_path):
     assert found.remanence_z_T == (0.0, 0.1)
 
 
+MEASURED = "serial,type,moment_x{0},moment_y{0},moment_z{0},sigma{0}{1}\n{2}a,1,1,0,0,0.001,{3}\n"
+
+
+@pytest.mark.parametrize(("text", "asked"), [
+    (MEASURED.format("[A m^2]", ",temperature[F]", "", "68"), "the unit of temperature.* not 'F'"),
+    (MEASURED.format("[A m^2]", ",temp (degF)", "", "68"), "the unit of temperature.* not 'degF'"),
+    (MEASURED.format("", ",volume[cm^3]", "", "1"),
+     r"the unit of moment_x, moment_y, moment_z, sigma \(one of Am\^2"),
+    ("x,y,z,size_x,size_y,size_z,Br[T]\n0,0,0,10,10,10,1.3\n",
+     r"the unit of at_x, at_y, at_z, size_x, size_y, size_z \(one of m, .*: --length-unit"),
+    ("serial,type,jx[T],jy[T],jz[T],sigma[%],volume[cm^3]\na,1,1300,0,0,0.1,1\n",
+     "polarization in line 2 .* below 10 T; .* 1300 T"),
+    ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,0,0,0.1,1\n",
+     "moment in line 2 .* below 10 T"),
+    ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,0,0,0.1,0\n",
+     "volume_m3 of block a .* must be positive"),
+    ("r[mm],phi[deg],z[mm],Br[T]\n9,0,0,1.3\n", r"x of each .*\(x = r cos\(phi\)"),
+    ("x[m],y[m],z[m],shape,size_x[m],size_y[m],size_z[m],Br[T],angle[deg]\n"
+     "0,0,0,cuboid,0.01,0.01,0.01,1.3,45\n", "direction of the magnetization as a rotation")])
+def test_what_a_table_does_not_say(tmp_path, text, asked):
+    """A temperature in °F was read as one in °C."""
+    with pytest.raises(MeasurementError, match=asked):
+        imported(tmp_path, text)
+
+
+def test_units_below_the_names(tmp_path):
+    """As of maps. Control: the same numbers in another unit."""
+    units = ",,{0},{0},{0},{0},C\n"
+    for unit, moment in (("A m^2", 1.0), ("mA m^2", 1e-3)):
+        found = imported(tmp_path, MEASURED.format("", ",temp", units.format(unit), "25"))
+        assert found.moment.tolist() == [[pytest.approx(moment), 0, 0]]
+        assert found.temperature.tolist() == [25.0]
+
+
 def test_columns_that_are_not_read_are_named(tmp_path):
     row = "Br [mT];{}\nb;cuboid;0;0;0;0;0;0;10;20;30;1300;{}\n"
     with pytest.warns(HalbachWarning, match="are not read: colour, temperature, volume. Free"):

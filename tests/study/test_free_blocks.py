@@ -53,6 +53,7 @@ def test_every_shape_needs_its_own_sizes_and_no_others(shape):
     ({"x_m": [0.0]}, "column x_m has 1 rows, and there are 2 names"),
     ({"z_m": None}, "there is no column z_m: add it"),
     ({"shape": None}, "there is no column shape: add it"),
+    ({"x_m": [None, None]}, "column x_m has no value: give it, as every block needs name"),
     ({"shape": ["cuboid", "sphere"]}, "'cuboid', 'sector'"),
     ({"ring": [1, 1]}, "ring and slot together"),
     ({"ring": [1, 1], "slot": [2, 2]}, r"ring and slot must be unique.*\(1, 2\) occurs twice"),

@@ -73,6 +73,9 @@ KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys
     f"{name}_{axis}": kind for axis in COMPONENTS for name, kind in (
         ("at", "length"), ("size", "length"), ("rotation", "angle"), *VECTORS.items())} | VECTORS
 """Kinds of the units of quantities that have one."""
+KELVIN = ("K", "kelvin")
+TEMPERATURES = ("C", "\u00b0C", "degC", "Celsius", "celsius", *KELVIN)
+"""Units of temperatures; C if none is stated."""
 QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
 
 
@@ -164,29 +167,58 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         one.count(mark) for mark in ",;\t")), declared)
     rows = [(number, cells_of(uncommented(line) if is_comment(line) else line, delimiter),
              is_comment(line)) for number, line in lines]
-    start = next((n for n, (_, cells, _) in enumerate(rows) if _names(cells)), None)
-    if start is None and declared.columns:
-        start = -1
-    if start is None:
+    start = next((n for n, (_, cells, _) in enumerate(rows) if _names(cells)), -1)
+    own = rows[start][1] if start >= 0 else []
+    body = [(number, cells) for number, cells, comment in rows[start + 1:] if not comment]
+    below = [cell.strip("[]() ") for cell in body[0][1]] if body else []
+    if names.is_units(["" if unit in TEMPERATURES else unit for unit in below]):
+        body = body[1:]
+    else:
+        below = []
+    header = _header(own, below, declared, where)
+    for number, cells in body:
+        if len(cells) != len(header):
+            raise MeasurementError(must_be(f"line {number}", where, f"of {len(header)} cells, as "
+                                           "the header", str(len(cells))))
+    if not body:
+        raise MeasurementError(must_be("content", where, "at least one block", "none"))
+    table, unit = _columns(header, [cells for _, cells in body], declared, where)
+    unknown = [] if declared.columns else [
+        text.strip() for text, (name, _) in zip(own, header, strict=False)
+        if not name and text.strip()]
+    return _Table(table, _with_stated(unit, declared, where), tuple(number for number, _ in body),
+                  where, declared.decimal_comma, tuple(unknown))
+
+
+def _header(
+    own: Sequence[str], below: Sequence[str], declared: DeclaredBlocks, where: str
+) -> list[tuple[str, str]]:
+    """Return the quantity and the unit of each column, empty texts if they are not known.
+
+    The table has its ``own`` names, or none, and units ``below`` them, or none; those of the user
+    take their place, but what they leave open the table says.
+    """
+    if not own and not declared.columns:
         raise MeasurementError(must_be("header", where, f"made of {', '.join(QUANTITIES)}",
                                        "no line that names two of them",
                                        "State the columns by --columns."))
-    header = [quantity_of(text) if text != "-" else ("", "")
-              for text in declared.columns or rows[start][1]]
+    header = [quantity_of(text) if text != "-" else ("", "") for text in declared.columns or own]
     if unknown := [text for text, (name, _) in zip(declared.columns, header, strict=False)
                    if text != "-" and not name]:
         raise MeasurementError(must_be("--columns", where, f"made of {', '.join(QUANTITIES)} and -",
                                        f"'{unknown[0]}'"))
-    if declared.columns and start >= 0 and len(rows[start][1]) == len(header):
-        header = [(name, said or names.split_unit(own)[1].strip())  # the unit of the table holds
-                  for (name, said), own in zip(header, rows[start][1], strict=True)]
-    body = [row for row in rows[start + 1:] if not row[2]]
-    for number, row, _ in body:
-        if len(row) != len(header):
-            raise MeasurementError(must_be(f"line {number}", where, f"of {len(header)} cells, as "
-                                           "the header", str(len(row))))
-    if not body:
-        raise MeasurementError(must_be("content", where, "at least one block", "none"))
+    for said in ([names.split_unit(text)[1].strip() for text in own], below):
+        if len(said) == len(header):
+            header = [(name, unit or other)
+                      for (name, unit), other in zip(header, said, strict=True)]
+    return header
+
+
+def _columns(
+    header: Sequence[tuple[str, str]], body: Sequence[Sequence[str]], declared: DeclaredBlocks,
+    where: str
+) -> tuple[dict[str, list[str]], dict[str, str]]:
+    """Return cells and unit of each quantity, of the table or as the user states for all blocks."""
     cells: dict[str, list[str]] = {}
     unit: dict[str, str] = {}
     for column, (name, said) in enumerate(header):
@@ -194,7 +226,7 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
             raise MeasurementError(must_be("header", where, f"with one column {name}", "two",
                                            "Choose one with --columns; - ignores a column."))
         if name:
-            cells[name], unit[name] = [one[1][column] for one in body], said
+            cells[name], unit[name] = [row[column] for row in body], said
     for name, text in declared.fixed.items():
         if name in cells:
             raise MeasurementError(must_be(
@@ -204,22 +236,24 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         value = value.replace(".", ",") if declared.decimal_comma else value
         cells[name] = [value if name in KIND or name == "temperature" else text] * len(body)
         unit[name] = said
-    kinds = {"length": declared.length_unit, "field": declared.field_unit,
-             "angle": declared.angle_unit}
-    for kind, said in kinds.items():
+    return cells, unit
+
+
+def _with_stated(
+    unit: dict[str, str], declared: DeclaredBlocks, where: str
+) -> dict[str, str]:
+    """Return the units by their symbols, those that the user states of a kind where none is."""
+    stated = {"length": declared.length_unit, "field": declared.field_unit,
+              "angle": declared.angle_unit}
+    for kind, said in stated.items():
         own = {units.unit_symbol(one) or one for name, one in unit.items()
                if KIND.get(name) == kind}
         if said and "" not in own and own != {units.unit_symbol(said) or said}:
             raise MeasurementError(must_be(
                 f"--{kind}-unit", where, "of a column that does not state its unit itself",
                 f"'{said}', which no column needs", "Leave it out."))
-    for name in unit:
-        unit[name] = units.unit_symbol(unit[name]) or (
-            unit[name] if unit[name] else kinds.get(KIND.get(name, ""), ""))
-    unknown = [text.strip() for text, (name, _) in zip(rows[start][1], header, strict=False)
-               if not name and text.strip()] if start >= 0 and not declared.columns else []
-    return _Table(cells, unit, tuple(one[0] for one in body), where, declared.decimal_comma,
-                  tuple(unknown))
+    return {name: units.unit_symbol(said) or said or stated.get(KIND.get(name, ""), "")
+            for name, said in unit.items()}
 
 
 def _names(cells: Sequence[str]) -> bool:
@@ -261,34 +295,49 @@ def _strength(table: _Table) -> str:
 
 def _missing(table: _Table, free: bool) -> list[str]:
     """Return what the table does not say."""
-    missing = []
-    if "serial" not in table and not free:
-        missing.append("the serial or name of each block (a column serial)")
     strength = _strength(table)
-    if not strength and "material" not in table:
-        missing.append("its strength (columns moment_x, moment_y, moment_z, or polarization_x ..., "
-                       "or magnetization_x ...)")
-    if free:
-        missing += [f"{axis} of each block (a column at_{axis})" for axis in COMPONENTS
-                    if f"at_{axis}" not in table]
-        if "shape" not in table:
-            missing.append(f"the shape (--fixed shape=cuboid, or one of {', '.join(SIZES)})")
-    else:
-        if "sigma" not in table:
-            missing.append("the standard deviation of a moment (a column sigma, or --fixed "
-                           "'sigma=0.001 A m^2' or 'sigma=0.2 %')")
-        if "type" not in table and not {"ring", "slot"} <= set(table.cells):
-            missing.append("ring and slot, or the type of the blocks (--fixed type=1)")
     sizes = all(f"size_{axis}" in table for axis in COMPONENTS)
-    if strength and (strength == "moment") == free and "volume" not in table and not sizes:
-        missing.append("the volume (a column, or --fixed 'volume=12 cm^3')")
+    of_moment = strength == "moment"
+    polar = "at_x" not in table and any(
+        names.parse(text).quantity in ("r", "phi") for text in table.unknown)
+    places = [f"at_{axis}" for axis in COMPONENTS if f"at_{axis}" not in table]
+    wanted = [
+        (not free and "serial" not in table,
+         "the serial or name of each block (a column serial)"),
+        (not strength and "material" not in table,
+         "its strength (columns moment_x, moment_y, moment_z, or polarization_x ..., or "
+         "magnetization_x ...)"),
+        *((free, f"{name[-1]} of each block (a column {name})") for name in places),
+        (free and polar, "x and y of its angle (x = r cos(phi), y = r sin(phi))"),
+        (free and "shape" not in table,
+         f"the shape (--fixed shape=cuboid, or one of {', '.join(SIZES)})"),
+        (not free and "sigma" not in table,
+         "the standard deviation of a moment (a column sigma, or --fixed 'sigma=0.001 A m^2' or "
+         "'sigma=0.2 %')"),
+        (not free and "type" not in table and not {"ring", "slot"} <= set(table.cells),
+         "ring and slot, or the type of the blocks (--fixed type=1)"),
+        (bool(strength) and of_moment == free and "volume" not in table and not sizes,
+         "the volume (a column, or --fixed 'volume=12 cm^3')")]
+    return [text for lacks, text in wanted if lacks] + _without_unit(table)
+
+
+def _without_unit(table: _Table) -> list[str]:
+    """Return which quantities have no unit, or one that is not known."""
+    of: dict[tuple[str, str], list[str]] = {}
     for name, unit in table.unit.items():
-        kind = KIND.get(name)
-        if kind and units.kind_of(unit) != kind and not (name == "sigma" and unit in (
+        kind = KIND.get(name, "")
+        if name == "temperature":
+            if unit and unit not in TEMPERATURES:
+                of.setdefault((name, unit), []).append(name)
+        elif kind and units.kind_of(unit) != kind and not (name == "sigma" and unit in (
                 "%", *units.FIELDS)):
-            missing.append(f"the unit of {name} (one of {', '.join(units.KINDS[kind])}"
-                           + (f", not '{unit[:20]}')" if unit else ")"))
-    return missing
+            of.setdefault((kind, unit), []).append(name)
+    return [f"the unit of {', '.join(named)} (one of "
+            f"{', '.join(TEMPERATURES if kind == 'temperature' else units.KINDS[kind])}"
+            + (f", not '{unit[:20]}'" if unit else "")
+            + (f": --{kind}-unit, or in the header)" if kind in ("length", "field", "angle")
+               and not unit else ")")
+            for (kind, unit), named in of.items()]
 
 
 def _unread(table: _Table, free: bool) -> list[str]:
@@ -332,6 +381,8 @@ def _measured_blocks(
     vectors = _turned(table.vector(strength), declared.axes)
     volume = _volume(table)
     moment = vectors if strength == "moment" else vectors * (volume / MU_0)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # zero is refused below
+        _check_strength(moment * (MU_0 / volume)[:, None], strength, table)
     if table.unit["sigma"] == "%":
         sigma = np.array([_number(cell, "sigma", line, table) for cell, line in zip(
             table.cells["sigma"], table.lines, strict=True)])
@@ -345,11 +396,23 @@ def _measured_blocks(
                              for cell, line in zip(table.cells[name], table.lines, strict=True)])
              if name in table else np.zeros(count, int) for name in ("ring", "slot")}
     temperature = table.si("temperature") if "temperature" in table else np.full(count, np.nan)
-    if table.unit.get("temperature") in ("K", "kelvin"):
+    if table.unit.get("temperature") in KELVIN:
         temperature = temperature - 273.15
     return BlockTable(tuple(table.cells["serial"]), tuple(table.cells.get("type", [""] * count)),
                       place["ring"], place["slot"], moment, sigma, volume, temperature,
                       dict(attributes), table.where)
+
+
+def _check_strength(polarization: Floats, strength: str, table: _Table) -> None:
+    """Raise MeasurementError for polarizations (n, 3) in T that no magnet has; NaN is unknown."""
+    most_T = 10.0  # no material has a quarter of it, and mT or kG taken for T are beyond
+    size = np.nan_to_num(np.linalg.norm(polarization, axis=1))
+    if (size > most_T).any():
+        row = int(np.argmax(size > most_T))
+        raise MeasurementError(must_be(
+            f"{strength} in line {table.lines[row]}", table.where,
+            f"a polarization below {most_T:g} T", f"one of {size[row]:.4g} T",
+            "Are the units of its columns, and of the volume, right?"))
 
 
 def _whole(cell: str, name: str, line: int, table: _Table) -> int:

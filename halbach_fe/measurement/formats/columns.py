@@ -37,6 +37,7 @@ from halbach_fe.measurement.formats.text import (
     comments_of,
     delimiter_of,
     is_comment,
+    joining,
     lines_of,
     numbers_among,
     rows_of,
@@ -90,8 +91,11 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
              for number, line in lines]
     try:
         start = _first_numbers(lines, declared, where)
-    except MeasurementError:  # unless the numbers of all rows run together
-        start = _first_numbers(apart, declared, where)
+    except MeasurementError as error:  # unless the numbers of all rows run together
+        try:
+            start = _first_numbers(apart, declared, where)
+        except MeasurementError:
+            raise error from None
         lines = apart
     if delimiter_of(lines[start][1], declared) is None:
         while start and _are_alike(apart[start - 1][1], apart[start][1]) and (
@@ -123,6 +127,11 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     values = _without_empty_end(values, texts, lines[:start], delimiter)
     count = values.shape[1]
     _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
+    named = [text for text in declared.columns if text != "-"]
+    if (apart := len(named) // count) > 1 and len(declared.columns) == apart * count:
+        raise MeasurementError(must_be(
+            "--columns", where, f"of {count} columns, as the file has", len(declared.columns),
+            joining(apart, body[0][0], delimiter) + " Else name each column; - ignores a column."))
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
     own = {column.text for column in columns} <= OWN_COLUMNS
     stated = [names.parse(text, stated=True) for text in declared.columns] or columns
@@ -390,4 +399,6 @@ def _refuse_other_length(
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",
                 str(len(cells)), "State what separates them by --delimiter, correct the header, or "
-                "state the columns: --columns NAME,NAME,... takes its place."))
+                "state the columns: --columns NAME,NAME,... takes its place."
+                + (" If commas are decimal commas too, write the file anew with semicolons."
+                   if delimiter == "," and count > len(cells) else "")))

@@ -18,9 +18,9 @@ from halbach_fe.measurement.field_map import (
     check_readings,
     doubt_of_metres,
     read_map,
+    save_map,
     warn_of_left_out,
     warn_of_millimetres,
-    write_map,
 )
 from halbach_fe.measurement.formats import (
     bdsim,
@@ -215,7 +215,7 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
         raise OutputError(must_be("suffix", f"output {path}", f"one of text, as {name} is",
                                   f"'{path.suffix}', that of another format"))
     if name not in GRIDS:
-        write_map(data, path)
+        save_map(data, path)
         return
     where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
     content = GRIDS[name](grid_of(data, where))

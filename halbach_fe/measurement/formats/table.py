@@ -6,7 +6,6 @@ all missing statements and the options that provide them.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +15,13 @@ import xarray as xr
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import in_a_row
-from halbach_fe.measurement.field_map import MAX_FIELD_T, field_map, undirected, with_total_field
+from halbach_fe.measurement.field_map import (
+    MAX_FIELD_T,
+    field_map,
+    is_placeholder,
+    undirected,
+    with_total_field,
+)
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import UNKNOWN, DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
@@ -139,6 +144,12 @@ def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
         points = points + declared.origin_m
     total = si.get(names.TOTAL, np.full(count, np.nan))
     read = ~(np.isnan(flux_density).all(axis=1) & np.isnan(total))
+    if not read.any():
+        empty = _quoted([columns[used[name]].text or name for name in used
+                         if name in (*names.FIELDS, names.TOTAL)])
+        raise MeasurementError(must_be(
+            "content", table.where, "at least one reading",
+            f"{count} rows without a number in {empty}" if count else "none"))
     data = _checked(points[read], flux_density[read], total[read], table.where)
     noise = _noise(si, used, table, columns)
     if noise is not None and not np.isnan(flux_density).all():
@@ -189,11 +200,12 @@ def _refuse_placeholder(values: Floats, name: str, where: str) -> None:
     size = np.nan_to_num(np.abs(values))
     row = int(np.argmax(size))
     far_above = 3.0  # times the next largest number, from which one of nines alone is no reading
-    nines = name.startswith("B") and re.fullmatch(r"9{3,}(\.9*)?", f"{size[row]:.12g}")
+    nines = name.startswith("B") and is_placeholder(float(size[row]))
     if size[row] > MAX_NUMBER or (nines and size[row] > far_above * max(
             size[size < size[row]], default=size[row])):
         raise MeasurementError(must_be(
-            f"{name} of reading {row + 1}", where, f"a reading, below {MAX_NUMBER:g}",
+            f"{name} of reading {row + 1}", where,
+            "a reading" if nines else f"a reading, below {MAX_NUMBER:g}",
             f"{values[row]:g}, which looks like a placeholder", PLACEHOLDER))
 
 
@@ -523,7 +535,8 @@ def _missing(
                        + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
                           if others else "")
                        + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "")
-                       + (f"; {PPM}" if any("ppm" in text.lower() for text in others) else "")
+                       + (f"; {PPM}" if any("ppm" in column.text.lower() for column in columns)
+                          else "")
                        + ")")
     whole = ["Br", *(["Btheta"] if spherical else []), "Bphi"]
     half = [name for name in whole if name not in used]
@@ -607,6 +620,7 @@ def _units(
     """
     found: dict[str, str] = {}
     unknown = []
+    foreign: dict[str, list[str]] = {}
     option = {"length": declared.length_unit, "field": declared.field_unit,
               "angle": declared.angle_unit, "time": ""}[kind]
     common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
@@ -628,11 +642,7 @@ def _units(
         unit = text if kind == "time" and text in units.TIMES else units.unit_symbol(text)
         if not units.states_no_unit(text) and (not unit or (
                 kind != "time" and units.kind_of(unit) != kind)):
-            stated = next(iter(units.KINDS[kind]))
-            if units.unit_symbol(f"{text} {stated}"):  # a factor
-                stated = f"{text} {stated}"
-            missing.append(f"the unit of {name}, as '{text[:20]}' is none of "
-                           f"{', '.join(units.KINDS[kind])} (--columns ...{name}[{stated}])")
+            foreign.setdefault(text, []).append(name)
             continue
         if unit and option and unit != option and name not in names.NOISE:
             raise _contradiction(table, f"unit of {name}", unit, f"--{kind}-unit {option}")
@@ -642,9 +652,23 @@ def _units(
             found[name] = unit or (of if name in names.NOISE else "") or option
         else:
             unknown.append(name)
+    missing += [f"the unit of {', '.join(of)}, as '{text[:20]}' is none of "
+                f"{', '.join(units.KINDS[kind])} (--columns ...{of[0]}[{_stated(text, kind)})"
+                for text, of in foreign.items()]
     if unknown:
         missing.append(f"the unit of {', '.join(unknown)} ({OPTIONS[kind]})")
     return found
+
+
+def _stated(text: str, kind: str) -> str:
+    """Return how to state a unit in place of another ``text``, which may be a factor, with the
+    bracket that ends it.
+    """
+    one = next(iter(units.KINDS[kind]))
+    if units.unit_symbol(f"{text} {one}"):
+        return f"{text} {one}]"
+    return f"{one}]" if kind in ("time", "angle") else (
+        f"N {one}], with the size N of this unit in {one}")
 
 
 def _kind(name: str) -> str:
@@ -722,8 +746,6 @@ def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) ->
     MeasurementError
         If values are too large for a permanent magnet.
     """
-    if not len(points):
-        raise MeasurementError(must_be("content", where, "at least one reading", "none"))
     largest = float(np.nanmax(np.abs(np.column_stack([flux_density, total]))))
     farthest = float(np.abs(points).max())
     if not largest <= MAX_FIELD_T:

@@ -45,6 +45,9 @@ COMPLEX = re.compile(r"[-+]?[\d.]+([eE][-+]?\d+)?[-+][\d.]+([eE][-+]?\d+)?\s*\*?
 MAX_COMMENTS = 2000
 """Largest number of characters of comments that are kept."""
 
+MOST_LINES = 4
+"""Most lines of a file over which a reading is looked for."""
+
 Line = tuple[int, str]
 """Number, from 1, and text of a line."""
 
@@ -244,9 +247,10 @@ def rows_of(
             continue
         cells = cells_of(line, delimiter)
         if len(cells) != columns:
+            joined = _joined(lines, delimiter) if len(rows) == 1 else ""
             raise MeasurementError(must_be(
                 f"line {position}", where, f"{columns} values", str(len(cells)),
-                "Is the file cut short? Else remove the line, or begin it with #"
+                joined or "Is the file cut short? Else remove the line, or begin it with #"
                 + ("." if position == lines[-1][0] else
                    f"; if the table begins below it, add --skip-lines {position}, if with it, "
                    f"--skip-lines {position - 1}; if cells are separated otherwise, "
@@ -261,11 +265,32 @@ def rows_of(
     return np.array(rows), texts
 
 
+def _joined(lines: Sequence[Line], delimiter: str | None) -> str:
+    """Return what to do if rows of some lengths follow each other again and again, else ""."""
+    lengths = [len(cells_of(text, delimiter)) for _, text in lines[:3 * MOST_LINES]
+               if not is_comment(text)]
+    period = next((n for n in range(2, MOST_LINES + 1)
+                   if len(lengths) >= 2 * n and lengths == (lengths[:n] * len(lengths))[
+                       :len(lengths)]), 0)
+    return joining(period, lines[0][0], delimiter) if period else ""
+
+
+def joining(lines: int, first: int, delimiter: str | None) -> str:
+    """Return what to do with readings of several lines each; line ``first`` begins the table."""
+    mark = {None: " ", "\t": r"\t"}.get(delimiter, delimiter)
+    above = f"(head -n {first - 1} FILE; tail -n +{first} FILE | " if first > 1 else ""
+    return (f"If each reading stands in {lines} lines, join them: {above}paste -d '{mark}' "
+            f"{' '.join('-' * lines)}{') > NEW' if above else ' < FILE > NEW'}.")
+
+
 def comma_hint(cell: str) -> str:
     """Return what to do with a cell that is nearly a number, else an empty string."""
     cell = cell.strip()
     if len(cell) > MAX_CELL:
         return ""
+    if re.fullmatch(r"[-+]?(\d+\.\d*|\.\d+)[-+]\d{1,3}", cell):
+        return (r"Write exponents with their letter, as in 1.2e-05: sed -E "
+                r"'s/([0-9.])([-+][0-9])/\1e\2/g' FILE > NEW.")
     if re.fullmatch(r"[-+]?[\d.'\u2019\u00a0\u2009\u202f]*,\d+([eE][-+]?\d+)?", cell):
         return "If its comma is a decimal comma, add --decimal-comma."
     if re.fullmatch(r"[-+\d.,eE]+\s*(\u00b1|\+/?-).*", cell):

@@ -1,0 +1,89 @@
+"""Every public function refuses arguments of other kinds by a sentence, before it works."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+import halbach_fe as hf
+from halbach_fe.core.arguments import typed
+
+FUNCTIONS = [name for name in hf.__all__ if not inspect.isclass(getattr(hf, name))]
+WRONG = (object(), 1j, b"bytes", int)
+"""What no argument is, but for those of `ANYTHING`; a class is taken where a function is."""
+ANYTHING = {("write_report", "result"), ("field_map", "points_m"), ("field_map", "B_T"),
+            ("field_map", "sigma_T"), ("from_magpylib", "sources")}
+"""Arguments that are looked at by the functions themselves."""
+RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
+
+
+@pytest.fixture(scope="module")
+def known():
+    """What the arguments of all functions are, by their names."""
+    ring = hf.halbach_ring(**RING)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    points = 0.02 * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    data = hf.field_map(points, ring.field_T(points) + 1e-5, sigma_T=1e-4)
+    result = hf.infer(ring, data)
+    return RING | {
+        "magnet": ring, "study": ring.study, "data": data, "result": result,
+        "session": hf.Session.temporary(), "magnetizations": result.posterior,
+        "points_m": points, "B_T": points, "lines": hf.Lines((0, 0, 0), (0.01, 0, 0), count=3),
+        "maps": {"a": data}, "content": data, "path": "file", "folder": "folder",
+        "folders": ["folder"], "output": "page.html", "sources": [], "posterior": result,
+        "table": {"name": ["a"]}, "blocks": hf.BlockTable(
+            ("a",), ("1",), np.zeros(1, int), np.zeros(1, int), np.ones((1, 3)), np.ones(1),
+            np.ones(1), np.ones(1), {}, "table")}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_arguments_of_other_kinds(name, known, tmp_path, monkeypatch):
+    """Unknown ones too, and missing ones."""
+    monkeypatch.chdir(tmp_path)
+    function = getattr(hf, name)
+    named = [one for one in inspect.signature(function).parameters.values()
+             if one.kind is not one.VAR_KEYWORD]
+    right = {one.name: 8 if name == "halbach_ring" and one.name == "blocks" else known[one.name]
+             for one in named if one.default is one.empty}
+    with pytest.raises(hf.HalbachError, match="nonsense"):
+        function(**right, nonsense=1)
+    if right:
+        with pytest.raises(hf.HalbachError, match="missing"):
+            function()
+    for one in named:
+        for wrong in WRONG:
+            if (name, one.name) in ANYTHING or (
+                    callable(wrong) and one.name in ("say", "progress")):
+                continue
+            with pytest.raises(hf.HalbachError, match=one.name):
+                function(**right | {one.name: wrong})
+    assert not list(tmp_path.iterdir())
+
+
+@typed
+def sample(number: float = 1.0, flag: bool = False, names: tuple[str, ...] = (),
+           several: list[int] | None = None) -> str:
+    return "taken"
+
+
+@pytest.mark.parametrize("right", [
+    {"number": 2}, {"number": np.float32(2)}, {"number": np.array(2.0)}, {"flag": np.True_},
+    {"names": ["a"]}, {"names": ("a", "b")}, {"names": {"a": 1}.keys()}, {"several": None},
+    {"several": np.arange(3)}, {"several": range(3)}])
+def test_what_is_taken(right):
+    """The control: numbers of numpy, and lists of any kind."""
+    assert sample(**right) == "taken"
+
+
+@pytest.mark.parametrize(("wrong", "said"), [
+    ({"number": "2 mm"}, "number of sample must be a number; instead received '2 mm'"),
+    ({"number": True}, "instead received True"), ({"number": None}, "a NoneType"),
+    ({"number": 10**400}, "must be a number"), ({"number": np.ones(2)}, "a ndarray"),
+    ({"flag": 1}, "must be True or False; instead received 1"), ({"names": [1]}, "a list"),
+    ({"names": 3}, "must be a list"), ({"several": {"a": 1}}, "must be a list; .* a dict"),
+    ({"several": ["a"]}, "must be a list")])
+def test_what_is_not_taken(wrong, said):
+    with pytest.raises(hf.HalbachError, match=said):
+        sample(**wrong)
