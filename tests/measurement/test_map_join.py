@@ -19,7 +19,7 @@ from halbach_fe.measurement.field_map import field_map, points_of, read_map, wri
 from halbach_fe.measurement.harmonic_field import Charges
 from halbach_fe.measurement.joined_probe import JoinedModel, Pose
 from halbach_fe.measurement.map_check import InstrumentTerm, scan_of
-from halbach_fe.measurement.map_join import join_checked, join_maps
+from halbach_fe.measurement.map_join import join_checked, join_maps, read_joined
 from halbach_fe.report.map_check import joined_answer as answer
 from halbach_fe.report.map_check import joined_sentences as sentences
 from tests.support.joined_campaigns import (
@@ -248,6 +248,10 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     assert summary["agree"]
     assert np.array(summary["covariance"]).shape == (6, 6)
     (pose,) = summary["poses"]
+    frame, (again,) = read_joined(out / "joined.json")
+    assert (frame, again.name) == ("part0", "part1")
+    np.testing.assert_allclose(again.translation_m, pose["translation_m"], atol=1e-15)
+    np.testing.assert_array_equal(again.shift_sd_m, pose["shift_sd_m"])
     turn = Rotation.from_rotvec(pose["rotation_rad"]).as_matrix()
     written = read_map(out / "joined.csv")
     count = maps["part0"].sizes["point"]
