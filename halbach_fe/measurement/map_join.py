@@ -237,21 +237,24 @@ def read_joined(path: Path) -> tuple[str, tuple[MapPose, ...]]:
     MeasurementError
         If the file is no joined.json of `halbach-fe check MAP MAP`.
     """
-    where, wanted = "joined maps", "a joined.json that `halbach-fe check MAP MAP` wrote"
+    raw = file_bytes(path, f"file {path}")
     try:
-        found = json.loads(file_bytes(path, where))
+        found = json.loads(raw)
         poses = tuple(MapPose(str(one["name"]), *(np.array(one[key], float) for key in (
             "middle_m", "shift_m", "shift_sd_m", "rotation_rad", "rotation_sd_rad")),
             int(one["sign"])) for one in found["poses"])
         numbers = np.array([list(vars(one).values())[1:-1] for one in poses], float)
         bars = numbers[:, [2, 4]] if numbers.shape[1:] == (5, 3) else np.zeros(1)
-        if not np.isfinite(numbers).all() or not (bars > 0).all():
+        names = [str(found["frame"]), *(one.name for one in poses)]
+        if not np.isfinite(numbers).all() or not (bars > 0).all() or not all(
+                name.isprintable() for name in names):
             raise ValueError
-        return str(found["frame"]), poses
+        return names[0], poses
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError,
             IndexError):
         raise MeasurementError(must_be(
-            f"file {path}", where, wanted, "another file")) from None
+            f"file {path}", "joined maps", "a joined.json that `halbach-fe check MAP MAP` wrote",
+            "another file")) from None
 
 
 @dataclass(frozen=True)

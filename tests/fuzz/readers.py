@@ -43,6 +43,7 @@ from halbach_fe.measurement.formats.files import READERS as FORMATS
 from halbach_fe.measurement.formats.files import import_map
 from halbach_fe.measurement.formats.grid import grid_of
 from halbach_fe.measurement.formats.openpmd import content as openpmd_content
+from halbach_fe.measurement.map_join import MapPose, read_joined
 from halbach_fe.report.campaign_report import read_campaign
 from halbach_fe.response import matrix as matrix_module
 from halbach_fe.response.matrix import Response, StoredMatrix, _beside
@@ -504,10 +505,23 @@ def check_order(names: tuple[str, ...]) -> None:
     assert names
 
 
+JOINED = json.dumps({"frame": "body", "poses": [{
+    "name": "fringe", "middle_m": [0, 0, 0.1], "shift_m": [0, 0, 0.05], "shift_sd_m": [1e-4] * 3,
+    "rotation_rad": [0, 0, 0.1], "rotation_sd_rad": [1e-3] * 3, "sign": 1}]}).encode()
+
+
+def check_joined(found: tuple[str, tuple[MapPose, ...]]) -> None:
+    """Every pose is one, with bars."""
+    for one in found[1]:
+        assert np.isfinite(one.translation_m).all()
+        assert (one.shift_sd_m > 0).all()
+        assert (one.rotation_sd_rad > 0).all()
+
+
 NAMES = (
     "study", "changed study", "steel", "body of iron", "free blocks (CSV)",
     "free blocks (HDF5)", "map (CSV)",
-    "map (HDF5)", "map (VTU)", "block table", "order of assembly",
+    "map (HDF5)", "map (VTU)", "block table", "order of assembly", "joined maps",
     "import: columns", "import: opera", "import: comsol",
     "import: openpmd", "import as columns", "import as opera", "import as comsol",
     "import as openpmd", "posterior", "stored response", "stored matrix", "stored chains",
@@ -558,6 +572,8 @@ def readers() -> tuple[Reader, ...]:
         Reader("order of assembly", "order.csv", (ORDER_CSV,),
                partial(read_order, blocks=("r01s01", "r01s02")), MeasurementError,
                check_order, (b"block",)),
+        Reader("joined maps", "joined.json", (JOINED,), read_joined, MeasurementError,
+               check_joined, (b"NaN", b"1e999", b"null", b"[]", b'"poses"')),
         replace(foreign, name="import: columns", seeds=columns),
         replace(foreign, name="import: opera", seeds=((OPERA + rows(field=FIELD)).encode(),)),
         replace(foreign, name="import: comsol", seeds=(

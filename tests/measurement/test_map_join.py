@@ -17,9 +17,10 @@ from halbach_fe.core.pace import Pace
 from halbach_fe.measurement import map_join
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.measurement.harmonic_field import Charges
-from halbach_fe.measurement.joined_probe import JoinedModel, Pose
+from halbach_fe.measurement.joined_probe import TERMS, JoinedModel, Pose
 from halbach_fe.measurement.map_check import InstrumentTerm, scan_of
-from halbach_fe.measurement.map_join import join_checked, join_maps
+from halbach_fe.measurement.map_join import join_checked, join_maps, read_joined
+from halbach_fe.measurement.probe_in_field import LAG
 from halbach_fe.report.map_check import joined_answer as answer
 from halbach_fe.report.map_check import joined_sentences as sentences
 from tests.support.joined_campaigns import (
@@ -55,8 +56,12 @@ def test_derivatives_of_joined_readings(generator):
                  # the derivative by a turn is that at a small one, which poses start from
                  instrument=0.01 * generator.standard_normal(len(at.instrument)))
     by_parameter = model.by_parameter(at, rows)
+    # of a stage that goes one way, a lag is a shift of the map, which is not asked
+    unseen = [number * TERMS + LAG for number in range(len(scans) + 1)]
     for number in [*range(0, len(at.instrument), 7), *range(len(at.instrument) - 7,
                                                             len(at.instrument))]:
+        if number in unseen:
+            continue
         step = 1e-4 * np.eye(len(at.instrument))[number]
         there, before = (model.readings(replace(at, instrument=at.instrument + sign * step), rows)
                          for sign in (1, -1))
@@ -258,6 +263,10 @@ def test_check_of_several_maps(tmp_path, monkeypatch, capsys):
     assert summary["agree"]
     assert np.array(summary["covariance"]).shape == (6, 6)
     (pose,) = summary["poses"]
+    frame, (again,) = read_joined(out / "joined.json")
+    assert (frame, again.name) == ("part0", "part1")
+    np.testing.assert_allclose(again.translation_m, pose["translation_m"], atol=1e-15)
+    np.testing.assert_array_equal(again.shift_sd_m, pose["shift_sd_m"])
     turn = Rotation.from_rotvec(pose["rotation_rad"]).as_matrix()
     written = read_map(out / "joined.csv")
     count = maps["part0"].sizes["point"]
