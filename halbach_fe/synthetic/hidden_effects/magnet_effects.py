@@ -204,14 +204,14 @@ def ring_tilted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float)
 
 def halves_apart(magnet: TrueMagnet, site: Site, slot: float, apart: float, sideways: float,
                  z: float) -> TrueMagnet:
-    """Move what is on one side of a plane through the axis, half a slot beyond a slot's middle."""
+    """Move both sides of a plane through the axis, half a slot beyond a slot's middle, apart."""
     own = [body for body in magnet.bodies if body.ring == 1]
     beside = next(body for body in own if body.slot == slot)
     direction = np.arctan2(*beside.centre[1::-1]) + np.pi / len(own) + np.pi / 2
     normal = np.array([np.cos(direction), np.sin(direction), 0.0])
     shift = apart * normal + sideways * np.cross([0, 0, 1], normal) + [0, 0, z]
-    return _bodies(magnet, lambda body: _moved(body, vector(shift)),
-                   lambda body: float(normal @ body.centre) > 0)
+    return _bodies(magnet, lambda body: _moved(
+        body, vector(np.sign(normal @ body.centre) / 2 * shift)))
 
 
 def ring_demagnetized(magnet: TrueMagnet, site: Site, ring: float, fraction: float) -> TrueMagnet:
