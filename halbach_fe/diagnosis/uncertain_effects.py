@@ -87,12 +87,14 @@ def _rivals(
 def _is_neutral(study: Study, nothing: IdentifiedEffect) -> bool:
     """Tell whether an effect with amplitudes of 0 changes nothing but the shape of a study.
 
-    It may add an exception of a block.
+    It may add an exception of a block. Rotations that follow each other are rounded.
     """
+    rounding = 1e-12  # of rotations in rad
     if _switches(nothing):
         return False
     try:
-        return not number_changes(study, apply_effects(study, [nothing]))
+        changes = number_changes(study, apply_effects(study, [nothing]))
+        return all(abs(change) < rounding for change in changes.values())
     except (StudyError, ValidationError):
         return False
     except ValueError:  # the shape

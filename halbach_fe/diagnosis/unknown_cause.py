@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy.linalg as linalg
 from pydantic import ValidationError
 from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
@@ -351,40 +352,81 @@ def imitated(
 ) -> Imitation | None:
     """Return what may be missing that blocks imitate, so that an update is less sure than its bars.
 
-    An effect J theta that the study lacks changes the posterior mean of the blocks by ``C H' J
-    theta``, the chi-squared of which is ``theta' J' H C H' J theta``. What an effect changes of
-    the magnetizations themselves is no error of the update, and what is suspected is in the study.
-    Of the rest, weighed with its probability, as much is returned as leaves less than `least_chi2`.
+    What is suspected is in the study already. Of the rest, everything that would make an update
+    wrong by itself is returned, and as much as leaves less than `least_chi2` of what is expected,
+    weighed with its probability.
     """
     # Expected chi-squared per parameter of an update's blocks, beyond that of their error bars,
     # from which what they imitate has to be in the model: the mean is to be below 1.2.
     least_chi2 = 0.2
+    # The same if an effect is there, from which it has to be in the model however improbable it
+    # is: chi-squared is to be below 2 whichever of the effects is missing.
+    wrong_chi2 = 0.8
     candidates, best = search.candidates, judgement.best
     if best.terms:
         return None
     beside = with_candidates(search.evidence, [candidates[k] for k in best.effects])
-    count, expected = len(update.magnet.parameter_names), {}
+    errors = _ErrorsOfUpdate(update, search)
+    expected, if_there = dict[int, float](), dict[int, float]()
     known = {name for suspicion in suspected for name in suspicion.effects}
     for number in np.flatnonzero(further.probabilities > SHOWN_PROBABILITY).tolist():
-        candidate, hypothesis = candidates[number], search.hypotheses[number]
+        candidate = candidates[number]
         if number in search.rough or candidate.is_binary or candidate.effect in known:
             continue
+        off = errors.of(number)
+        if off is None:
+            continue
         fit = with_wide_priors(beside, [candidate]).fit(candidate.free)
-        taken = search.absorbed[:, list(candidate.free)]
-        chi2 = float(np.sum((taken @ fit.mean)**2) + np.sum((taken @ fit.covariance) * taken))
-        if not _is_of_magnetizations(hypothesis, update.study):
-            expected[number] = float(further.probabilities[number]) * chi2 / count
-    rest, chosen = sum(expected.values()), []
+        if_there[number] = float(np.sum((off @ fit.mean)**2) + np.sum(
+            (off @ fit.covariance) * off)) / len(off)
+        expected[number] = float(further.probabilities[number]) * if_there[number]
+    rest, chosen, placed = sum(expected.values()), [], set[str]()
     for number in sorted(expected, key=lambda each: -expected[each]):
-        if rest < least_chi2:
-            break
-        chosen.append(number)
-        rest -= expected[number]
+        if candidates[number].effect in placed:  # its place is fitted
+            continue
+        if rest >= least_chi2 or if_there[number] >= wrong_chi2:
+            chosen.append(number)
+            rest -= expected[number]
+            if search.hypotheses[number].effect.refinements:
+                placed.add(candidates[number].effect)
     if not chosen:
         return None
     named = further.by_effect(candidates, chosen)
     return Imitation(sum(named.values()), tuple(named), tuple(named.values()), tuple(
         _beside(judgement, further, search, number)[-1] for number in chosen))
+
+
+class _ErrorsOfUpdate:
+    """How far the blocks of an update are off if an effect is missing from its study.
+
+    An effect that changes the readings by J theta changes the posterior mean of the magnetizations
+    by ``C_0 H' S^-1 J theta``. What it changes of the magnetizations themselves is no error.
+    """
+
+    def __init__(self, update: InferenceResult, search: Search) -> None:
+        self.update, self.search = update, search
+        rows = np.flatnonzero(~update.held_out)
+        self.response = update.errors.subset(rows).whiten(update.response.matrix[rows])
+        self.prior = np.asarray(update.prior.root)
+        covariance = update.posterior.covariance
+        rounding = 1e-12  # of the largest variance; missing blocks have none
+        self.factor = linalg.cholesky(covariance + rounding * np.diag(covariance).max() * np.eye(
+            len(covariance)), lower=True)
+
+    def of(self, number: int) -> Floats | None:
+        """Return the errors (m, k) of all parameters in their posterior standard deviations, per
+        amplitude of a candidate; None if the magnet has other blocks with it.
+        """
+        hypothesis, free = self.search.hypotheses[number], self.search.candidates[number].free
+        columns = self.search.columns[:, list(free)]
+        change = _change_of_magnetizations(hypothesis, self.update.study)
+        if change is None:
+            return None
+        taken = self.prior @ (self.prior.T @ (
+            self.response.T @ self.search.marginal.remove(columns)))
+        change = change[:, :taken.shape[1]]  # refinements are of places
+        taken[:, :change.shape[1]] -= change
+        return np.asarray(linalg.solve_triangular(self.factor, taken, lower=True))
 
 
 def _beside(
@@ -398,18 +440,26 @@ def _beside(
                        float(odds), ())])
 
 
-def _is_of_magnetizations(hypothesis: Hypothesis, study: Study) -> bool:
-    """Tell whether an effect changes magnetizations, as a temperature does."""
+def _change_of_magnetizations(hypothesis: Hypothesis, study: Study) -> Floats | None:
+    """Return by how much an effect changes the nominal magnetizations (m, k), in A/m per prior
+    standard deviation of its k parameters; None if the magnet has other blocks with it.
+    """
     effect = hypothesis.effect
-    if effect.kind == "instrument":
-        return False
-    values = [parameter.sd / 10 for parameter in effect.parameters]
-    try:
-        changed = build_magnet(hypothesis.apply(study, values)).nominal_magnetization
-    except (HalbachError, ValidationError):
-        return False
     before = build_magnet(study).nominal_magnetization
-    return len(changed) != len(before) or not np.allclose(changed, before, rtol=1e-9)
+    found = np.zeros((len(before), len(effect.parameters)))
+    if effect.kind == "instrument":
+        return found
+    step = 0.1  # in prior standard deviations
+    for which, parameter in enumerate(effect.parameters):
+        values = step * parameter.sd * np.eye(len(effect.parameters))[which]
+        try:
+            changed = build_magnet(hypothesis.apply(study, values.tolist())).nominal_magnetization
+        except (HalbachError, ValidationError):
+            return None
+        if len(changed) != len(before):
+            return None
+        found[:, which] = (changed - before) / step
+    return found
 
 
 def _why_not_named(

@@ -62,7 +62,8 @@ EQUAL = ("rings_swapped", "block_put_in_wrongly")
 NAMES = [
     "iron_ring", "recoil_permeability", "recoil_permeability_across", "block_displaced",
     "block_turned", "radial_gap", "azimuthal_gap", "ring_gap", "ring_twisted", "ring_shifted",
-    "ring_shifted_along", "ring_tilted", "ring_demagnetized", "halves_apart", "blocks_swapped", "block_put_in_wrongly", "rings_swapped",
+    "ring_shifted_along", "ring_tilted", "ring_demagnetized", "halves_apart", "blocks_swapped",
+    "block_put_in_wrongly", "rings_swapped",
     "rings_turned", "block_flipped", "block_missing", "block_demagnetized",
     "corners_demagnetized", "magnetization_gradient", "temperature", "temperature_gradient",
     "inner_radius", "length", "background", "neighbour_magnet", "ferromagnetic_object",
