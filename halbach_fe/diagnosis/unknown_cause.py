@@ -378,7 +378,7 @@ def imitated(
             continue
         fit = with_wide_priors(beside, [candidate]).fit(candidate.free)
         if_there[number] = float(np.sum((off @ fit.mean)**2) + np.sum(
-            (off @ fit.covariance) * off)) / len(off)
+            (off @ fit.covariance) * off)) / len(update.magnet.parameter_names)
         expected[number] = float(further.probabilities[number]) * if_there[number]
     rest, chosen, placed = sum(expected.values()), [], set[str]()
     for number in sorted(expected, key=lambda each: -expected[each]):
@@ -404,29 +404,57 @@ class _ErrorsOfUpdate:
     """
 
     def __init__(self, update: InferenceResult, search: Search) -> None:
-        self.update, self.search = update, search
-        rows = np.flatnonzero(~update.held_out)
+        # number of parameters whose covariance is factorized in a second or two; of more, effects
+        # that change magnetizations are left out
+        most_parameters = 3000
+        rounding = 1e-12  # of the largest variance; missing blocks have none
+        self.study, self.search = update.study, search
+        self.before = build_magnet(update.study).nominal_magnetization
+        self.factor: Floats | None = None
+        if len(self.before) > most_parameters:
+            return
+        rows, count = np.flatnonzero(~update.held_out), len(self.before)
+        variance = update.posterior.covariance[:count, :count]  # uncertain amplitudes come after
         self.response = update.errors.subset(rows).whiten(update.response.matrix[rows])
         self.prior = np.asarray(update.prior.root)
-        covariance = update.posterior.covariance
-        rounding = 1e-12  # of the largest variance; missing blocks have none
-        self.factor = linalg.cholesky(covariance + rounding * np.diag(covariance).max() * np.eye(
-            len(covariance)), lower=True)
+        self.factor = linalg.cholesky(
+            variance + rounding * np.diag(variance).max() * np.eye(count), lower=True)
 
     def of(self, number: int) -> Floats | None:
-        """Return the errors (m, k) of all parameters in their posterior standard deviations, per
-        amplitude of a candidate; None if the magnet has other blocks with it.
+        """Return the errors (n, k) of the parameters, rotated and in posterior standard deviations,
+        per amplitude of a candidate; None if they are not known.
         """
-        hypothesis, free = self.search.hypotheses[number], self.search.candidates[number].free
-        columns = self.search.columns[:, list(free)]
-        change = _change_of_magnetizations(hypothesis, self.update.study)
-        if change is None:
+        free = list(self.search.candidates[number].free)
+        change = self._change(self.search.hypotheses[number])
+        if change is None or (self.factor is None and change.any()):
             return None
-        taken = self.prior @ (self.prior.T @ (
-            self.response.T @ self.search.marginal.remove(columns)))
-        change = change[:, :taken.shape[1]]  # refinements are of places
-        taken[:, :change.shape[1]] -= change
-        return np.asarray(linalg.solve_triangular(self.factor, taken, lower=True))
+        if self.factor is None:
+            return self.search.absorbed[:, free]
+        off = self.prior[:len(self.before)] @ (self.prior.T @ (
+            self.response.T @ self.search.marginal.remove(self.search.columns[:, free])))
+        own = change[:, :len(free)]  # the refinements, which are places, change none
+        off[:, :own.shape[1]] -= own
+        return np.asarray(linalg.solve_triangular(self.factor, off, lower=True))
+
+    def _change(self, hypothesis: Hypothesis) -> Floats | None:
+        """Return by how much an effect changes the nominal magnetizations (m, k), in A/m per prior
+        standard deviation of its k parameters; None if the magnet has other blocks with it.
+        """
+        effect, step = hypothesis.effect, 0.1
+        found = np.zeros((len(self.before), len(effect.parameters)))
+        if effect.kind == "instrument":
+            return found
+        for which, parameter in enumerate(effect.parameters):
+            values = step * parameter.sd * np.eye(len(effect.parameters))[which]
+            try:
+                changed = build_magnet(
+                    hypothesis.apply(self.study, values.tolist())).nominal_magnetization
+            except (HalbachError, ValidationError):
+                return None
+            if len(changed) != len(self.before):
+                return None
+            found[:, which] = (changed - self.before) / step
+        return found
 
 
 def _beside(
@@ -438,28 +466,6 @@ def _beside(
         *(SelectedEffect(candidates[own], 0.0, 0.0, ()) for own in judgement.best.effects),
         SelectedEffect(candidates[number], float(odds - judgement.competition.prior[number]),
                        float(odds), ())])
-
-
-def _change_of_magnetizations(hypothesis: Hypothesis, study: Study) -> Floats | None:
-    """Return by how much an effect changes the nominal magnetizations (m, k), in A/m per prior
-    standard deviation of its k parameters; None if the magnet has other blocks with it.
-    """
-    effect = hypothesis.effect
-    before = build_magnet(study).nominal_magnetization
-    found = np.zeros((len(before), len(effect.parameters)))
-    if effect.kind == "instrument":
-        return found
-    step = 0.1  # in prior standard deviations
-    for which, parameter in enumerate(effect.parameters):
-        values = step * parameter.sd * np.eye(len(effect.parameters))[which]
-        try:
-            changed = build_magnet(hypothesis.apply(study, values.tolist())).nominal_magnetization
-        except (HalbachError, ValidationError):
-            return None
-        if len(changed) != len(before):
-            return None
-        found[:, which] = (changed - before) / step
-    return found
 
 
 def _why_not_named(
