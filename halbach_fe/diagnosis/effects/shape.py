@@ -63,6 +63,7 @@ class MoveRow(Effect):
 
     ``by_block`` returns the change (k, n, 3) in T per unit of each amplitude that a block, by its
     number, makes; ``moved`` the exceptions by the amplitudes. Blocks at the place move, or all.
+    Of the places, ``few`` that are evenly chosen are compared first, or all.
     """
 
     name: str
@@ -74,10 +75,14 @@ class MoveRow(Effect):
     defining: tuple[str, ...] = ()
     relative_odds: float = 1.0
     moves_all: bool = False
+    few: int = 0
     kind: Literal["field", "instrument"] = "field"
 
     def places(self, study: Study) -> Sequence[Place]:
         return self.where(study)
+
+    def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
+        return places[::max(1, len(places) // self.few)] if self.few else places
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal, place)
@@ -230,10 +235,12 @@ EFFECTS = (
         Parameter("x", "rad", 2e-3), Parameter("y", "rad", 2e-3)), _several_rings,
             _about_its_middle, lambda study, place, values: [BlockException(
                 ring=place.ring, tilt_deg=tuple(np.degrees(values).tolist()))]),
-    # of a magnet that opens; what both halves share is a displaced mapper
+    # of a magnet that opens; what both halves share is a displaced mapper. Planes that are 30
+    # degrees apart leave five of six blocks in the same half.
     MoveRow("halves_apart", "displacement of half the magnet", (
         Parameter("apart", "m", 2e-4), Parameter("sideways", "m", 2e-4),
-        Parameter("axial", "m", 2e-4)), _planes, _half, _halves_of, moves_all=True),
+        Parameter("axial", "m", 2e-4)), _planes, _half, _halves_of, moves_all=True,
+            few=6),
     # Which rings a gap has moved depends on where the others are held. Therefore all of them may
     # have moved along z as well, which alone is no gap.
     MoveRow("ring_gap", "gap between two rings",
