@@ -292,9 +292,9 @@ def axis_errors(
     if axis is None:
         return []
     roll, *true = true_axis(campaign, result.magnet)
-    pairs = [(axis.roll_rad, roll, axis.roll_sd_rad)] if (
-        found.study.array, found.study.external) == (
-            campaign.study.array, campaign.study.external) else []
+    same = found.study.external == campaign.study.external and (  # amplitudes of 0 change none
+        build_magnet(found.study).blocks == build_magnet(campaign.study).blocks)
+    pairs = [(axis.roll_rad, roll, axis.roll_sd_rad)] if same else []
     if axis.order > 1 and axis.centre_m and axis.centre_sd_m:
         places = [*axis.centre_m, *(axis.slope_rad or ())]
         bars = [*axis.centre_sd_m, *(axis.slope_sd_rad or ())]
