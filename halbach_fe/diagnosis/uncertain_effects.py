@@ -67,6 +67,11 @@ def is_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
                for one in study.uncertain)
 
 
+def can_be_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
+    """Tell whether a study can have amplitudes of an effect as uncertain numbers about 0."""
+    return is_uncertain(with_uncertain_effects(study, (), [effect]), effect)
+
+
 def _rivals(
     effects: Sequence[IdentifiedEffect], suspected: Sequence[IdentifiedEffect] = ()
 ) -> list[IdentifiedEffect]:

@@ -40,6 +40,7 @@ from halbach_fe.diagnosis.result import (
     UnknownPart,
 )
 from halbach_fe.diagnosis.search import SHOWN_PROBABILITY, Search, amplitudes, possible
+from halbach_fe.diagnosis.uncertain_effects import can_be_uncertain
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.study.model import Study
@@ -353,8 +354,8 @@ def imitated(
     """Return what may be missing that blocks imitate, so that an update is less sure than its bars.
 
     What is suspected is in the study already. Of the rest, everything that would make an update
-    wrong by itself is returned, and as much as leaves less than `least_chi2` of what is expected,
-    weighed with its probability.
+    wrong by itself and can be an uncertain number is returned, and as much as leaves less than
+    `least_chi2` of what is expected, weighed with its probability.
     """
     # Expected chi-squared per parameter of an update's blocks, beyond that of their error bars,
     # from which what they imitate has to be in the model: the mean is to be below 1.2.
@@ -384,7 +385,8 @@ def imitated(
     for number in sorted(expected, key=lambda each: -expected[each]):
         if candidates[number].effect in placed:  # its place is fitted
             continue
-        if rest >= least_chi2 or if_there[number] >= wrong_chi2:
+        if rest >= least_chi2 or (if_there[number] >= wrong_chi2 and can_be_uncertain(
+                update.study, _beside(judgement, further, search, number)[-1])):
             chosen.append(number)
             rest -= expected[number]
             if search.hypotheses[number].effect.refinements:

@@ -118,6 +118,27 @@ def _outwards(nominal: NominalFields, place: Place, number: int) -> list[Floats]
     return _along(np.cos(angle) * X + np.sin(angle) * Y)(nominal, place, number)
 
 
+def _out_and_in(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes whose ring is pressed oval, along x and between the axes."""
+    (change,) = _outwards(nominal, place, number)
+    return [part * change for part in _oval(nominal.blocks[number].angle_deg)]
+
+
+def _oval(angle_deg: float) -> tuple[float, float]:
+    """Return how far a block is moved outwards by an oval along x, and by one at 45 degrees."""
+    turn = 2 * np.radians(angle_deg)
+    return float(np.cos(turn)), float(np.sin(turn))
+
+
+def _ovals_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
+    """Return the displacements of the blocks of oval rings, by slots if the rings are equal."""
+    alike = study.array.is_uniform
+    return [BlockException(
+        ring=None if alike else block.ring, slot=block.slot,
+        displacement_m=(float(np.dot(values, _oval(block.angle_deg))), 0.0, 0.0))
+        for block in build_magnet(study).blocks if block.ring == 1 or not alike]
+
+
 def _about_z(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
     """Return what a block changes that turns about the magnet's axis."""
     return [nominal.block_rotation_derivative(number, Z, np.zeros(3))]
@@ -235,6 +256,9 @@ EFFECTS = (
         Parameter("x", "rad", 2e-3), Parameter("y", "rad", 2e-3)), _several_rings,
             _about_its_middle, lambda study, place, values: [BlockException(
                 ring=place.ring, tilt_deg=tuple(np.degrees(values).tolist()))]),
+    MoveRow("rings_oval", "oval rings", (Parameter("along x", "m", 2e-4),
+                                         Parameter("at 45 degrees", "m", 2e-4)),
+            lambda study: [Place()], _out_and_in, _ovals_of, moves_all=True),
     # of a magnet that opens; what both halves share is a displaced mapper. Planes that are 30
     # degrees apart leave five of six blocks in the same half.
     MoveRow("halves_apart", "displacement of half the magnet", (
