@@ -381,12 +381,14 @@ def imitated(
         if_there[number] = float(np.sum((off @ fit.mean)**2) + np.sum(
             (off @ fit.covariance) * off)) / len(update.magnet.parameter_names)
         expected[number] = float(further.probabilities[number]) * if_there[number]
+    wrong = {number for number, chi2 in if_there.items()
+             if chi2 >= wrong_chi2 and can_be_uncertain(
+                 update.study, _beside(judgement, further, search, number)[-1])}
     rest, chosen, placed = sum(expected.values()), [], set[str]()
-    for number in sorted(expected, key=lambda each: -expected[each]):
+    for number in sorted(expected, key=lambda each: (each not in wrong, -expected[each])):
         if candidates[number].effect in placed:  # its place is fitted
-            continue
-        if rest >= least_chi2 or (if_there[number] >= wrong_chi2 and can_be_uncertain(
-                update.study, _beside(judgement, further, search, number)[-1])):
+            rest -= expected[number]
+        elif number in wrong or rest >= least_chi2:
             chosen.append(number)
             rest -= expected[number]
             if search.hypotheses[number].effect.refinements:
