@@ -67,6 +67,11 @@ def is_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
                for one in study.uncertain)
 
 
+def can_be_uncertain(study: Study, effect: IdentifiedEffect) -> bool:
+    """Tell whether a study can have amplitudes of an effect as uncertain numbers about 0."""
+    return is_uncertain(with_uncertain_effects(study, (), [effect]), effect)
+
+
 def _rivals(
     effects: Sequence[IdentifiedEffect], suspected: Sequence[IdentifiedEffect] = ()
 ) -> list[IdentifiedEffect]:
@@ -87,12 +92,14 @@ def _rivals(
 def _is_neutral(study: Study, nothing: IdentifiedEffect) -> bool:
     """Tell whether an effect with amplitudes of 0 changes nothing but the shape of a study.
 
-    It may add an exception of a block.
+    It may add an exception of a block. Rotations that follow each other are rounded.
     """
+    rounding = 1e-12  # of rotations in rad
     if _switches(nothing):
         return False
     try:
-        return not number_changes(study, apply_effects(study, [nothing]))
+        changes = number_changes(study, apply_effects(study, [nothing]))
+        return all(abs(change) < rounding for change in changes.values())
     except (StudyError, ValidationError):
         return False
     except ValueError:  # the shape

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy.linalg as linalg
 from pydantic import ValidationError
 from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
@@ -39,6 +40,7 @@ from halbach_fe.diagnosis.result import (
     UnknownPart,
 )
 from halbach_fe.diagnosis.search import SHOWN_PROBABILITY, Search, amplitudes, possible
+from halbach_fe.diagnosis.uncertain_effects import can_be_uncertain
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.study.model import Study
@@ -351,40 +353,112 @@ def imitated(
 ) -> Imitation | None:
     """Return what may be missing that blocks imitate, so that an update is less sure than its bars.
 
-    An effect J theta that the study lacks changes the posterior mean of the blocks by ``C H' J
-    theta``, the chi-squared of which is ``theta' J' H C H' J theta``. What an effect changes of
-    the magnetizations themselves is no error of the update, and what is suspected is in the study.
-    Of the rest, weighed with its probability, as much is returned as leaves less than `least_chi2`.
+    What is suspected is in the study already. Of the rest, everything that would make an update
+    wrong by itself and can be an uncertain number is returned, and as much as leaves less than
+    `least_chi2` of what is expected, weighed with its probability.
     """
     # Expected chi-squared per parameter of an update's blocks, beyond that of their error bars,
     # from which what they imitate has to be in the model: the mean is to be below 1.2.
     least_chi2 = 0.2
+    # The same if an effect is there, from which it has to be in the model however improbable it
+    # is: chi-squared is to be below 2 whichever of the effects is missing.
+    wrong_chi2 = 0.8
     candidates, best = search.candidates, judgement.best
     if best.terms:
         return None
     beside = with_candidates(search.evidence, [candidates[k] for k in best.effects])
-    count, expected = len(update.magnet.parameter_names), {}
+    errors = _ErrorsOfUpdate(update, search)
+    expected, if_there = dict[int, float](), dict[int, float]()
     known = {name for suspicion in suspected for name in suspicion.effects}
     for number in np.flatnonzero(further.probabilities > SHOWN_PROBABILITY).tolist():
-        candidate, hypothesis = candidates[number], search.hypotheses[number]
+        candidate = candidates[number]
         if number in search.rough or candidate.is_binary or candidate.effect in known:
             continue
+        off = errors.of(number)
+        if off is None:
+            continue
         fit = with_wide_priors(beside, [candidate]).fit(candidate.free)
-        taken = search.absorbed[:, list(candidate.free)]
-        chi2 = float(np.sum((taken @ fit.mean)**2) + np.sum((taken @ fit.covariance) * taken))
-        if not _is_of_magnetizations(hypothesis, update.study):
-            expected[number] = float(further.probabilities[number]) * chi2 / count
-    rest, chosen = sum(expected.values()), []
-    for number in sorted(expected, key=lambda each: -expected[each]):
-        if rest < least_chi2:
-            break
-        chosen.append(number)
-        rest -= expected[number]
+        if_there[number] = float(np.sum((off @ fit.mean)**2) + np.sum(
+            (off @ fit.covariance) * off)) / len(update.magnet.parameter_names)
+        expected[number] = float(further.probabilities[number]) * if_there[number]
+    wrong = {number for number, chi2 in if_there.items()
+             if chi2 >= wrong_chi2 and can_be_uncertain(
+                 update.study, _beside(judgement, further, search, number)[-1])}
+    rest, chosen, placed = sum(expected.values()), [], set[str]()
+    for number in sorted(expected, key=lambda each: (each not in wrong, -expected[each])):
+        if candidates[number].effect in placed:  # its place is fitted
+            rest -= expected[number]
+        elif number in wrong or rest >= least_chi2:
+            chosen.append(number)
+            rest -= expected[number]
+            if search.hypotheses[number].effect.refinements:
+                placed.add(candidates[number].effect)
     if not chosen:
         return None
     named = further.by_effect(candidates, chosen)
     return Imitation(sum(named.values()), tuple(named), tuple(named.values()), tuple(
         _beside(judgement, further, search, number)[-1] for number in chosen))
+
+
+class _ErrorsOfUpdate:
+    """How far the blocks of an update are off if an effect is missing from its study.
+
+    An effect that changes the readings by J theta changes the posterior mean of the magnetizations
+    by ``C_0 H' S^-1 J theta``. What it changes of the magnetizations themselves is no error.
+    """
+
+    def __init__(self, update: InferenceResult, search: Search) -> None:
+        # number of parameters whose covariance is factorized in a second or two; of more, effects
+        # that change magnetizations are left out
+        most_parameters = 3000
+        rounding = 1e-12  # of the largest variance; missing blocks have none
+        self.study, self.search = update.study, search
+        self.before = build_magnet(update.study).nominal_magnetization
+        self.factor: Floats | None = None
+        if len(self.before) > most_parameters:
+            return
+        rows, count = np.flatnonzero(~update.held_out), len(self.before)
+        variance = update.posterior.covariance[:count, :count]  # uncertain amplitudes come after
+        self.response = update.errors.subset(rows).whiten(update.response.matrix[rows])
+        self.prior = np.asarray(update.prior.root)
+        self.factor = linalg.cholesky(
+            variance + rounding * np.diag(variance).max() * np.eye(count), lower=True)
+
+    def of(self, number: int) -> Floats | None:
+        """Return the errors (n, k) of the parameters, rotated and in posterior standard deviations,
+        per amplitude of a candidate; None if they are not known.
+        """
+        free = list(self.search.candidates[number].free)
+        change = self._change(self.search.hypotheses[number])
+        if change is None or (self.factor is None and change.any()):
+            return None
+        if self.factor is None:
+            return self.search.absorbed[:, free]
+        off = self.prior[:len(self.before)] @ (self.prior.T @ (
+            self.response.T @ self.search.marginal.remove(self.search.columns[:, free])))
+        own = change[:, :len(free)]  # the refinements, which are places, change none
+        off[:, :own.shape[1]] -= own
+        return np.asarray(linalg.solve_triangular(self.factor, off, lower=True))
+
+    def _change(self, hypothesis: Hypothesis) -> Floats | None:
+        """Return by how much an effect changes the nominal magnetizations (m, k), in A/m per prior
+        standard deviation of its k parameters; None if the magnet has other blocks with it.
+        """
+        effect, step = hypothesis.effect, 0.1
+        found = np.zeros((len(self.before), len(effect.parameters)))
+        if effect.kind == "instrument":
+            return found
+        for which, parameter in enumerate(effect.parameters):
+            values = step * parameter.sd * np.eye(len(effect.parameters))[which]
+            try:
+                changed = build_magnet(
+                    hypothesis.apply(self.study, values.tolist())).nominal_magnetization
+            except (HalbachError, ValidationError):
+                return None
+            if len(changed) != len(self.before):
+                return None
+            found[:, which] = (changed - self.before) / step
+        return found
 
 
 def _beside(
@@ -396,20 +470,6 @@ def _beside(
         *(SelectedEffect(candidates[own], 0.0, 0.0, ()) for own in judgement.best.effects),
         SelectedEffect(candidates[number], float(odds - judgement.competition.prior[number]),
                        float(odds), ())])
-
-
-def _is_of_magnetizations(hypothesis: Hypothesis, study: Study) -> bool:
-    """Tell whether an effect changes magnetizations, as a temperature does."""
-    effect = hypothesis.effect
-    if effect.kind == "instrument":
-        return False
-    values = [parameter.sd / 10 for parameter in effect.parameters]
-    try:
-        changed = build_magnet(hypothesis.apply(study, values)).nominal_magnetization
-    except (HalbachError, ValidationError):
-        return False
-    before = build_magnet(study).nominal_magnetization
-    return len(changed) != len(before) or not np.allclose(changed, before, rtol=1e-9)
 
 
 def _why_not_named(

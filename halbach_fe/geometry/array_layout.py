@@ -123,8 +123,10 @@ def _displaced(block: MagnetBlock, exceptions: Sequence[BlockException]) -> Magn
     for exception in exceptions:
         twist = np.array([0.0, 0.0, np.radians(exception.twist_deg)])
         displacement += axes @ exception.displacement_m + exception.shift_m
-        displacement += rotation_matrix(vector(twist)) @ block.middle - block.middle
-        rotation += axes @ np.radians(exception.rotation_deg) + twist
+        tilt = np.radians([*exception.tilt_deg, 0.0])
+        arm = block.middle * [1.0, 1.0, 0.0]  # from the axis, also of a tilt
+        displacement += sum(rotation_matrix(vector(turn)) @ arm - arm for turn in (twist, tilt))
+        rotation += axes @ np.radians(exception.rotation_deg) + twist + tilt
     if not (displacement.any() or rotation.any()):
         return block
     return replace(block, displacement_m=vector(displacement), rotation_rad=vector(rotation),

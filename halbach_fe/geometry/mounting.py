@@ -44,7 +44,7 @@ def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
 def as_meant(magnet: Magnet) -> Magnet:
     """Return the magnet with every block present, unrotated, and in the slot it was made for."""
     meant = {"mounted_from": None, "magnetization_factor": 1.0, "rotation_deg": (0.0, 0.0, 0.0),
-             "twist_deg": 0.0}
+             "twist_deg": 0.0, "tilt_deg": (0.0, 0.0)}
     return magnet.with_(array__exceptions=tuple(
         exception.with_(**meant) for exception in magnet.array.exceptions))
 

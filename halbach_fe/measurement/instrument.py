@@ -179,7 +179,7 @@ def sensor_matrix(instrument: Instrument) -> Floats:
 def nonlinear_part(instrument: Instrument, fields: Floats, time: Floats) -> Floats:
     """Return the part (n, 3) in T of the sensors' values that is not linear in B.
 
-    It is the sum of planar Hall effect, quadratic and cubic terms, offset and drift.
+    It is the sum of planar Hall effect, quadratic and cubic terms, offset and drifts.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def nonlinear_part(instrument: Instrument, fields: Floats, time: Floats) -> Floa
     return np.asarray(
         others * instrument.planar_hall_per_T + fields**2 * instrument.quadratic_per_T
         + fields**3 * instrument.cubic_per_T2 + instrument.offset_T
-        + np.outer(time, instrument.drift_T))
+        + np.outer(time, instrument.drift_T) + instrument.gain_drift * time[:, None] * fields)
 
 
 def with_memory(instrument: Instrument, values: Floats, time: Floats) -> Floats:

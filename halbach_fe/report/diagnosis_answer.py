@@ -353,8 +353,12 @@ def _imitated_in_words(diagnosis: Diagnosis) -> str:
     imitation, titles = diagnosis.imitated, catalogue_titles(diagnosis)
     if imitation is None:
         return ""
+    shown = 4  # most of them by name
     parts = [f"{title_of(name, titles)} {decimals(100 * share)} %" for name, share in zip(
         imitation.effects, imitation.shares, strict=True)]
+    if len(parts) > shown + 1:
+        rest = sum(imitation.shares[shown:])
+        parts[shown:] = [f"one of {len(parts) - shown} others {decimals(100 * rest)} %"]
     return (f"With a probability of {decimals(100 * imitation.probability)} % something is missing "
             f"that no reading shows, as the blocks imitate it ({in_a_row(parts)}): "
             "the blocks of an update without it are then off by more than their error bars. "

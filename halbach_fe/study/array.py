@@ -126,7 +126,8 @@ class BlockException(StudyModel):
     Position: ``displacement_m`` displaces the block along its own radial, azimuthal and axial
     direction, and ``rotation_deg`` is a rotation vector along the same axes, about the block's
     middle. ``shift_m`` displaces the block along x, y and z, and ``twist_deg`` rotates it about the
-    magnet's axis.
+    magnet's axis. ``tilt_deg`` is a rotation vector along x and y, about the point of the axis at
+    the height of the block's middle, so that the blocks of a ring tilt as one body.
 
     If several exceptions hold for a block, their displacements and rotations add up, and their
     factors multiply; of every other key, the last value counts. A missing block has no permeability
@@ -149,6 +150,7 @@ class BlockException(StudyModel):
     rotation_deg: Rotation = (0.0, 0.0, 0.0)
     shift_m: Displacement = (0.0, 0.0, 0.0)
     twist_deg: Angle = 0.0
+    tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
 
 
 class Ring(StudyModel):

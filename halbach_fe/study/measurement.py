@@ -54,14 +54,16 @@ class Instrument(StudyModel):
 
     Readings. With B' the components of B along the rotated axes, the reading of component i is
     ``(1 + gain_i) B'_i + sum_j crosstalk_ij B'_j + planar_hall_i B'_j B'_k + quadratic_i B'_i^2
-    + cubic_i B'_i^3 + offset_i + drift_i t``, where j and k are the two other components and t runs
-    from 0 to 1 over the map (by its column time_s, or by the order of its rows). The key ``zx`` of
+    + cubic_i B'_i^3 + offset_i + drift_i t + gain_drift t B'_i``, where j and k are the two other
+    components and t runs from 0 to 1 over the map (by its column time_s, or by the order of its
+    rows); ``gain_drift`` is that of a magnet, or of all sensors, that get warmer. The key ``zx`` of
     ``crosstalk`` is the sensitivity of the z sensor to B'_x. A slow instrument shows
     ``(1 - memory) r_i + memory m_i`` in place of the reading r_i of a row, with m the mean of the
     readings before, in the order of the scan: of the last one, or of all with weights that fall by
     a factor e within ``memory_rows`` rows. The reading of a map of |B| is
-    ``(1 + gain) |B| + quadratic |B|^2 + cubic |B|^3 + offset + drift t``: the three entries of
-    these keys are equal, those of ``sensor_position_m`` too; besides, ``memory`` alone changes it.
+    ``(1 + gain) |B| + quadratic |B|^2 + cubic |B|^3 + offset + drift t + gain_drift t |B|``:
+    the three entries of these keys are equal, those of ``sensor_position_m`` too; besides,
+    ``memory`` alone changes it.
     """
 
     length_unit_m: Unit = 1.0
@@ -85,6 +87,7 @@ class Instrument(StudyModel):
     cubic_per_T2: Fractions = (0.0, 0.0, 0.0)
     offset_T: FluxDensityVector = (0.0, 0.0, 0.0)
     drift_T: FluxDensityVector = (0.0, 0.0, 0.0)
+    gain_drift: Fraction = 0.0
     memory: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     memory_rows: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 

@@ -209,7 +209,10 @@ def _moved(body: Body, exceptions: Sequence[BlockException]) -> Body:
         twist = np.radians([0.0, 0.0, exception.twist_deg])
         shift += own.apply(exception.displacement_m) + exception.shift_m
         shift += Rotation.from_rotvec(twist).apply(middle) - middle
-        turn += own.apply(np.radians(exception.rotation_deg)) + twist
+        tilt = np.radians([*exception.tilt_deg, 0.0])
+        centre = np.array([0.0, 0.0, middle[2]])
+        shift += Rotation.from_rotvec(tilt).apply(middle - centre) - (middle - centre)
+        turn += own.apply(np.radians(exception.rotation_deg)) + twist + tilt
     if not (shift.any() or turn.any()):
         return body
     shift += arm - Rotation.from_rotvec(turn).apply(arm)

@@ -60,6 +60,8 @@ class FaultyInstrument:
         A sensor shows (1 + gain) times its reading, plus the offset.
     drift : float
         Growth of all readings from the first to the last point of the map, linear in time.
+    gain_drift : float
+        Growth of all sensitivities, or of the field of a magnet that gets colder, as a fraction.
     memory : tuple
         Fraction of every reading that comes from those before, and number of rows within which
         these are forgotten; 0 if it is the last one alone.
@@ -90,6 +92,7 @@ class FaultyInstrument:
     gain: Vector = ZERO_VECTOR
     offset: Vector = ZERO_VECTOR
     drift: float = 0.0
+    gain_drift: float = 0.0
     memory: tuple[float, float] = (0.0, 0.0)
     outliers: tuple[float, float] = (0.0, 0.0)
     reversed_z: bool = False
@@ -136,7 +139,8 @@ class FaultyInstrument:
             shown = field @ self.axes[sensor]
             shown += self.planar_hall * np.prod(np.delete(field, sensor, axis=1), axis=1)
             shown += self.quadratic * shown**2 + self.cubic * shown**3
-            columns.append((1 + self.gain[sensor]) * shown + self.offset[sensor])
+            grown = 1 + self.gain[sensor] + self.gain_drift * time
+            columns.append(grown * shown + self.offset[sensor])
         fraction, size = self.outliers
         shown = _remembering(np.column_stack(columns), time, *self.memory)
         is_outlier = generator.random(shown.shape) < fraction
@@ -222,7 +226,8 @@ def stated_readings(instrument: Instrument, fields: Floats, time: Floats) -> Flo
                  + instrument.planar_hall_per_T[sensor] * first * second
                  + instrument.quadratic_per_T[sensor] * own**2
                  + instrument.cubic_per_T2[sensor] * own**3
-                 + instrument.offset_T[sensor] + instrument.drift_T[sensor] * time)
+                 + instrument.offset_T[sensor] + instrument.drift_T[sensor] * time
+                 + instrument.gain_drift * time * own)
         for pair, part in instrument.crosstalk.items():
             if pair[0] == name:
                 value = value + part * seen[COMPONENTS.index(pair[1])]

@@ -111,6 +111,7 @@ STUDIES: dict[str, dict[str, Any]] = {
     "rotated": with_exception(rotation_deg=[0.5, 0.5, 1.0]),
     "shifted": with_exception(shift_m=[0.0, 5e-4, 5e-4]),
     "twisted": changed(BASE, array__exceptions=[{"ring": 2, "twist_deg": 2.0}]),
+    "tilted": changed(BASE, array__exceptions=[{"ring": 2, "tilt_deg": [2.0, 0.0]}]),
     "permeability": with_exception(recoil_permeability=1.1),
     "permeability-across": changed(BASE, array__recoil_permeability=1.05,
                                    array__recoil_permeability_across=1.15),

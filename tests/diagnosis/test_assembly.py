@@ -29,8 +29,9 @@ EFFECTS = {effect.name: effect for effect in catalogue()}
 RIVALS = [EFFECTS[name] for name in (
     "background", "block_demagnetized", "block_displaced", "block_flipped", "block_missing",
     "block_put_in_wrongly", "block_turned", "blocks_swapped", "ferromagnetic_object", "gain_x",
-    "mapper_translation", "ring_shifted", "ring_shifted_along", "ring_twisted", "rings_swapped",
-    "rings_turned", "rings_upside_down")]
+    "halves_apart", "mapper_tilt_x", "mapper_translation", "radial_gap", "ring_demagnetized",
+    "ring_shifted", "ring_shifted_along", "ring_tilted", "ring_twisted", "rings_oval",
+    "rings_swapped", "rings_turned", "rings_upside_down")]
 POINTS = np.vstack([circle(0.065, 12, z, 0.1) for z in np.linspace(-0.15, 0.15, 11)])
 
 QUADRUPOLE = {"multipole_order": 2, "rings": 4, "ring_length_m": 0.045}
@@ -63,14 +64,14 @@ def mri():
 
 
 def field_of_cubes(polarizations, points, moved=0.0):
-    """B (n, 3) in T by magpylib; ``moved`` (cubes,) in m along z."""
+    """B (n, 3) in T by magpylib; ``moved`` (cubes, 3) in m."""
     centres, angles = cubes()
     total = np.zeros(points.shape)
-    z = moved + np.zeros(len(angles))
-    for centre, angle, polarization, shift in zip(centres, angles, polarizations, z, strict=True):
+    for centre, angle, polarization in zip(
+            centres + moved, angles, polarizations, strict=True):
         turn = Rotation.from_euler("z", angle)
         total += magpylib.magnet.Cuboid(
-            position=centre + np.array([0, 0, shift]), dimension=[SIDE_M] * 3, orientation=turn,
+            position=centre, dimension=[SIDE_M] * 3, orientation=turn,
             polarization=turn.inv().apply(polarization)).getB(points)
     return total
 
@@ -116,12 +117,50 @@ def test_nothing_is_wrong(session, generator):
 
 def test_a_layer_along_the_axis(session, generator):
     study = mri()
-    moved = np.where(np.arange(RINGS * CUBES) // CUBES == 1, 5e-4, 0.0)
+    moved = np.outer(np.arange(RINGS * CUBES) // CUBES == 1, [0, 0, 5e-4])
     true = field_of_cubes(drawn(study, generator), POINTS, moved)
     found = selected(study, true, session, generator)
     assert names_of(found) == [("ring_shifted_along", "r02")]
     (layer,) = found
     assert abs(layer.values[0] - 5e-4) < 3.5 * layer.sd[0] < 5e-4
+
+
+@pytest.mark.parametrize("name", ["ring_tilted", "halves_apart", "ring_demagnetized"])
+def test_what_rings_and_halves_do_as_a_whole(name, session, generator):
+    """Not as a sum of other effects: a tilted ring was a tilted mapper and a displaced ring, and an
+    open magnet a displaced mapper and blocks that are all farther out.
+    """
+    study = mri()
+    polarizations, (centres, _) = drawn(study, generator), cubes()
+    normal = np.array([np.cos(np.pi / 12), np.sin(np.pi / 12), 0.0])  # between two cubes
+    ring = np.arange(RINGS * CUBES) // CUBES == 1
+    part = (centres @ normal > 0 if name == "halves_apart" else ring)[:, None]
+    middle, turn = centres[ring].mean(axis=0), Rotation.identity()
+    shift, loss = np.zeros(3), 0.0
+    if name == "ring_tilted":
+        turn, size = Rotation.from_rotvec([6e-3, 0.0, 0.0]), 6e-3
+    elif name == "halves_apart":
+        shift, size = 4e-4 * normal, 4e-4
+    else:
+        loss = size = 0.05
+    true = field_of_cubes(polarizations * ~part, POINTS + shift / 2) + (1 - loss) * turn.apply(
+        field_of_cubes(polarizations * part,
+                       turn.inv().apply(POINTS - shift / 2 - middle) + middle))
+    (found,) = selected(study, true, session, generator)
+    place = "at the plane whose normal is at 15°" if name == "halves_apart" else "r02"
+    assert names_of([found]) == [(name, place)]
+    assert abs(found.values[0] - size) < 3.5 * found.sd[0] < 0.8 * size
+
+
+def test_oval_rings(session, generator):
+    study, (centres, angles) = mri(), cubes()
+    outwards = centres * [10, 10, 0]  # the radius is 0.1 m, the easy axes turn twice as fast
+    true = field_of_cubes(drawn(study, generator), POINTS, 4e-4 * np.cos(angles)[:, None]
+                          * outwards)
+    (found,) = selected(study, true, session, generator)
+    assert found.hypothesis.effect.name == "rings_oval"
+    assert abs(found.values[0] - 4e-4) < 3.5 * found.sd[0] < 2e-4
+    assert abs(found.values[1]) < 3.5 * found.sd[1] or not found.values[1]
 
 
 def test_a_dipole_inside_a_body_is_no_object():

@@ -346,7 +346,8 @@ def test_a_turn_of_the_magnet_exchanges_names(flat, monkeypatch):
         hypothesis = Hypothesis(EFFECTS[name], place)
         candidate = Candidate(name, place.name, (0,), is_binary=True)
         return answer(replace(
-            found, before=replace(found.before, magnet=build_magnet(study), **changes),
+            found, imitated=None,
+            before=replace(found.before, magnet=build_magnet(study), **changes),
             identified=(replace(one, hypothesis=hypothesis, values=np.ones(1), sd=np.zeros(1),
                                 selection=replace(one.selection, candidate=candidate,
                                                   alternatives=())),))).trust

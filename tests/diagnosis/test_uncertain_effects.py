@@ -45,12 +45,9 @@ POINTS = np.vstack([circle(radius, 12, z, 0.1) for radius in (0.03, 0.06)
 TILT_RAD, TWIST_RAD, MORE_T = 3e-3, 0.02, 0.03
 
 
-def hidden(study, name, polarizations):
-    """B (n, 3) in T that a map shows at `POINTS`, and the polarizations, with a hidden effect."""
-    if name == "mapper_tilt_x":
-        turn = Rotation.from_rotvec([TILT_RAD, 0.0, 0.0])
-        return turn.inv().apply(field(study, polarizations, turn.apply(POINTS))), polarizations
-    turn = Rotation.from_rotvec([0.0, 0.0, TWIST_RAD])
+def twisted(study, polarizations, angle_rad):
+    """B (n, 3) in T at `POINTS`, and the polarizations, with the first ring turned about z."""
+    turn = Rotation.from_rotvec([0.0, 0.0, angle_rad])
     first = np.array([block.ring == 1 for block in build_magnet(study).blocks])[:, None]
     own = polarizations * first
     true = field(study, polarizations - own, POINTS) + turn.apply(
@@ -173,6 +170,35 @@ def test_what_blocks_imitate_is_estimated_with_them(session):
             assert found.imitated is None
 
 
+def test_a_ring_that_moves_with_its_blocks_is_imitated_too(session):
+    """Blocks whose magnetizations turn imitate a twisted ring by turning the other way."""
+    generator = np.random.default_rng(3)
+    effects = [one for one in catalogue() if one.name in ("ring_twisted", "offset_z")]
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | QUADRUPOLE})
+    true, polarizations = twisted(study, drawn(study, generator), 3e-3)
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    found = diagnose(study, shown, session.within("diagnosis"), effects=effects)
+    assert not found.identified
+    assert "ring_twisted" in found.imitated.effects
+    assert "offset_z" not in found.imitated.effects  # the readings show that there is none
+    chi2, _ = update(found.study, shown, polarizations, session.within("update"))
+    exact, _ = update(study, shown, polarizations, session.within("exact"))
+    assert abs(chi2 - 1) < 4 * np.sqrt(2 / polarizations.size)
+    assert exact > 10  # the control: the study as it was
+
+
+def test_rotations_that_are_rounded_stay_uncertain(generator):
+    """Those of a mapper follow each other: an angle of 0 beside another changes the last digit."""
+    study = parse_study(DOCUMENT)
+    tilt, roll = (next(one for one in catalogue() if one.name == name)
+                  for name in ("mapper_tilt_x", "mapper_roll"))
+    for angle in generator.uniform(2e-3, 4e-3, 20).tolist():
+        one, other = (IdentifiedEffect(Hypothesis(effect, Place()), np.array([value]), np.ones(1),
+                                       None) for effect, value in ((tilt, angle), (roll, 1e-3)))
+        names = [each.name for each in with_uncertain_effects(study, [one], [other]).uncertain]
+        assert names == ["mapper_tilt_x.angle_rad", "mapper_roll.angle_rad"]
+
+
 def test_only_what_changes_nothing_is_put_beside_a_named_effect():
     """Amplitudes of 0, and all parts of an effect. That a block is missing is no number, and a
     memory over other rows would change that of the named one.
@@ -211,11 +237,7 @@ def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator
     blocks = build_magnet(study).blocks
     drawn_T = np.array([block.easy_axis for block in blocks]) * (blocks[0].remanence + MORE_T)
     drawn_T += PRECISE * blocks[0].remanence * generator.standard_normal(drawn_T.shape)
-    turn = Rotation.from_rotvec([0.0, 0.0, TWIST_RAD])
-    first = np.array([block.ring == 1 for block in blocks])[:, None]
-    true = field(study, drawn_T * ~first, POINTS) + turn.apply(
-        field(study, drawn_T * first, turn.inv().apply(POINTS)))
-    drawn_T = np.where(first, turn.apply(drawn_T), drawn_T)
+    true, drawn_T = twisted(study, drawn_T, TWIST_RAD)
     shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
     chi2, result = update(study, shown, drawn_T, session.within("update"))
     exact, _ = update(study.with_(uncertain=()), shown, drawn_T, session.within("exact"))
@@ -227,9 +249,9 @@ def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator
     assert (np.abs(found.change - [TWIST_RAD, MORE_T]) < 3.5 * found.sd).all()
     assert (found.sd < 0.3 * found.prior_sd).all()
     # what the file of the posterior holds serves other commands, with the twist in it
-    twisted = study.with_(uncertain=(), array__exceptions=[
+    as_it_is = study.with_(uncertain=(), array__exceptions=[
         twist | {"twist_deg": float(np.degrees(TWIST_RAD))}])
-    check_axis(result, twisted, drawn_T, session)
+    check_axis(result, as_it_is, drawn_T, session)
     write_inference(result, session.folder)
     stored = read_posterior(result.magnet, session.folder / "posterior.h5")["posterior"]
     np.testing.assert_allclose(stored.covariance, result.posterior.covariance, rtol=1e-9)

@@ -26,7 +26,7 @@ LAYOUTS = {
     "cuboids": ("cuboid", {"shape": "cuboid", "width_m": 0.03}),
     "turned cuboids": ("cuboid", {"shape": "cuboid", "width_m": 0.02,
                                   "orientation": "magnetization"})}
-MOVES = {"displacement_m", "rotation_deg", "shift_m", "twist_deg"}
+MOVES = {"displacement_m", "rotation_deg", "shift_m", "twist_deg", "tilt_deg"}
 EXCEPTIONS = [
     {"slot": 1, "remanence_T": 0.9, "recoil_permeability": 1.2},
     {"slot": 2, "recoil_permeability_across": 1.15}, {"slot": 3, "magnetization_angle_deg": 33.0},
@@ -36,6 +36,7 @@ EXCEPTIONS = [
     {"ring": 2, "slot": 8, "displacement_m": [1e-4, -2e-4, 3e-4]},
     {"slot": 9, "rotation_deg": [0.1, -0.2, 0.15]},
     {"slot": 11, "shift_m": [1e-4, 2e-4, -1e-4], "twist_deg": 0.05},
+    {"ring": 2, "slot": 10, "tilt_deg": [0.1, -0.05]},
     {"ring": 2, "slot": 12, "rotation_deg": [0.1, 0.0, 0.1], "displacement_m": [1e-4, 0.0, 0.0],
      "magnetization_factor": -1.05, "inner_corner_loss": 0.2},
     {"slot": 13, "rotation_deg": [180.0, 0.0, 0.0]}]

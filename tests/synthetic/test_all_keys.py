@@ -71,6 +71,7 @@ EXCEPTIONS = {
     "rotation_deg": {"slot": 2, "rotation_deg": (1.0, 2.0, -3.0)},
     "shift_m": {"slot": 2, "shift_m": (1e-3, -2e-3, 3e-3)},
     "twist_deg": {"slot": 2, "twist_deg": 2.0},
+    "tilt_deg": {"slot": 2, "tilt_deg": (2.0, -1.0)},
 }
 OF_MATERIAL = ("recoil_permeability", "recoil_permeability_across")
 """Keys that change the reaction, and not the field in vacuum."""
@@ -396,7 +397,8 @@ def exceptions(draw, four_edges):
               "magnetization_factor": st.sampled_from([-1.0, 0.0, 0.9]),
               "displacement_m": st.tuples(small, small, small),
               "rotation_deg": st.tuples(*[st.floats(-4.0, 4.0)] * 3),
-              "shift_m": st.tuples(small, small, small), "twist_deg": st.floats(-2.0, 2.0)}
+              "shift_m": st.tuples(small, small, small), "twist_deg": st.floats(-2.0, 2.0),
+              "tilt_deg": st.tuples(*[st.floats(-2.0, 2.0)] * 2)}
     if four_edges:
         chosen |= {"magnetization_gradient": st.floats(-0.5, 0.5),
                    "inner_corner_loss": st.floats(0.0, 1.0)}

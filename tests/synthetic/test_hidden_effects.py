@@ -62,7 +62,8 @@ EQUAL = ("rings_swapped", "block_put_in_wrongly")
 NAMES = [
     "iron_ring", "recoil_permeability", "recoil_permeability_across", "block_displaced",
     "block_turned", "radial_gap", "azimuthal_gap", "ring_gap", "ring_twisted", "ring_shifted",
-    "ring_shifted_along", "blocks_swapped", "block_put_in_wrongly", "rings_swapped",
+    "ring_shifted_along", "ring_tilted", "ring_demagnetized", "halves_apart", "blocks_swapped",
+    "block_put_in_wrongly", "rings_swapped",
     "rings_turned", "block_flipped", "block_missing", "block_demagnetized",
     "corners_demagnetized", "magnetization_gradient", "temperature", "temperature_gradient",
     "inner_radius", "length", "background", "neighbour_magnet", "ferromagnetic_object",
@@ -72,7 +73,7 @@ NAMES = [
     "misalignment_zy", "planar_hall", "quadratic_nonlinearity", "cubic_nonlinearity",
     "sensor_position_x", "sensor_position_y", "sensor_position_z", "mapper_translation",
     "mapper_roll", "mapper_tilt_x", "mapper_tilt_y", "z_scale", "radius_scale", "arm_sag",
-    "eccentric_circle", "drift", "lag", "slow_readings", "vibration", "outliers",
+    "eccentric_circle", "drift", "gain_drift", "lag", "slow_readings", "vibration", "outliers",
     "wrong_radius", "swapped_axes",
     "sign_flipped_axis", "millimetres", "millitesla", "reversed_z", "rotated_by_one_block",
     "wrong_ring_count"]
@@ -342,6 +343,13 @@ def test_rings_that_move(magnet):
     np.testing.assert_allclose(
         rings(("ring_shifted_along", 1, 1e-3)), vacuum_field(upper, points)
         + vacuum_field(lower, points - np.array([0, 0, 1e-3])), atol=1e-10)
+    turn, middle = Rotation.from_rotvec([0.02, -0.01, 0.0]), np.array([0, 0, lower[0].centre[2]])
+    np.testing.assert_allclose(
+        rings(("ring_tilted", 1, 0.02, -0.01)), vacuum_field(upper, points) + turn.apply(
+            vacuum_field(lower, turn.inv().apply(points - middle) + middle)), atol=1e-10)
+    np.testing.assert_allclose(
+        rings(("ring_demagnetized", 1, 0.05)),
+        vacuum_field(upper, points) + 0.95 * vacuum_field(lower, points), atol=1e-10)
     turn = Rotation.from_euler("z", np.pi / 4)
     np.testing.assert_allclose(  # by one of eight slots
         rings(("rings_turned", 2, 1)), vacuum_field(lower, points) + turn.apply(

@@ -31,7 +31,7 @@ STATED = {
     "gain": [0.01, -0.02, 0.03], "crosstalk": {"xy": 0.004, "zx": -0.006},
     "planar_hall_per_T": [0.01, 0.02, -0.03], "quadratic_per_T": [0.01, 0.0, 0.02],
     "cubic_per_T2": [0.02, -0.01, 0.0], "offset_T": [1e-4, 2e-4, -3e-4],
-    "drift_T": [1e-4, -1e-4, 2e-4], "memory": 0.02}
+    "drift_T": [1e-4, -1e-4, 2e-4], "gain_drift": 2e-3, "memory": 0.02}
 
 
 def field(points):

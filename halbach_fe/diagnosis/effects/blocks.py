@@ -15,6 +15,7 @@ from halbach_fe.diagnosis.effects.base import (
     can_be_uneven,
     changed,
     each_block,
+    each_ring,
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -79,28 +80,41 @@ class BlockDemagnetizedEffect(Effect):
     def magnetization_change(
         self, nominal: NominalFields, place: Place
     ) -> Mapping[int, Floats] | None:
-        (number,) = blocks_at(nominal, place)
-        return {number: -nominal.magnetizations[number]}
+        return {number: -nominal.magnetizations[number] for number in blocks_at(nominal, place)}
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        (number,) = blocks_at(nominal, place)
-        return -nominal.block_fields[number][None]
+        return -nominal.block_fields[blocks_at(nominal, place)].sum(axis=0)[None]
 
     def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.derivative`: the loss is relative to the block without it, which may be
         reversed by another effect.
         """
-        (number,) = blocks_at(nominal, place)
         left = 1.0 - values[0]
         if left:
             return self.signature(nominal, place) / left
-        block = nominal.blocks[number]
-        return -nominal.intact_blocks[number].remanence * (
-            nominal.unit_fields[number] @ np.array(block.easy_axis))[None]
+        return -np.sum([nominal.intact_blocks[number].remanence * (
+            nominal.unit_fields[number] @ np.array(nominal.blocks[number].easy_axis))
+            for number in blocks_at(nominal, place)], axis=0)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         return with_exceptions(study, [BlockException(
-            ring=place.ring, slot=place.slot, magnetization_factor=1.0 - float(values[0]))])
+            ring=place.ring, slot=place.slot or None,
+            magnetization_factor=1.0 - float(values[0]))])
+
+
+class RingDemagnetizedEffect(BlockDemagnetizedEffect):
+    """All blocks of a ring are weaker by the same fraction: of another batch or grade, or warmer.
+
+    The remanences of two grades that follow each other differ by 3 to 4 %.
+    """
+
+    name = "ring_demagnetized"
+    title = "ring of weaker blocks"
+    parameters = (Parameter("loss", "1", 0.03),)
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """Return several rings: of one alone, it is what all blocks share."""
+        return rings if len(rings := each_ring(study)) > 1 else []
 
 
 class BlockDisplacedEffect(Effect):
@@ -207,5 +221,5 @@ class CornersDemagnetizedEffect(Effect):
 
 
 EFFECTS = (BlockMissingEffect(), BlockFlippedEffect(), BlockDemagnetizedEffect(),
-           BlockDisplacedEffect(), BlockTurnedEffect(), MagnetizationGradientEffect(),
-           CornersDemagnetizedEffect())
+           RingDemagnetizedEffect(), BlockDisplacedEffect(), BlockTurnedEffect(),
+           MagnetizationGradientEffect(), CornersDemagnetizedEffect())

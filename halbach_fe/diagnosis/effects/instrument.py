@@ -136,6 +136,9 @@ EFFECTS = (
     _row("lag", "lag of the readings behind the stage", "distance", "m", 3e-4, _plus("lag_m"),
          shown_by=goes_both_ways),
     _row("drift", "drift of the zeros during the scan", "x y z", "T", 1e-4, _plus("drift_T")),
+    # a magnet of NdFeB that gets warmer by a degree has lost a part in a thousand
+    _row("gain_drift", "drift of the readings in proportion to the field, as of a warming magnet",
+         "change", "1", 1e-3, _plus("gain_drift")),
     *(_row(name, f"mapper turned about {COMPONENTS[axis]}", "angle", "rad", 2e-3, _turned(axis))
       for axis, name in enumerate(("mapper_tilt_x", "mapper_tilt_y", "mapper_roll"))),
     *(_row(f"{name}_{COMPONENTS[axis]}", title.format(COMPONENTS[axis]), amplitudes, unit, sd,

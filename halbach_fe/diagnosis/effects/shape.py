@@ -7,6 +7,7 @@ blocks that move.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -26,6 +27,7 @@ from halbach_fe.diagnosis.effects.base import (
     with_remanence,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import Array, BlockException
 from halbach_fe.study.model import Study
 
@@ -61,6 +63,7 @@ class MoveRow(Effect):
 
     ``by_block`` returns the change (k, n, 3) in T per unit of each amplitude that a block, by its
     number, makes; ``moved`` the exceptions by the amplitudes. Blocks at the place move, or all.
+    Of the places, ``few`` that are evenly chosen are compared first, or all.
     """
 
     name: str
@@ -72,10 +75,14 @@ class MoveRow(Effect):
     defining: tuple[str, ...] = ()
     relative_odds: float = 1.0
     moves_all: bool = False
+    few: int = 0
     kind: Literal["field", "instrument"] = "field"
 
     def places(self, study: Study) -> Sequence[Place]:
         return self.where(study)
+
+    def representatives(self, places: Sequence[Place]) -> Sequence[Place]:
+        return places[::max(1, len(places) // self.few)] if self.few else places
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal, place)
@@ -111,9 +118,41 @@ def _outwards(nominal: NominalFields, place: Place, number: int) -> list[Floats]
     return _along(np.cos(angle) * X + np.sin(angle) * Y)(nominal, place, number)
 
 
+def _out_and_in(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes whose ring is pressed oval, along x and between the axes."""
+    (change,) = _outwards(nominal, place, number)
+    return [part * change for part in _oval(nominal.blocks[number].angle_deg)]
+
+
+def _oval(angle_deg: float) -> tuple[float, float]:
+    """Return how far a block is moved outwards by an oval along x, and by one at 45 degrees."""
+    turn = 2 * np.radians(angle_deg)
+    return float(np.cos(turn)), float(np.sin(turn))
+
+
+def _ovals_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
+    """Return the displacements of the blocks of oval rings, by slots if the rings are equal."""
+    alike = study.array.is_uniform
+    return [BlockException(
+        ring=None if alike else block.ring, slot=block.slot,
+        displacement_m=(float(np.dot(values, _oval(block.angle_deg))), 0.0, 0.0))
+        for block in build_magnet(study).blocks if block.ring == 1 or not alike]
+
+
 def _about_z(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
     """Return what a block changes that turns about the magnet's axis."""
     return [nominal.block_rotation_derivative(number, Z, np.zeros(3))]
+
+
+def _about_its_middle(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that tilts about x and y with its ring."""
+    centre = nominal.blocks[number].middle * Z
+    return [nominal.block_rotation_derivative(number, axis, centre) for axis in (X, Y)]
+
+
+def _several_rings(study: Study) -> list[Place]:
+    """Return a place for every ring, unless there is only one: that is a displaced mapper."""
+    return rings if len(rings := each_ring(study)) > 1 else []
 
 
 def _apart(rings: int, seam: int, ring: int) -> float:
@@ -138,6 +177,56 @@ def _gap_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockEx
         0.0, 0.0, _apart(rings, place.ring, ring) * gap + shift)) for ring in range(1, rings + 1)]
 
 
+def _planes(study: Study) -> list[Place]:
+    """Return the planes through the axis that pass between the blocks of every ring, none in two
+    dimensions; ``at_m`` is the angle in degrees of the normal.
+    """
+    if study.dimension == 2:
+        return []
+    blocks = [block for block in build_magnet(study).blocks if block.remanence]
+    middles = np.array([block.middle[:2] for block in blocks])
+    counts = Counter(block.ring for block in blocks)
+    # distance from the plane of a block beside it, at least: half of that of a regular ring
+    least = np.sin(np.pi / 2 / np.array([counts[block.ring] for block in blocks]))
+    first = [block.angle_deg for block in blocks if block.ring == blocks[0].ring]
+    pitch, on_axis_m = 360 / len(first), 1e-9
+    angles = sorted({round((angle + pitch / 2 + 90) % 180, 6) for angle in first})
+    radius = np.hypot(*middles.T)
+    return [Place(at_m=(angle,), words=f"at the plane whose normal is at {angle:.4g}°")
+            for angle in angles if radius.min() > on_axis_m and (
+                np.abs(middles @ _in_plane(angle)[0][:2]) > least * radius).all()]
+
+
+def _in_plane(angle_deg: float) -> Floats:
+    """Return normal, direction across the axis, and axis (3, 3) of a plane through the axis."""
+    angle = np.radians(angle_deg)
+    normal = np.cos(angle) * X + np.sin(angle) * Y
+    return np.array([normal, np.cross(Z, normal), Z])
+
+
+def _side(middle: Floats, place: Place) -> float:
+    """Return 1/2 of a block beyond a plane, and -1/2 of others."""
+    return 0.5 if middle @ _in_plane(place.at_m[0])[0] > 0 else -0.5
+
+
+def _half(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that moves with its half of the magnet."""
+    side = _side(nominal.blocks[number].middle, place)
+    return [side * change for change in _along(*_in_plane(place.at_m[0]))(nominal, place, number)]
+
+
+def _halves_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
+    """Return the displacements of both halves, by slots if these are the same in all rings."""
+    shift = np.array(values) @ _in_plane(place.at_m[0])
+    sides: dict[int, dict[int, float]] = {}
+    for block in build_magnet(study).blocks:
+        sides.setdefault(block.slot, {})[block.ring] = _side(block.middle, place)
+    return [BlockException(ring=ring, slot=slot, shift_m=tuple((side * shift).tolist()))
+            for slot, rings in sides.items()
+            for ring, side in (rings.items() if len(set(rings.values())) > 1
+                               else [(None, next(iter(rings.values())))])]
+
+
 EFFECTS = (
     ShapeRow("inner_radius", "inner radius of the blocks", (Parameter("difference", "m", 3e-4),),
              1e-4, lambda array, more: {"inner_radius_m": array.inner_radius_m + more}),
@@ -155,14 +244,27 @@ EFFECTS = (
                 BlockException(ring=place.ring, shift_m=(values[0], values[1], 0.0))]),
     # blocks of a table at one height are a ring; all rings together are a displaced mapper
     MoveRow("ring_shifted_along", "displacement of a ring along the axis",
-            (Parameter("z", "m", 3e-4),),
-            lambda study: rings if len(rings := each_ring(study)) > 1 else [], _along(Z),
+            (Parameter("z", "m", 3e-4),), _several_rings, _along(Z),
             lambda study, place, values: [
                 BlockException(ring=place.ring, shift_m=(0.0, 0.0, values[0]))]),
     MoveRow("ring_twisted", "rotation of a ring about the axis",
             (Parameter("angle", "rad", 2e-3),), each_ring, _about_z,
             lambda study, place, values: [
                 BlockException(ring=place.ring, twist_deg=float(np.degrees(values[0])))]),
+    # a shim of 0.1 mm at one side of a ring of 10 cm is 1 mrad
+    MoveRow("ring_tilted", "tilt of a ring", (
+        Parameter("x", "rad", 2e-3), Parameter("y", "rad", 2e-3)), _several_rings,
+            _about_its_middle, lambda study, place, values: [BlockException(
+                ring=place.ring, tilt_deg=tuple(np.degrees(values).tolist()))]),
+    MoveRow("rings_oval", "oval rings", (Parameter("along x", "m", 2e-4),
+                                         Parameter("at 45 degrees", "m", 2e-4)),
+            lambda study: [Place()], _out_and_in, _ovals_of, moves_all=True),
+    # of a magnet that opens; what both halves share is a displaced mapper. Planes that are 30
+    # degrees apart leave five of six blocks in the same half.
+    MoveRow("halves_apart", "displacement of half the magnet", (
+        Parameter("apart", "m", 2e-4), Parameter("sideways", "m", 2e-4),
+        Parameter("axial", "m", 2e-4)), _planes, _half, _halves_of, moves_all=True,
+            few=6),
     # Which rings a gap has moved depends on where the others are held. Therefore all of them may
     # have moved along z as well, which alone is no gap.
     MoveRow("ring_gap", "gap between two rings",

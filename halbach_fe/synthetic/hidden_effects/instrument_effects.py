@@ -161,6 +161,11 @@ def drift(instrument: FaultyInstrument, site: Site, value: float) -> FaultyInstr
     return replace(instrument, drift=instrument.drift + value)
 
 
+def gain_drift(instrument: FaultyInstrument, site: Site, change: float) -> FaultyInstrument:
+    """Let all readings grow with time in proportion to the field, by a fraction over the map."""
+    return replace(instrument, gain_drift=instrument.gain_drift + change)
+
+
 def lag(instrument: FaultyInstrument, site: Site, distance: float) -> FaultyInstrument:
     """Read the field behind where the stage is on its way."""
     return replace(instrument, lag=instrument.lag + distance)
@@ -220,6 +225,8 @@ def _effects() -> Iterator[HiddenEffect]:
                        instrument=eccentric_circle, needs=("circles",))
     yield HiddenEffect("drift", "instrument", (HiddenParameter("value", "T"),),
                        draw_number(1e-4, 1e-3), instrument=drift)
+    yield HiddenEffect("gain_drift", "instrument", (HiddenParameter("change"),),
+                       draw_number(5e-4, 5e-3), instrument=gain_drift)
     yield HiddenEffect("lag", "instrument", (HiddenParameter("distance", "m"),),
                        draw_length(1e-4, 5e-4, False), instrument=lag, needs=("3d",))
     yield HiddenEffect("slow_readings", "instrument",

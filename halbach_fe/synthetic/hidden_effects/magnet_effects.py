@@ -188,6 +188,37 @@ def ring_shifted_along(magnet: TrueMagnet, site: Site, ring: float, z: float) ->
     return _bodies(magnet, lambda body: _moved(body, (0.0, 0.0, z)), _of_ring(ring))
 
 
+def ring_tilted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float) -> TrueMagnet:
+    """Turn one ring about its middle by a rotation vector across the axis."""
+    turn = Rotation.from_rotvec([x, y, 0.0])
+
+    def tilted(body: Body) -> Body:
+        centre = np.array([0.0, 0.0, body.centre[2]])
+        return replace(
+            body, displacement=vector(
+                turn.apply(body.position - centre) + centre - np.array(body.centre)),
+            rotation=vector((turn * Rotation.from_rotvec(body.rotation)).as_rotvec()))
+
+    return _bodies(magnet, tilted, _of_ring(ring))
+
+
+def halves_apart(magnet: TrueMagnet, site: Site, slot: float, apart: float, sideways: float,
+                 z: float) -> TrueMagnet:
+    """Move both sides of a plane through the axis, half a slot beyond a slot's middle, apart."""
+    own = [body for body in magnet.bodies if body.ring == 1]
+    beside = next(body for body in own if body.slot == slot)
+    direction = np.arctan2(*beside.centre[1::-1]) + np.pi / len(own) + np.pi / 2
+    normal = np.array([np.cos(direction), np.sin(direction), 0.0])
+    shift = apart * normal + sideways * np.cross([0, 0, 1], normal) + [0, 0, z]
+    return _bodies(magnet, lambda body: _moved(
+        body, vector(np.sign(normal @ body.centre) / 2 * shift)))
+
+
+def ring_demagnetized(magnet: TrueMagnet, site: Site, ring: float, fraction: float) -> TrueMagnet:
+    """Take a fraction off the magnetization of all blocks of a ring."""
+    return _bodies(magnet, lambda body: _scaled(body, 1 - fraction), _of_ring(ring))
+
+
 def inner_radius(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
     """Increase the inner radius of all blocks by ``more``; their outer faces stay."""
     def shorter(body: Body) -> Body:
@@ -456,6 +487,24 @@ EFFECTS = (
                  lambda site, generator: (draw_place(site, generator)[0],
                                           site.scale * signed_log_uniform(generator, 2e-4, 1e-3)),
                  ring_shifted_along, needs=("3d", "rings")),
+    HiddenEffect("ring_tilted", "field",
+                 (HiddenParameter("ring"), HiddenParameter("x", RAD), HiddenParameter("y", RAD)),
+                 lambda site, generator: (
+                     draw_place(site, generator)[0],
+                     *(log_uniform(generator, 1e-3, 5e-3) * value
+                       for value in draw_direction(generator, 2)[:2])),
+                 ring_tilted, needs=("3d", "rings")),
+    HiddenEffect("ring_demagnetized", "field", (HiddenParameter("ring"), LOST),
+                 lambda site, generator: (draw_place(site, generator)[0],
+                                          log_uniform(generator, 0.02, 0.08)),
+                 ring_demagnetized, needs=("3d", "rings")),
+    HiddenEffect("halves_apart", "field",
+                 (HiddenParameter("slot"), HiddenParameter("apart", M),
+                  HiddenParameter("sideways", M), HiddenParameter("z", M)),
+                 lambda site, generator: (
+                     draw_place(site, generator)[1],
+                     site.scale * log_uniform(generator, 2e-4, 1e-3), 0.0, 0.0),
+                 halves_apart, needs=("3d", "equal rings")),
     HiddenEffect("blocks_swapped", "field",
                  (*BLOCK, HiddenParameter("other_ring"), HiddenParameter("other_slot")), _draw_swap,
                  blocks_swapped),
