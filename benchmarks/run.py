@@ -52,14 +52,15 @@ PARTS = {"response": response.run, "nonlinear": nonlinear.run,
          "design": design.run, "mri": mri.run, "first_field": front.first_field,
          "no_root": front.no_root, "speed": speed.run, "speed_small": speed.small,
          "speed_full": speed.full, "speed_permeability": speed.permeability,
-         "speed_solvers": speed.solvers, "speed_waiting": speed.waiting}
+         "speed_solvers": speed.solvers, "speed_waiting": speed.waiting,
+         "speed_quadrupole": speed.quadrupole}
 ALONE = ("recovery", "recipe", "scaling", "moments", "iron3d", "iron_any", "team13",
          "calibration", "check", "joined",
          "overlap", "unknown", "suspicion",
          "campaign_kinds", "campaign_knee", "real", "real_mri", "faser",
          "design", "mri", "first_field", "no_root", "speed", "speed_small", "speed_full",
          "speed_permeability",
-         "speed_solvers", "speed_waiting")
+         "speed_solvers", "speed_waiting", "speed_quadrupole")
 """Parts that are measured only when they are named: they take long."""
 
 

@@ -218,6 +218,36 @@ def root_matrix(root: Floats | sparse.csr_array | CovarianceFactor) -> Floats | 
     return np.asarray(root) if root.remaining.size else root.outer
 
 
+def largest_directions(matrix: Floats, smallest: float) -> Floats:
+    """Return the right singular vectors (k, r) of a matrix (n, k) of values above ``smallest``.
+
+    They are eigenvectors of the smaller Gram matrix. Of a large one, of which few values are so
+    large, a subspace is iterated that is larger (N. Halko, P. G. Martinsson, J. A. Tropp, SIAM Rev.
+    53 (2011) 217), until it has values that are too small.
+    """
+    wide = len(matrix) < matrix.shape[1]
+    gram = matrix @ matrix.T if wide else matrix.T @ matrix
+    most, turns = len(gram) // 3, 2  # size up to which the subspace takes less time; iterations
+    # With two iterations and values below half of the smallest one in the subspace, the largest
+    # part of a wanted direction outside of it was 6e-3 of the smallest value: 434 of 3637.
+    size, spare = max(64, len(gram) // 6), 0.5
+    generator = np.random.default_rng(0)
+    while size <= most:
+        basis = generator.standard_normal((len(gram), size))
+        for _ in range(turns):
+            basis = np.linalg.qr(gram @ basis)[0]
+        squares, inside = np.linalg.eigh(basis.T @ gram @ basis)
+        if squares[0] < (spare * smallest)**2:
+            vectors = basis @ inside
+            break
+        size *= 2
+    else:
+        squares, vectors = np.linalg.eigh(gram)
+    kept = squares > smallest**2
+    found = vectors[:, kept]
+    return np.asarray(matrix.T @ (found / np.sqrt(squares[kept])) if wide else found)
+
+
 def remounted_root(
     root: Floats | CovarianceFactor, turns: Floats, sources: Ints
 ) -> CovarianceFactor:

@@ -25,6 +25,7 @@ from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_bl
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.response.resource_estimate import machine_speed
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks_file import read_free_blocks, write_free_blocks
 from halbach_fe.study.reader import read_study
@@ -248,13 +249,16 @@ class Case:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick(getdp):
+def quick(getdp, tmp_path_factory):
     """Find GetDP once, and measure once how fast this machine is, which estimates ask for.
 
-    Elements of iron are three times as large as usual: only keys are tried here.
+    Elements of iron are three times as large as usual: only keys are tried here. Commands share
+    their runs of GetDP by a cache: one that passes over a key asks for another run than `solve`.
     """
     speed, fine = machine_speed(), Sizes.of
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(FOLDER_VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        patch.setenv(LIMIT_VARIABLE, "1")
         patch.setattr("halbach_fe.response.resource_estimate.machine_speed", lambda: speed)
         patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
         patch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 3.0 * coarseness))
@@ -278,7 +282,7 @@ def made_case(name, document, folder):
     """Write a study, solve it, and write the map and the table of its blocks."""
     study = folder / "study.toml"
     study.write_text(tomlkit.dumps(_with_file(document, folder)))
-    assert main(["solve", str(study), "-o", str(folder / "solved"), "--json", "--no-cache"]) == 0
+    assert main(["solve", str(study), "-o", str(folder / "solved"), "--json"]) == 0
     data = read_map(folder / "solved" / "field_map.h5")
     write_map(field_map(points_of(data), data["B_T"].values), folder / "map.csv")
     magnet = build_magnet(read_study(study))
@@ -327,8 +331,6 @@ def run(case: Case, command: str, capsys: pytest.CaptureFixture[str]) -> tuple[i
     folder.mkdir(exist_ok=True)
     output = folder / "blocks.csv" if verb == "export" else folder
     more = [] if verb == "export" else ["--json"]
-    if verb not in ("export", "prior", "simulate-measurement"):
-        more.append("--no-cache")
     capsys.readouterr()
     code = main([verb, str(case.study), *options, "-o", str(output), *more])
     shown = capsys.readouterr()

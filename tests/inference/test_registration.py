@@ -18,6 +18,7 @@ from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.campaign_registration import _of_known_probe
 from halbach_fe.inference.infer import infer
+from halbach_fe.inference.pose_fit import PoseFit
 from halbach_fe.inference.pose_result import OpenKey, ProbePrior
 from halbach_fe.inference.pose_search import _after_no_pose, coarse_poses, right_angles
 from halbach_fe.inference.registration import (
@@ -311,6 +312,34 @@ def test_every_pose_has_its_own_derivatives(magnet, generator, tmp_path):
         value, sd = each.open_keys["array.ring_length_m"]
         assert value == pytest.approx(0.0303, abs=max(4 * sd, 2e-5))
         assert each.at_rest
+
+
+def test_a_large_map_is_fitted_by_a_few_readings_first(magnet, generator, tmp_path, monkeypatch):
+    """All readings decide: the pose is that of a fit of all of them from the start."""
+    side = np.linspace(-0.004, 0.004, 9)
+    points = np.array([(x, y, z) for x in side for y in side
+                       for z in np.linspace(-0.02, 0.02, 11)])
+    turn, middle = Rotation.from_rotvec([0.02, -0.03, 0.04]), np.array([8e-4, -5e-4, 0.012])
+    blocks = truth(generator)
+    field = turn.inv().apply(blocks.getB(turn.apply(points) + middle))
+    data = field_map(points, field + NOISE_T * generator.standard_normal(field.shape))
+    counts, rest = [], PoseFit._come_to_rest
+
+    def counted(self, *arguments):
+        counts.append(len(self.points))
+        return rest(self, *arguments)
+
+    monkeypatch.setattr(PoseFit, "_come_to_rest", counted)
+    found = register(magnet, data, Session.open(tmp_path), most=1)[0]
+    assert counts[0] < len(points) / 2
+    assert counts[1] == len(points)
+    monkeypatch.setattr(PoseFit, "_few", None)
+    whole = register(magnet, data, Session.open(tmp_path), most=1)[0]
+    assert (np.abs(found.middle_m - whole.middle_m) < 0.1 * whole.translation_sd_m).all()
+    # both end when chi-squared of 2700 decreases by less than a thousandth
+    assert found.log_evidence == pytest.approx(whole.log_evidence, abs=1.0)
+    assert found.translation_sd_m == pytest.approx(whole.translation_sd_m, rel=0.02)
+    assert (np.abs(found.middle_m - middle) < 4 * found.translation_sd_m).all()
 
 
 def test_readings_that_the_study_excludes_are_not_fitted(magnet, generator, tmp_path):

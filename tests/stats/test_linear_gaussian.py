@@ -8,7 +8,7 @@ from scipy import stats
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.stats import linear_gaussian
-from halbach_fe.stats.gaussian import Gaussian, by_readings_alone, nominal_prior
+from halbach_fe.stats.gaussian import Gaussian, by_readings_alone, largest_directions, nominal_prior
 from halbach_fe.stats.linear_gaussian import contraction, posterior, predict, update, whitened
 from halbach_fe.stats.noise import independent_noise
 
@@ -283,3 +283,23 @@ def test_a_missing_block_is_known_to_be_missing():
     prior = nominal_prior(np.array([0.0, 0, 0, 100, 0, 0]), 3, 0.01, 1.0)
     assert not prior.sd[:3].any()
     assert prior.sd[3:].all()
+
+
+@pytest.mark.parametrize(("rows", "columns", "decay"), [
+    (500, 400, 0.85), (300, 400, 0.85), (500, 400, 0.9999), (30, 20, 0.5)])
+def test_largest_directions_are_those_of_the_singular_values(generator, rows, columns, decay):
+    """Of matrices of many rows and of few, whose values decay as those of a field, or hardly.
+
+    A subspace that is iterated leaves 1e-2 of the smallest value outside; without the iteration,
+    a part as large as the value would be.
+    """
+    left, right = (np.linalg.qr(generator.standard_normal((size, min(rows, columns))))[0]
+                   for size in (rows, columns))
+    values = decay**np.arange(min(rows, columns))
+    matrix, smallest = left * values @ right.T, 1e-4 if decay < 0.9999 else 0.95
+    found = largest_directions(matrix, smallest)
+    wanted = right[:, values > smallest]
+    assert found.shape == wanted.shape
+    assert np.allclose(found.T @ found, np.eye(found.shape[1]), rtol=0, atol=1e-6)
+    outside = matrix @ (wanted - found @ (found.T @ wanted))
+    assert np.linalg.norm(outside, ord=2) < 0.01 * smallest

@@ -348,17 +348,16 @@ class Interaction:
         local, weights = gauss_nodes(cells.vertices, cells.half, 2)
         return cells.centre[:, None] + local @ np.swapaxes(cells.axes, 1, 2), weights
 
-    def near_node_matrices(self, reach: float) -> tuple[Neighbours, Floats]:
-        """Return near pairs of cells, and field matrices of the sources at the nodes.
-
-        The matrices are (n, q, 3, 3). The pairs are those whose distance is at most ``reach`` times
-        the sum of their radii.
-        """
+    def pairs_within(self, reach: float) -> Neighbours:
+        """Return near pairs of cells, up to ``reach`` times the sum of their radii apart."""
         close = self._pairs[1]
         targets = close.targets
         chosen = near.touching(targets, close.sources, self.cells.centre, self.cells.radius, reach)
-        close = Neighbours.of(targets[chosen], close.sources[chosen], len(self.cells))
-        return close, matrix_of(self._node_matrices(close.targets, close.sources))
+        return Neighbours.of(targets[chosen], close.sources[chosen], len(self.cells))
+
+    def node_matrices(self, targets: Ints, sources: Ints) -> Floats:
+        """Return the field matrices (n, q, 3, 3) of source cells at the nodes of target cells."""
+        return matrix_of(self._node_matrices(targets, sources))
 
     def _node_matrices(self, targets: Ints, sources: Ints) -> Floats:
         """Return the field matrices (n, q, 6) of source cells at the nodes of target cells."""

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array
+from scipy.sparse import bsr_array, csc_array
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
@@ -389,10 +389,11 @@ class _Deviations:
     close : Neighbours
         Pairs of a cell and the near ones that polarize it.
     matrices : ndarray, shape (pairs, q, 3, 3)
+        In single precision, whose error is 1e-7 of these polarizations.
     """
 
     close: Neighbours
-    matrices: Floats
+    matrices: NDArray[np.float32]
 
     def add(self, by_node: Floats, to: Floats) -> None:
         """Add readings per polarization of the cells, by those per polarization of the nodes.
@@ -418,18 +419,29 @@ def _deviations(system: System) -> tuple[_Deviations, Any]:
     # distance of cells, in units of the sum of their radii, up to which the field of one makes the
     # polarization of the other vary
     reach = 1.2
-    close, field = system.interaction.near_node_matrices(reach)
-    targets, shape = close.targets, (3 * nodes * count, 3 * count)
+    close = system.interaction.pairs_within(reach)
+    targets, size = close.targets, 3 * count
+    found = np.empty((len(targets), nodes, 3, 3), np.float32)
+    extra = csc_array((size, size))
+    pairs_at_once = 20_000  # whose matrices are in memory in double precision, 40 MB
+    for first, last in close.shares(1 + len(targets) // pairs_at_once):
+        some = slice(close.starts[first], close.starts[last])
+        target, source = targets[some], close.sources[some]
+        starts = close.starts[first:last + 1] - close.starts[first]
+        field = system.interaction.node_matrices(target, source)
 
-    def sparse(blocks: Floats) -> Any:
-        return bsr_array((blocks.reshape(-1, 3 * nodes, 3), close.sources, close.starts), shape)
+        def sparse(blocks: Floats, source: Ints = source, starts: Ints = starts) -> Any:
+            return bsr_array((blocks.reshape(-1, 3 * nodes, 3), source, starts),
+                             (3 * nodes * (len(starts) - 1), size))
 
-    # by reciprocity, as in near.add_of_deviations
-    share = (cells.weights * cells.volume[:, None])[targets] / cells.volume[close.sources, None]
-    means = sparse(field * share[..., None, None])
-    field -= np.einsum("pq,pqij->pij", cells.weights[targets], field)[:, None]
-    matrices = system.susceptibility[targets, None] @ field
-    return _Deviations(close, matrices), (means.T @ sparse(matrices)).tocsc()
+        # by reciprocity, as in near.add_of_deviations
+        share = (cells.weights * cells.volume[:, None])[target] / cells.volume[source, None]
+        means = sparse(field * share[..., None, None])
+        field -= np.einsum("pq,pqij->pij", cells.weights[target], field)[:, None]
+        field = system.susceptibility[target, None] @ field
+        extra = extra + (means.T @ sparse(field)).tocsc()
+        found[some] = field
+    return _Deviations(close, found), extra
 
 
 @dataclass(frozen=True)
