@@ -310,7 +310,7 @@ def test_a_fine_map_between_the_points_of_a_coarse_one(generator, order):
     joined = join_checked(maps, QUIET)
     (pose,) = joined.poses
     assert order * pose.shift_m == pytest.approx(shift, abs=max(5 * pose.shift_sd_m.max(), 1e-6))
-    # its pose has bars of 6 to 9 mm, by which one point of the coarse map may come into the fine one
+    # its pose has bars of 6 to 9 mm: one point of the coarse map may come into the fine one
     assert joined.overlaps[0].name == "part1"
     assert all(one.readings <= 3 for one in joined.overlaps[1:])
     json.dumps(joined.plain(), allow_nan=False)
