@@ -118,8 +118,10 @@ deviation, and of the scatter of all other layers along the axis. The first plan
 dipole, which the stage came to from the other side, was off by 0.36 mm: 26 and 9 of these units,
 and no other layer by more than 7 and 4."""
 
-FEWEST_IN_LAYER, FEWEST_LAYERS = 8, 4
-"""Smallest number of points in an overlap that are a layer, and of layers that are compared."""
+FEWEST_IN_LAYER, FEWEST_LAYERS = 8, 5
+"""Smallest number of points in an overlap that are a layer, and of layers that are compared. Of
+four layers of a stage with a periodic error of 0.1 mm one seemed to be off the others, and the pose
+by these was 22 bars off."""
 
 TURNED_RAD = 0.5
 """Turn from which a stage has other axes than it states."""

@@ -216,10 +216,12 @@ def test_positions_that_lines_have_in_common_widen_the_bars(monkeypatch):
     assert np.abs(over_bars(joined_of(torn), poses)).max() > 4
 
 
-def test_a_plane_that_the_stage_came_to_from_the_other_side(generator):
+def test_a_plane_that_the_stage_came_to_from_the_other_side(generator, monkeypatch):
     """It is named and left out; before, the join was 0.1 mm off and both maps contradicted each
-    other. A scale of the stage, the control, displaces all planes and is no such one.
+    other. A scale of the stage, the control, displaces all planes and is no such one. The overlap
+    has four planes, of which otherwise none is left out.
     """
+    monkeypatch.setattr(map_join, "FEWEST_LAYERS", 4)
     maps, poses, magnet = campaign(0, maps=2)
     first = POINTS[:, 2] == 0
     late = read(magnet, poses[1], generator, were=POINTS + 3e-4 * first[:, None] * [0, 0, 1])
@@ -318,7 +320,9 @@ def test_a_fine_map_between_the_points_of_a_coarse_one(generator, order):
     joined = join_checked(maps, QUIET)
     (pose,) = joined.poses
     assert order * pose.shift_m == pytest.approx(shift, abs=max(5 * pose.shift_sd_m.max(), 1e-6))
-    assert [one.name for one in joined.overlaps] == ["part1"]
+    # its pose has bars of 6 to 9 mm: one point of the coarse map may come into the fine one
+    assert joined.overlaps[0].name == "part1"
+    assert all(one.readings <= 3 for one in joined.overlaps[1:])
     json.dumps(joined.plain(), allow_nan=False)
 
 
@@ -367,7 +371,7 @@ def test_a_turn_about_a_far_dipole_is_not_determined(monkeypatch):
     Control: counted as such, it makes bars of which errors are many.
     """
     off = []
-    for seed in (5, 7):  # of 8 draws those with the largest errors
+    for seed in (7, 5):  # of 8 draws those with the largest errors
         maps, poses = coarse_maps(seed, 1)
         joined = join_checked(maps, QUIET)
         assert "does not determine the turn about" in answer(joined).trust
