@@ -62,9 +62,9 @@ SLICE = 25
 """Number of points along the sides of the slices that are drawn."""
 
 NEAR_SHARE = 0.7
-"""Distance of points of a region from each other, relative to their distance from the nearest block.
-Of cubes of 12 mm that come within 0.5 to 4 mm of the region, the largest |B| was then found to 0.2 %,
-but with points at 1.5 to 4 times that distance the peak to peak value was up to half too large."""
+"""Distance of points of a region from each other, relative to their distance from the nearest
+block. Of cubes of 12 mm that come within 0.5 to 4 mm of the region, the peak to peak value was then
+found to 0.5 %, but with points at 1.5 to 8 times that distance it was up to half too large."""
 
 CLOSER = 3
 """How often points are added about the smallest and the largest |B|, at half the distance."""
@@ -268,6 +268,15 @@ class Region:
         unit = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
         return np.asarray(np.array(self.centre_m) + unit * self.half_axes_m)
 
+    def nodes(self, cells: Floats, size: int) -> tuple[Floats, Floats]:
+        """Return Gauss's points (n size^3, 3) in m of cells (n, 3, 2), and their weights."""
+        nodes, weights = np.polynomial.legendre.leggauss(size)
+        unit = np.stack(np.meshgrid(*3 * [nodes], indexing="ij"), axis=-1).reshape(-1, 3)
+        half = np.ptp(cells, axis=2) / 2
+        places = (cells.mean(axis=2)[:, None] + half[:, None] * unit).reshape(-1, 3)
+        volume = np.outer(half.prod(axis=1), np.einsum("i,j,k->ijk", *3 * [weights])).ravel()
+        return self.places(places), volume * places[:, 0]**(1 if self.shape == "cylinder" else 2)
+
     def cells(self, surface: bool) -> Floats:
         """Return cells (n, 3, 2) of the `places` that make up the region, or its surface."""
         turns, heights = np.linspace(0, 2 * np.pi, 17), np.linspace(-1, 1, 5)
@@ -423,6 +432,8 @@ class Sampling:
         Degree of the functions that these resolve, see `Region.points`.
     unresolved_m : float
         Distance in m at which blocks are too near for the points; 0 if none is.
+    near_shims : bool
+        Whether means over the volume are those of more points, where shims are near.
     """
 
     points: Floats
@@ -431,6 +442,7 @@ class Sampling:
     surface: int
     degree: int
     unresolved_m: float = 0.0
+    near_shims: bool = False
 
     @property
     def doubt(self) -> str:
@@ -618,7 +630,9 @@ def _climbed(
     near = distance <= reach
     away = (unit[near] - unit[start]) * region.half_axes_m
     scale = float(np.linalg.norm(away, axis=1).max())
-    weight = np.exp(-(near_distance / reach * distance[near] / weighed_distance)**2)[:, None, None]
+    if reach > 2 * near_distance:  # few points are near, so that farther ones determine the fit
+        weighed_distance *= reach / near_distance
+    weight = np.exp(-(distance[near] / weighed_distance)**2)[:, None, None]
     design = solid_harmonic_fields(away / scale, local_degrees)
     amplitudes = np.linalg.lstsq((weight * design).reshape(-1, unknowns),
                                  (weight * fields[near]).reshape(-1, fields.shape[2]),
@@ -738,41 +752,54 @@ def _resolved(
 ) -> Sampling:
     """Add points to those of a region where blocks are nearer than these are to each other.
 
-    They do not count in means over the volume, which the others resolve well enough.
+    They count in means over the volume where shims are near; those of blocks the others resolve
+    to 0.5 %.
     """
     axes, spacing = np.array(region.half_axes_m), base.steps[0] * region.half_axes_m
-    far = float(spacing.max()) / NEAR_SHARE
+    # of no cell that is halved the middle is farther from the blocks
+    far = 2 * float(axes.max()) / NEAR_SHARE
     blocks = (*present_blocks(magnet.blocks), *neighbour_blocks(
         magnet.blocks, magnet.external.neighbours), *shims)
     # distance up to which points are added, as if blocks that are nearer were so far away
     least = 1e-3 * magnet.bore_radius
 
     def distance(points: Floats) -> Floats:
-        found = distance_from_blocks(blocks, points, far)
-        return np.where(found < far, np.maximum(found, least), np.inf)
+        return np.maximum(distance_from_blocks(blocks, points, far), least)
 
-    more, lengths, resolved = [], [], True
+    parts, resolved = [], True
     for surface in (True, False):
         cells, sides, enough = halved(
             region.cells(surface), region.places, distance, NEAR_SHARE, MOST_CELLS)
-        fine = sides < spacing.max()
-        # of cells of the surface their corners, which are on its rims, too
-        ends = np.array([cells[fine][:, np.arange(3), list(corner)] for corner in product(
-            (0, 1), repeat=3)]) if surface else cells[fine].mean(axis=2)
-        more.append(ends.reshape(-1, 3))
-        lengths.append(np.resize(sides[fine], len(more[-1])))
+        parts.append((cells, sides))
         resolved = resolved and enough
-    if not len(more[0]):
+    (cells, sides), (inner, long) = parts
+    fine, small = sides < spacing.max(), long < spacing.max()
+    if not fine.any():
         return base
-    points = region.places(np.vstack(more))
+    # of cells of the surface their corners, which are on its rims, too
+    corners = np.vstack([cells[fine][:, np.arange(3), list(corner)]
+                         for corner in product((0, 1), repeat=3)])
+    length = np.tile(sides[fine], 8)
+    points = region.places(corners)
     _, first = np.unique(points.round(12), axis=0, return_index=True)
-    points, length = points[first], np.concatenate(lengths)[first]
-    own = np.append(NEAR_SHARE * distance(base.points), length)
+    points, length = points[first], length[first]
+    near_shims = len(shims) > 0 and bool((distance_from_blocks(
+        shims, base.points, far) < spacing.max() / NEAR_SHARE).any())
+    if near_shims:
+        nodes = [region.nodes(inner[~small], 3), region.nodes(inner[small], 2)]
+        more, weights = (np.concatenate(each) for each in zip(*nodes, strict=True))
+        lengths = np.append(np.repeat(long[~small] / 3, 27), np.repeat(long[small] / 2, 8))
+        base = replace(base, points=base.points[:base.surface])
+    else:
+        more, lengths = region.places(inner[small].mean(axis=2)), long[small]
+        weights = np.append(base.weights[base.surface:], np.zeros(len(more)))
+    own = np.concatenate([NEAR_SHARE * distance(base.points), lengths, length])
     nearest = float(distance_from_blocks(blocks, points, far).min())
     found = replace(
-        base, points=np.vstack([base.points, points]),
-        weights=np.append(base.weights, np.zeros(len(points))),
-        steps=np.minimum(own[:, None] / axes, base.steps[0]),
+        base, points=np.vstack([base.points, more, points]),
+        weights=np.concatenate([np.zeros(base.surface), weights / weights.sum(),
+                                np.zeros(len(points))]),
+        steps=np.minimum(own[:, None] / axes, base.steps[0]), near_shims=near_shims,
         unresolved_m=0.0 if resolved and nearest >= least else max(nearest, 0.0))
     return _about_extremes(region, found, blocks)
 
@@ -808,16 +835,20 @@ def _advice(magnet: Magnet, region: Region) -> str:
 
 
 def homogeneity_model(
-    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES
+    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES,
+    shims: Sequence[MagnetBlock] = (),
 ) -> HomogeneityModel:
     """Build the matrix from block magnetizations to the field in a region.
+
+    The field of ``shims``, which may be near, is not part of it, but varies little from point to
+    point.
 
     Raises
     ------
     StudyError
         If the study is a cross-section, or the region reaches into material.
     """
-    sampling = region_points(magnet, region, degrees)
+    sampling = region_points(magnet, region, degrees, shims)
     planes = slice_points(region)
     in_air = ~magnet.contains(planes)
     bare = magnet.with_(instrument=Instrument(), observation=FluxDensity(
