@@ -66,8 +66,9 @@ NEAR_SHARE = 0.7
 block. Of cubes of 12 mm that come within 0.5 to 4 mm of the region, the peak to peak value was then
 found to 0.5 %, but with points at 1.5 to 8 times that distance it was up to half too large."""
 
-CLOSER = 3
-"""How often points are added about the smallest and the largest |B|, at half the distance."""
+PEAKS, CLOSER = 6, 4
+"""Number of the smallest and of the largest |B| about which points are added, and how often, each
+time at half the distance."""
 
 MOST_CELLS = 8000
 """Number of cells of a surface or volume from which none is halved any more, which limits the
@@ -811,18 +812,25 @@ def _about_extremes(
 
     Next to blocks B may turn round, so that |B| falls to zero at single points.
     """
-    points, steps = sampling.points, sampling.steps
+    points, steps = sampling.points, sampling.steps.copy()
+    unit = (points - region.centre_m) / region.half_axes_m
     size = np.linalg.norm(field_of(blocks, points), axis=1)
     for sign in (-1.0, 1.0):
-        for _ in range(CLOSER):
-            best = int(np.argmax(sign * size))
-            unit = (points[best] - region.centre_m) / region.half_axes_m
-            more = np.array(region.centre_m) + region.half_axes_m * region.around(
-                unit, steps[best], 5).reshape(-1, 3)
-            points = np.vstack([points, more])
-            steps = np.vstack([steps, np.repeat(steps[best:best + 1] / 2, len(more), axis=0)])
-            steps[best] /= 2
-            size = np.append(size, np.linalg.norm(field_of(blocks, more), axis=1))
+        left = sign * size
+        for _ in range(PEAKS):
+            start = int(left.argmax())
+            left[np.linalg.norm((unit - unit[start]) / steps[start], axis=1) <= 2] = -np.inf
+            place, step, value = unit[start], steps[start].copy(), float(sign * size[start])
+            for _ in range(CLOSER):
+                around = region.around(place, step, 3).reshape(-1, 3)
+                more = np.array(region.centre_m) + region.half_axes_m * around
+                own = sign * np.linalg.norm(field_of(blocks, more), axis=1)
+                if own.max() > value:
+                    place, value = around[own.argmax()], float(own.max())
+                step = step / 2
+                points = np.vstack([points, more])
+                steps = np.vstack([steps, np.repeat(step[None], len(more), axis=0)])
+            steps[start] = step
     return replace(sampling, points=points, steps=steps, weights=np.append(
         sampling.weights, np.zeros(len(points) - len(sampling.points))))
 
