@@ -86,7 +86,6 @@ if TYPE_CHECKING:
     from halbach_fe.response.field_on_lines import Lines as Lines
     from halbach_fe.response.homogeneity import Region as Region
     from halbach_fe.response.magnetic_axis import MagneticAxis as MagneticAxis
-    from halbach_fe.response.magnetic_axis import magnetic_axis as magnetic_axis
     from halbach_fe.response.multipoles import MultipoleReference as MultipoleReference
     from halbach_fe.response.solution import Solution as Solution
     from halbach_fe.response.solution import solve as solve
@@ -114,7 +113,7 @@ _HOME = {
     "verify": "response.discretization_error", "multipoles": "api", "homogeneity": "api",
     "Lines": "response.field_on_lines", "FieldOnLines": "response.field_on_lines",
     "stray_field": "response.stray_field", "StrayField": "response.stray_field",
-    "magnetic_axis": "response.magnetic_axis", "MagneticAxis": "response.magnetic_axis",
+    "magnetic_axis": "api", "MagneticAxis": "response.magnetic_axis",
     "forces": "design.forces",
     "plan": "api", "shim": "api", "shim_tray": "design.shim_tray",
     "FilledTray": "design.shim_tray",

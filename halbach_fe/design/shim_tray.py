@@ -162,9 +162,13 @@ def shim_tray(
     region = region or default_region(magnet)
     choices = _Choices.of(tray, magnet.name)
     _check(magnet, choices, region)
-    model = homogeneity_model(magnet, region, session)
+    model = homogeneity_model(magnet, region, session, shims=choices.largest)
     before = model.of(posterior)
     chosen = _best(model, posterior, before, choices, tray)
+    if model.sampling.near_shims and (chosen != EMPTY).any():
+        # the points about the extremes are those of the shims that were chosen
+        model = homogeneity_model(magnet, region, session, shims=choices.magnets(chosen))
+        before = model.of(posterior)
     shimmed, known = _with_shims(model, posterior, choices.fields(model.points, chosen), tray)
     filled = []
     for place in np.flatnonzero(chosen != EMPTY).tolist():
@@ -237,15 +241,28 @@ class _Choices:
                     found[place, option] = unit @ self._direction(place, int(option))
         return found
 
-    def fields(self, points: Floats, chosen: Ints) -> Floats:
-        """Return B (shims, n, 3) in T at points (n, 3) in m of the magnets that were chosen."""
+    @property
+    def largest(self) -> list[MagnetBlock]:
+        """A block in every place that is as large as the largest magnet in each direction."""
+        sizes = np.array([each.size_m for each in self.tray.magnets]).max(axis=0).tolist()
+        largest = self.tray.magnets[0].with_(size_m=tuple(sizes))
+        return [_block(largest, place, float(phi), number)
+                for number, place, phi in zip(range(1, len(self.places) + 1), self.places,
+                                              self.azimuth, strict=True)]
+
+    def magnets(self, chosen: Ints) -> list[MagnetBlock]:
+        """Return the magnets that were chosen, in the order of their places."""
         found = []
         for place in np.flatnonzero(chosen != EMPTY).tolist():
             option = int(chosen[place])
-            block = self.blocks[int(self.kind[option])][place]
-            found.append(block.remanence * unit_field(block, points)
-                         @ self._direction(place, option))
-        return np.array(found).reshape(-1, len(points), 3)
+            found.append(replace(self.blocks[int(self.kind[option])][place],
+                                 easy_axis=vector(self._direction(place, option))))
+        return found
+
+    def fields(self, points: Floats, chosen: Ints) -> Floats:
+        """Return B (shims, n, 3) in T at points (n, 3) in m of the magnets that were chosen."""
+        return np.array([block.remanence * unit_field(block, points) @ block.easy_axis
+                         for block in self.magnets(chosen)]).reshape(-1, len(points), 3)
 
     def magnet_and_angle(self, option: int) -> tuple[int, float]:
         """Return the number of the magnet of a choice, and its angle from the radius in degrees."""
@@ -296,10 +313,8 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
             f"place {first + 1} of `shim_tray`", study,
             f"within {reach:.3g} m of the middle along z, where there is some field",
             f"{along[first]:.4g} m", "Is it in metres?"))
-    sizes = np.array([each.size_m for each in choices.tray.magnets]).max(axis=0).tolist()
-    largest = choices.tray.magnets[0].with_(size_m=tuple(sizes))
-    blocks = [_block(largest, place, float(phi), number + 1) for number, (place, phi) in enumerate(
-        zip(choices.places, choices.azimuth, strict=True))]
+    blocks = choices.largest
+    sizes = np.array([each.size_m for each in choices.tray.magnets]).max(axis=0)
 
     def refuse(number: int, what: str, hint: str) -> None:
         x, y, z = 1e3 * choices.places[number]
@@ -332,15 +347,21 @@ def _best(
     inner = model.weights > 0
     weight = np.sqrt(model.weights[inner])
 
-    def whitened(field: Floats) -> Floats:
-        """Return deviations in ppm (..., n) of B (..., n, 3); their squares sum to the variance."""
-        along = field @ before.direction
+    def whitened(along: Floats) -> Floats:
+        """Return deviations in ppm (..., n) of components of B (..., n) along the mean field.
+
+        Their squares sum to the variance.
+        """
         return PPM / before.mean_T * weight * (
             along - (along @ model.weights[inner])[..., None])
 
     field = (model.response.offset + model.response.matrix @ posterior.mean).reshape(-1, 3)
-    target = whitened(field[:len(inner)][inner])
-    effect = whitened(choices.all_fields(model.points[:len(inner)][inner]))
+    target = whitened(field[:len(inner)][inner] @ before.direction)
+    points = model.points[:len(inner)][inner]
+    at_once = 1000  # points whose fields are in memory with all components
+    effect = whitened(np.concatenate([
+        choices.all_fields(points[first:first + at_once]) @ before.direction
+        for first in range(0, len(points), at_once)], axis=-1))
     flat = effect.reshape(-1, effect.shape[-1])
     # an error that all shims share adds the square of their whole field
     search = _Search((1 + tray.common_sd**2) * (flat @ flat.T), flat @ target,

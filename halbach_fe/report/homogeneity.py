@@ -43,7 +43,8 @@ CONVENTION = (
     "(Schmidt) without the phase (-1)^m")
 
 SIZES = ("Deviations are those of |B| from its mean over the volume; the rms is over the volume, "
-         "peak to peak over all points of surface and volume.")
+         "peak to peak over all points of surface and volume. Errors of blocks add to both, so "
+         "that the nominal magnet may have less than all that are likely.")
 
 MAP_ROWS = ("Those of the map are of a fit of its readings by solid harmonics, without "
             "any magnet; the held-out part are readings that do not update the magnet.")
@@ -155,9 +156,10 @@ def solver_error_text(model: HomogeneityModel, rms_ppm: float) -> tuple[str, boo
     """Return a sentence about the solver's error beside an rms deviation, and if it is smaller."""
     error = model.solver_error_ppm
     small = error <= rms_ppm
+    doubt = f" {model.sampling.doubt}".rstrip()
     return ("The field of given blocks is exact: no mesh is needed." if not error else
             f"The solver's own error, {ppm(error)} ppm rms, is {'' if small else 'not '}below "
-            f"the deviation of {ppm(rms_ppm)}."), small
+            f"the deviation of {ppm(rms_ppm)}.") + doubt, small
 
 
 def _known_as(name: str) -> str:

@@ -25,7 +25,6 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
-from halbach_fe.study.design import ShimTray
 
 LISTED = 12
 """Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""
@@ -58,13 +57,13 @@ def _answer(found: FilledTray) -> Answer:
 
 def _told(found: FilledTray) -> Answer:
     """Return the same without its numbers in large type."""
-    region, tray = found.model.region.text, found.magnet.study.shim_tray
+    region = found.model.region.text
     question = f"Which magnets in the tray make the field in {region} homogeneous?"
     measured = "halbach-fe infer STUDY --measurements NEW_MAP -o DIR"
     if not found.filled:
         return Answer(
             question, "Leave the tray empty: none of its magnets makes the field more homogeneous "
-            f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(tray),
+            f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(found),
             "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
             "comes from: its harmonics tell.",
             "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
@@ -79,27 +78,29 @@ def _told(found: FilledTray) -> Answer:
         useless = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
         if found.magnet.study.design is not None:
             return Answer(
-                question, useless, _ranges(tray),
+                question, useless, _ranges(found),
                 "The deviation is that of the design, and too large for a tray: search for a "
                 "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")
         return Answer(
-            question, useless, _ranges(tray),
+            question, useless, _ranges(found),
             "Take larger magnets or more places, or look for what the deviation comes from: its "
             "harmonics tell.", "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
     if after > 2 * found.after.rms_ppm:
         return Answer(
             question, text, "What remains is mostly what the measurement and the strength of the "
-            f"shims leave open. {_ranges(tray)}", "Fill the tray from shim_tray.csv, measure again "
-            "with it, update, and fill a second one.", measured)
-    return Answer(question, text, _ranges(tray),
+            f"shims leave open. {_ranges(found)}", "Fill the tray from shim_tray.csv, measure "
+            "again with it, update, and fill a second one.", measured)
+    return Answer(question, text, _ranges(found),
                   "Fill the tray from shim_tray.csv, then measure again and update.", measured)
 
 
-def _ranges(tray: ShimTray | None) -> str:
+def _ranges(found: FilledTray) -> str:
     """Say what the ranges contain."""
+    tray, doubt = found.magnet.study.shim_tray, f" {found.model.sampling.doubt}".rstrip()
     shims = (f"{100 * tray.strength_sd:g} % of each shim's strength and {100 * tray.common_sd:g} % "
              "that all shims share" if tray else "the strength of the shims")
-    return f"Yes, as far as the update is right: ranges contain what it leaves open, and {shims}."
+    return (f"Yes, as far as the update is right: ranges contain what it leaves open, and {shims}."
+            f"{doubt}")
 
 
 def _rows(found: FilledTray) -> list[dict[str, str]]:

@@ -233,6 +233,8 @@ def field_on_lines(
     """
     points = lines.points.reshape(-1, 3)
     number = _blocks_of(magnet, points)
+    if inside:
+        _check_faces(magnet, lines)
     if not inside and (number >= 0).any():
         raise StudyError(must_be(
             "points", magnet.name, "in air", f"{int((number >= 0).sum())} of {len(points)} inside "
@@ -255,6 +257,29 @@ def field_on_lines(
     return FieldOnLines(lines, mean, root.reshape(*shape, -1), error.reshape(shape),
                         weak.reshape(shape), polarization.reshape(*shape, -1),
                         names[number].reshape(shape[:2]), _spacing_error(magnet, lines, mean))
+
+
+def _between(magnet: Magnet, lines: Lines) -> int:
+    """Return how many points of lines lie on faces where blocks touch, or on edges."""
+    around = magnet.surroundings(lines.points.reshape(-1, 3))
+    return int((around.no_air & ~around.inside).sum())
+
+
+def _check_faces(magnet: Magnet, lines: Lines) -> None:
+    """Refuse points inside a magnet at which B has two values, those of both blocks that touch.
+
+    The advice is a number of points of which none is there, if there is one near theirs.
+    """
+    if not (there := _between(magnet, lines)):
+        return
+    others = [replace(lines, count=lines.count + more) for more in (-1, 1, -2, 2, 3, 4, 5)
+              if lines.count + more >= 3]  # Simpson's rule needs 3
+    free = next((each.count for each in others if not _between(magnet, each)), None)
+    raise StudyError(must_be(
+        "points", magnet.name, "in air or inside a block", f"{there} of {lines.points[..., 0].size}"
+        " on edges or on faces where blocks touch, at which B jumps",
+        "Move the line by 0.1 mm across or along itself." if free is None else
+        f"With --count {free} no point is there."))
 
 
 def _spacing_error(magnet: Magnet, lines: Lines, mean: Floats) -> Floats:

@@ -16,7 +16,8 @@ after.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
 from math import factorial
 from typing import Literal
 
@@ -27,11 +28,13 @@ from scipy.special import lpmv, roots_jacobi
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
-from halbach_fe.geometry.blocks import vector
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
+from halbach_fe.geometry.cells import distance_from_blocks, halved
+from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import Response, response_matrix
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import FluxDensity, Instrument, PointPositions
@@ -57,6 +60,19 @@ other: of two peaks the higher one may have the lower points."""
 
 SLICE = 25
 """Number of points along the sides of the slices that are drawn."""
+
+NEAR_SHARE = 0.7
+"""Distance of points of a region from each other, relative to their distance from the nearest
+block. Of cubes of 12 mm that come within 0.5 to 4 mm of the region, the peak to peak value was then
+found to 0.5 %, but with points at 1.5 to 8 times that distance it was up to half too large."""
+
+PEAKS, CLOSER = 6, 4
+"""Number of the smallest and of the largest |B| about which points are added, and how often, each
+time at half the distance."""
+
+MOST_CELLS = 8000
+"""Number of cells of a surface or volume from which none is halved any more, which limits the
+memory of a response matrix and of the drawn fields to a gigabyte."""
 
 SHOWN_DEGREES = 6
 """Degrees of the harmonics that are listed by default."""
@@ -162,22 +178,25 @@ class Region:
             return np.asarray((np.hypot(x, y) <= 1) & (np.abs(z) <= 1))
         return np.asarray(x**2 + y**2 + z**2 <= 1)
 
-    def around(self, unit: Floats, width: float, count: int) -> Floats:
+    def around(self, unit: Floats, widths: Floats, count: int) -> Floats:
         """Return places (count, count, count, 3) of the region about one (3,), along coordinates
         of which one is normal to the surface.
 
-        All are relative to the half axes, and up to ``width`` away, but within the region.
+        All are relative to the half axes, and up to ``widths`` (3,) away, but within the region.
         """
-        def span(middle: float) -> Floats:
+        width = float(widths.min())
+
+        def span(middle: float, width: float = width) -> Floats:
             return np.linspace(max(middle - width, -1.0), min(middle + width, 1.0), count)
 
         aside = np.linspace(-width, width, count)
         if self.shape == "cylinder":
             radius, angle = np.hypot(*unit[:2]), np.arctan2(unit[1], unit[0])
+            aside, along = np.linspace(-widths[0], widths[0], count), span(unit[2], widths[2])
             if radius <= 0.5:
-                return np.stack(np.meshgrid(unit[0] + aside, unit[1] + aside, span(unit[2]),
+                return np.stack(np.meshgrid(unit[0] + aside, unit[1] + aside, along,
                                             indexing="ij"), axis=-1)
-            r, phi, z = np.meshgrid(span(radius), angle + aside, span(unit[2]), indexing="ij")
+            r, phi, z = np.meshgrid(span(radius, widths[0]), angle + aside, along, indexing="ij")
             return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
         radius = float(np.linalg.norm(unit))
         if radius <= 0.5:
@@ -238,6 +257,35 @@ class Region:
         unit = np.vstack([surface, inner])
         return (np.array(self.centre_m) + unit * self.half_axes_m,
                 np.append(np.zeros(len(surface)), weights / weights.sum()))
+
+
+    def places(self, coordinates: Floats) -> Floats:
+        """Return points (n, 3) in m at coordinates (n, 3): radius from 0 to 1, angle about z, and z
+        from -1 to 1, relative to the radius unless the region is a cylinder.
+        """
+        r, phi, z = coordinates.T
+        if self.shape != "cylinder":
+            r, z = r * np.sqrt(1 - z**2), r * z
+        unit = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
+        return np.asarray(np.array(self.centre_m) + unit * self.half_axes_m)
+
+    def nodes(self, cells: Floats, size: int) -> tuple[Floats, Floats]:
+        """Return Gauss's points (n size^3, 3) in m of cells (n, 3, 2), and their weights."""
+        nodes, weights = np.polynomial.legendre.leggauss(size)
+        unit = np.stack(np.meshgrid(*3 * [nodes], indexing="ij"), axis=-1).reshape(-1, 3)
+        half = np.ptp(cells, axis=2) / 2
+        places = (cells.mean(axis=2)[:, None] + half[:, None] * unit).reshape(-1, 3)
+        volume = np.outer(half.prod(axis=1), np.einsum("i,j,k->ijk", *3 * [weights])).ravel()
+        return self.places(places), volume * places[:, 0]**(1 if self.shape == "cylinder" else 2)
+
+    def cells(self, surface: bool) -> Floats:
+        """Return cells (n, 3, 2) of the `places` that make up the region, or its surface."""
+        turns, heights = np.linspace(0, 2 * np.pi, 17), np.linspace(-1, 1, 5)
+        flat = [[1.0, 1.0]] if surface else [[0.0, 0.5], [0.5, 1.0]]
+        kinds = [(flat, pairwise(turns), pairwise(heights))]
+        if surface and self.shape == "cylinder":
+            kinds.append(([[0.0, 0.5], [0.5, 1.0]], pairwise(turns), [[-1.0, -1.0], [1.0, 1.0]]))
+        return np.array([cell for kind in kinds for cell in product(*kind)], float)
 
 
 def _sphere_surface(degree: int) -> Floats:
@@ -368,6 +416,45 @@ class Slice:
 
 
 @dataclass(frozen=True)
+class Sampling:
+    """Points of a region at which its field is computed.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), in m
+        Those of the surface, of the volume, and more of the surface where blocks are near.
+    weights : ndarray, shape (n,)
+        Of means over the volume; 0 on the surface.
+    steps : ndarray, shape (n, 3)
+        Distance of each point from those next to it, relative to the half axes.
+    surface : int
+        Number of points on the surface that come first.
+    degree : int
+        Degree of the functions that these resolve, see `Region.points`.
+    unresolved_m : float
+        Distance in m at which blocks are too near for the points; 0 if none is.
+    near_shims : bool
+        Whether means over the volume are those of more points, where shims are near.
+    """
+
+    points: Floats
+    weights: Floats
+    steps: Floats
+    surface: int
+    degree: int
+    unresolved_m: float = 0.0
+    near_shims: bool = False
+
+    @property
+    def doubt(self) -> str:
+        """Say that the extremes may lie between the points, or nothing."""
+        if not self.unresolved_m:
+            return ""
+        return (f"The region comes within {1e3 * self.unresolved_m:.2g} mm of blocks, nearer than "
+                "its points resolve: the true peak to peak may be larger than what is said.")
+
+
+@dataclass(frozen=True)
 class HomogeneityModel:
     """The linear model of B at the points of a region and of three slices through it.
 
@@ -376,28 +463,37 @@ class HomogeneityModel:
     region : Region
     points : ndarray, shape (m, 3), in m
         Those of the region, followed by those of the slices that are in air.
-    weights : ndarray, shape (n,)
-        Of the region's points in means over the volume.
-    surface : int
-        Number of points on the surface, which come first.
+    sampling : Sampling
+        Those of the region.
     in_air : ndarray of bool, shape (3 SLICE^2,)
         Which points of the slices are among those of the response, after the region's.
     response : Response
         Of Bx, By and Bz at each point.
     degrees : int
         Largest degree of the harmonics.
-    surface_degree : int
-        See `Region.points`.
     """
 
     region: Region
     points: Floats
-    weights: Floats
-    surface: int
+    sampling: Sampling
     in_air: NDArray[np.bool_]
     response: Response
     degrees: int
-    surface_degree: int
+
+    @property
+    def weights(self) -> Floats:
+        """Of the region's points (n,) in means over the volume."""
+        return self.sampling.weights
+
+    @property
+    def surface(self) -> int:
+        """Number of points on the surface that come first."""
+        return self.sampling.surface
+
+    @property
+    def surface_degree(self) -> int:
+        """See `Region.points`."""
+        return self.sampling.degree
 
     @property
     def nominal_mean(self) -> Floats:
@@ -463,8 +559,7 @@ class HomogeneityModel:
         size = np.linalg.norm(fields, axis=1)
         mean = self.weights @ size
         deviation = PPM * (size / mean - 1)
-        low, high = extremes(self.region, self.points[:len(size)],
-                             2 * np.pi / (self.surface_degree + 1), fields)
+        low, high = extremes(self.region, self.sampling.points, self.sampling.steps, fields)
         return mean, np.sqrt(self.weights @ deviation**2), PPM * (high - low) / mean
 
     def _harmonics(
@@ -484,7 +579,7 @@ class HomogeneityModel:
 
 
 def extremes(
-    region: Region, points: Floats, step: float, fields: Floats
+    region: Region, points: Floats, steps: Floats, fields: Floats
 ) -> tuple[Floats, Floats]:
     """Return the least and the largest |B| (d,) in a region, of fields (n, 3, d) at its points.
 
@@ -496,8 +591,8 @@ def extremes(
     ----------
     region : Region
     points : ndarray, shape (n, 3), in m
-    step : float
-        Distance of the points of the surface from each other, relative to the half axes.
+    steps : ndarray, shape (n, 3)
+        Distance of each point from those next to it, relative to the half axes.
     fields : ndarray, shape (n, 3, d)
     """
     size = np.linalg.norm(fields, axis=1)
@@ -511,31 +606,34 @@ def extremes(
             for start in np.unique(best):
                 own = np.flatnonzero(best == start)
                 value[own] = np.maximum(value[own], _climbed(
-                    region, unit, int(start), step, fields[..., own], sign))
-                near = np.linalg.norm(unit - unit[start], axis=1) <= 2 * step
+                    region, unit, int(start), steps[start], fields[..., own], sign))
+                near = np.linalg.norm((unit - unit[start]) / steps[start], axis=1) <= 2
                 left[np.ix_(near, own)] = -np.inf
         found.append(sign * value)
     return found[0], found[1]
 
 
 def _climbed(
-    region: Region, unit: Floats, start: int, step: float, fields: Floats, sign: float
+    region: Region, unit: Floats, start: int, step: Floats, fields: Floats, sign: float
 ) -> Floats:
     """Return ``sign`` times the extremes (d,) of |B| near a point; see `extremes`.
 
-    ``unit`` are the points relative to the half axes of the region.
+    ``unit`` are the points relative to the half axes of the region, as is their ``step`` (3,).
     """
-    distance = np.linalg.norm(unit - unit[start], axis=1)
+    distance = np.linalg.norm((unit - unit[start]) / step, axis=1)
     # degrees of the solid harmonics about a point that are fitted to the field at the points near
     local_degrees = 7
     unknowns = local_degrees * (local_degrees + 2)
     # how far these points are from it, and the distance at which one counts less by a factor of e,
     # in distances of points from each other
     near_distance, weighed_distance = 3.0, 1.5
-    near = distance <= max(near_distance * step, np.sort(distance)[min(unknowns, len(unit)) - 1])
+    reach = max(near_distance, float(np.sort(distance)[min(unknowns, len(unit)) - 1]))
+    near = distance <= reach
     away = (unit[near] - unit[start]) * region.half_axes_m
     scale = float(np.linalg.norm(away, axis=1).max())
-    weight = np.exp(-(distance[near] / (weighed_distance * step))**2)[:, None, None]
+    if reach > 2 * near_distance:  # few points are near, so that farther ones determine the fit
+        weighed_distance *= reach / near_distance
+    weight = np.exp(-(distance[near] / weighed_distance)**2)[:, None, None]
     design = solid_harmonic_fields(away / scale, local_degrees)
     amplitudes = np.linalg.lstsq((weight * design).reshape(-1, unknowns),
                                  (weight * fields[near]).reshape(-1, fields.shape[2]),
@@ -550,7 +648,9 @@ def _climbed(
         places * region.half_axes_m / scale, local_degrees) @ amplitudes, axis=1)
     value = _vertex(found.reshape(*3 * [tried], -1))
     sampled = sign * np.linalg.norm(fields[start], axis=0)
-    return np.where(value - sampled > rest, value, sampled)
+    # a fit through too few points may leave no rest: it adds no more than they differ by
+    spread = np.ptp(np.linalg.norm(fields[near], axis=1), axis=0)
+    return np.where((value - sampled > rest) & (value - sampled <= spread), value, sampled)
 
 
 def _vertex(values: Floats) -> Floats:
@@ -594,11 +694,10 @@ def real_harmonics(
 
 
 def region_points(
-    magnet: Magnet, region: Region, degrees: int = SHOWN_DEGREES
-) -> tuple[Floats, Floats, int]:
-    """Return the points (n, 3) in m and weights (n,) of a region in a magnet, and the degree.
-
-    The degree is that of the functions that the points of the surface resolve, see `Region.points`.
+    magnet: Magnet, region: Region, degrees: int = SHOWN_DEGREES,
+    shims: Sequence[MagnetBlock] = (),
+) -> Sampling:
+    """Return the points of a region in a magnet, perhaps with shims, which may be near.
 
     Raises
     ------
@@ -635,6 +734,10 @@ def region_points(
     points, weights = region.points(
         surface_degree, magnet.bore_radius,
         int(np.clip(resolved, INTEGRATION_DEGREE, ANGULAR_DEGREE)))
+    found = _resolved(magnet, region, Sampling(
+        points, weights, np.full(points.shape, 2 * np.pi / (surface_degree + 1)),
+        int((weights == 0).sum()), surface_degree), shims)
+    points = found.points
     inside = magnet.contains(points)
     if inside.any():
         x, y, z = 1e3 * points[int(np.argmax(inside))]
@@ -642,7 +745,94 @@ def region_points(
             "the region", f"study {magnet.name}", "in air",
             f"{region.text}, of which the point ({x:.4g}, {y:.4g}, {z:.4g}) mm is inside magnet or "
             "iron", _advice(magnet, region)))
-    return points, weights, surface_degree
+    return found
+
+
+def _resolved(
+    magnet: Magnet, region: Region, base: Sampling, shims: Sequence[MagnetBlock]
+) -> Sampling:
+    """Add points to those of a region where blocks are nearer than these are to each other.
+
+    They count in means over the volume where shims are near; those of blocks the others resolve
+    to 0.5 %.
+    """
+    axes, spacing = np.array(region.half_axes_m), base.steps[0] * region.half_axes_m
+    # of no cell that is halved the middle is farther from the blocks
+    far = 2 * float(axes.max()) / NEAR_SHARE
+    blocks = (*present_blocks(magnet.blocks), *neighbour_blocks(
+        magnet.blocks, magnet.external.neighbours), *shims)
+    # distance up to which points are added, as if blocks that are nearer were so far away
+    least = 1e-3 * magnet.bore_radius
+
+    def distance(points: Floats) -> Floats:
+        return np.maximum(distance_from_blocks(blocks, points, far), least)
+
+    parts, resolved = [], True
+    for surface in (True, False):
+        cells, sides, enough = halved(
+            region.cells(surface), region.places, distance, NEAR_SHARE, MOST_CELLS)
+        parts.append((cells, sides))
+        resolved = resolved and enough
+    (cells, sides), (inner, long) = parts
+    fine, small = sides < spacing.max(), long < spacing.max()
+    if not fine.any():
+        return base
+    # of cells of the surface their corners, which are on its rims, too
+    corners = np.vstack([cells[fine][:, np.arange(3), list(corner)]
+                         for corner in product((0, 1), repeat=3)])
+    length = np.tile(sides[fine], 8)
+    points = region.places(corners)
+    _, first = np.unique(points.round(12), axis=0, return_index=True)
+    points, length = points[first], length[first]
+    near_shims = len(shims) > 0 and bool((distance_from_blocks(
+        shims, base.points, far) < spacing.max() / NEAR_SHARE).any())
+    if near_shims:
+        nodes = [region.nodes(inner[~small], 3), region.nodes(inner[small], 2)]
+        more, weights = (np.concatenate(each) for each in zip(*nodes, strict=True))
+        lengths = np.append(np.repeat(long[~small] / 3, 27), np.repeat(long[small] / 2, 8))
+        base = replace(base, points=base.points[:base.surface])
+    else:
+        more, lengths = region.places(inner[small].mean(axis=2)), long[small]
+        weights = np.append(base.weights[base.surface:], np.zeros(len(more)))
+    own = np.concatenate([NEAR_SHARE * distance(base.points), lengths, length])
+    nearest = float(distance_from_blocks(blocks, points, far).min())
+    found = replace(
+        base, points=np.vstack([base.points, more, points]),
+        weights=np.concatenate([np.zeros(base.surface), weights / weights.sum(),
+                                np.zeros(len(points))]),
+        steps=np.minimum(own[:, None] / axes, base.steps[0]), near_shims=near_shims,
+        unresolved_m=0.0 if resolved and nearest >= least else max(nearest, 0.0))
+    return _about_extremes(region, found, blocks)
+
+
+def _about_extremes(
+    region: Region, sampling: Sampling, blocks: Sequence[MagnetBlock]
+) -> Sampling:
+    """Add points about the extremes of |B| of some blocks in vacuum, ever closer to them.
+
+    Next to blocks B may turn round, so that |B| falls to zero at single points.
+    """
+    points, steps = sampling.points, sampling.steps.copy()
+    unit = (points - region.centre_m) / region.half_axes_m
+    size = np.linalg.norm(field_of(blocks, points), axis=1)
+    for sign in (-1.0, 1.0):
+        left = sign * size
+        for _ in range(PEAKS):
+            start = int(left.argmax())
+            left[np.linalg.norm((unit - unit[start]) / steps[start], axis=1) <= 2] = -np.inf
+            place, step, value = unit[start], steps[start].copy(), float(sign * size[start])
+            for _ in range(CLOSER):
+                around = region.around(place, step, 3).reshape(-1, 3)
+                more = np.array(region.centre_m) + region.half_axes_m * around
+                own = sign * np.linalg.norm(field_of(blocks, more), axis=1)
+                if own.max() > value:
+                    place, value = around[own.argmax()], float(own.max())
+                step = step / 2
+                points = np.vstack([points, more])
+                steps = np.vstack([steps, np.repeat(step[None], len(more), axis=0)])
+            steps[start] = step
+    return replace(sampling, points=points, steps=steps, weights=np.append(
+        sampling.weights, np.zeros(len(points) - len(sampling.points))))
 
 
 def _advice(magnet: Magnet, region: Region) -> str:
@@ -653,25 +843,29 @@ def _advice(magnet: Magnet, region: Region) -> str:
 
 
 def homogeneity_model(
-    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES
+    magnet: Magnet, region: Region, session: Session, degrees: int = SHOWN_DEGREES,
+    shims: Sequence[MagnetBlock] = (),
 ) -> HomogeneityModel:
     """Build the matrix from block magnetizations to the field in a region.
+
+    The field of ``shims``, which may be near, is not part of it, but varies little from point to
+    point.
 
     Raises
     ------
     StudyError
         If the study is a cross-section, or the region reaches into material.
     """
-    points, weights, surface_degree = region_points(magnet, region, degrees)
+    sampling = region_points(magnet, region, degrees, shims)
     planes = slice_points(region)
     in_air = ~magnet.contains(planes)
     bare = magnet.with_(instrument=Instrument(), observation=FluxDensity(
         quantity="flux_density", positions=PointPositions(kind="points", points_m=(
             region.centre_m,))))
-    every = np.vstack([points, planes[in_air]])
+    every = np.vstack([sampling.points, planes[in_air]])
     observation = observe(bare.study, every, np.ones(every.shape, bool))
-    return HomogeneityModel(region, every, weights, int((weights == 0).sum()), in_air,
-                            response_matrix(bare, observation, session), degrees, surface_degree)
+    return HomogeneityModel(region, every, sampling, in_air,
+                            response_matrix(bare, observation, session), degrees)
 
 
 def slice_points(region: Region) -> Floats:

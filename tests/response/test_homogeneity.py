@@ -9,6 +9,7 @@ from dataclasses import replace
 import magpylib
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre
 from scipy.stats import qmc
 
@@ -22,6 +23,7 @@ from halbach_fe.response.homogeneity import (
     Region,
     extremes,
     real_harmonics,
+    region_points,
     sphere_points,
 )
 from halbach_fe.solver.session import Session
@@ -117,6 +119,67 @@ def cubes(order):
         position=(0.03 * np.cos(angle), 0.03 * np.sin(angle), 0.004)) for angle in angles))
 
 
+def even_steps(points):
+    return np.full(points.shape, 2 * np.pi / (SURFACE_DEGREE + 1))
+
+
+def ring_of_cubes():
+    """The study of `cubes` of order 1, not turned, with no magnetization along z."""
+    return build_magnet(parse_study({
+        "name": "cubes", "dimension": 3,
+        "array": {"blocks_per_ring": 8, "rings": 1, "inner_radius_m": 0.024,
+                  "outer_radius_m": 0.036, "ring_length_m": 0.03, "remanence_T": 1.0,
+                  "recoil_permeability": 1.0, "block": {"shape": "cuboid", "width_m": 0.012}},
+        "mesh": {"block_size_m": 0.006},
+        "observation": {"quantity": "flux_density", "positions": {
+            "kind": "points", "points_m": [[0, 0, 0]]}},
+        "noise": {"regions": [{"name": "all", "sigma_T": 1e-5}]}}))
+
+
+def magpylib_of(magnet):
+    return magpylib.Collection(*(magpylib.magnet.Cuboid(
+        polarization=Rotation.from_euler("z", -block.angle_deg, degrees=True).apply(
+            block.easy_axis), dimension=(0.012, 0.012, 0.03), position=block.middle,
+        orientation=Rotation.from_euler("z", block.angle_deg, degrees=True))
+        for block in magnet.blocks))
+
+
+@pytest.mark.parametrize("region", [
+    Region("cylinder", (0.0233, 0.0233, 0.0015)), Region("cylinder", (0.0225, 0.0225, 0.01)),
+    Region.sphere(0.023)], ids=lambda region: region.text)
+def test_extremes_next_to_blocks(region):
+    """Beside magpylib at points 0.1 mm from each other, 0.7 to 1.5 mm off blocks."""
+    magnet = ring_of_cubes()
+    truth, sampling = magpylib_of(magnet), region_points(magnet, region)
+    low, high = extremes(region, sampling.points, sampling.steps,
+                         truth.getB(sampling.points)[..., None])
+    phi, z = (part.ravel() for part in np.meshgrid(
+        np.linspace(0, np.pi / 2, 400), np.linspace(0, 1, 60)))  # an eighth, by symmetry
+    wide = np.ones_like(z) if region.shape == "cylinder" else np.sqrt(1 - z**2)
+    wall = np.column_stack([wide * np.cos(phi), wide * np.sin(phi), z]) * region.half_axes_m
+    size = np.linalg.norm(truth.getB(wall), axis=1)
+    # the extremes between these points, and within the region, are 1 % from theirs at most
+    assert high[0] == pytest.approx(size.max(), rel=0.01)
+    assert low[0] <= size.min() + 0.01 * size.max()
+    assert not sampling.doubt
+    first, _ = region.points(SURFACE_DEGREE)  # the control: points that do not mind the blocks
+    coarse = extremes(region, first, even_steps(first), truth.getB(first)[..., None])
+    assert np.ptp(coarse) != pytest.approx(high[0] - low[0], rel=0.02)
+
+
+def test_points_follow_the_distance_from_blocks():
+    """Far from blocks there are no more than before, and where they are too near a page says so."""
+    magnet = ring_of_cubes()
+    far = region_points(magnet, Region.sphere(0.01))
+    assert (far.weights[far.surface:] > 0).all()  # none was added
+    assert far.steps == pytest.approx(2 * np.pi / (far.degree + 1))
+    assert not far.doubt
+    near = region_points(magnet, Region("cylinder", (0.023999, 0.023999, 0.012)))
+    assert "within 0.001 mm of blocks" in near.doubt
+    with pytest.raises(StudyError, match="must be in air"):
+        region_points(magnet, Region.sphere(0.0241))
+
+
 @pytest.mark.parametrize("order", [1, 2], ids=["dipole", "quadrupole"])
 @pytest.mark.parametrize("region", [
     Region.sphere(0.012), Region.sphere(0.008, (0.003, -0.002, 0.005)),
@@ -127,7 +190,7 @@ def test_extremes_lie_between_the_points(generator, region, order):
     magnet = cubes(order)
     points, _ = region.points(SURFACE_DEGREE)
     field = magnet.getB(points)[..., None]
-    low, high = extremes(region, points, 2 * np.pi / (SURFACE_DEGREE + 1), field)
+    low, high = extremes(region, points, even_steps(points), field)
     dense = np.vstack(list(even_points(region, generator, 100_000)))
     size = np.linalg.norm(magnet.getB(dense), axis=1)
     span = size.max() - size.min()
@@ -144,7 +207,7 @@ def test_extremes_of_a_field_that_no_fit_follows(generator):
     region = Region.sphere(0.01)
     points, _ = region.points(SURFACE_DEGREE)
     field = generator.standard_normal((len(points), 3, 2))
-    low, high = extremes(region, points, 2 * np.pi / (SURFACE_DEGREE + 1), field)
+    low, high = extremes(region, points, even_steps(points), field)
     size = np.linalg.norm(field, axis=1)
     assert high == pytest.approx(size.max(axis=0), rel=1e-12)
     assert low == pytest.approx(size.min(axis=0), rel=1e-12)
