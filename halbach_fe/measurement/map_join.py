@@ -242,9 +242,10 @@ def read_joined(path: Path) -> tuple[str, tuple[MapPose, ...]]:
     raw = file_bytes(path, f"file {path}")
     try:
         found = json.loads(raw)
-        poses = tuple(MapPose(str(one["name"]), *(np.array(one[key], float) for key in (
-            "middle_m", "shift_m", "shift_sd_m", "rotation_rad", "rotation_sd_rad")),
-            int(one["sign"])) for one in found["poses"])
+        poses = tuple(MapPose(sign=int(one["sign"]), name=str(one["name"]), **{
+            key: np.array(one[key], float) for key in (
+                "middle_m", "shift_m", "shift_sd_m", "rotation_rad", "rotation_sd_rad")})
+            for one in found["poses"])
         numbers = np.array([list(vars(one).values())[1:-1] for one in poses], float)
         bars = numbers[:, [2, 4]] if numbers.shape[1:] == (5, 3) else np.zeros(1)
         names = [str(found["frame"]), *(one.name for one in poses)]
