@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from halbach_fe.api import homogeneity as homogeneity
     from halbach_fe.api import import_blocks as import_blocks
     from halbach_fe.api import import_map as import_map
+    from halbach_fe.api import magnetic_axis as magnetic_axis
     from halbach_fe.api import multipoles as multipoles
     from halbach_fe.api import plan as plan
     from halbach_fe.api import prior as prior

@@ -66,6 +66,8 @@ from halbach_fe.response.homogeneity import (
     default_region,
     homogeneity_model,
 )
+from halbach_fe.response.magnetic_axis import MagneticAxis
+from halbach_fe.response.magnetic_axis import magnetic_axis as axis_of
 from halbach_fe.response.multipoles import (
     MultipoleModel,
     MultipoleReference,
@@ -374,6 +376,43 @@ def diagnose(
                   effect if isinstance(effect, str) else effect.name for effect in effects)])
     return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say,
                                    floor_T=floor_T, time_limit_s=time_limit_s)
+
+
+def magnetic_axis(
+    magnet: Magnet, session: Session, magnetizations: Gaussian | InferenceResult
+) -> MagneticAxis | None:
+    """Compute magnetic centre, axis and roll for a distribution of the magnetizations.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    session : Session
+    magnetizations : Gaussian or InferenceResult
+        In A/m; of the result of `halbach_fe.infer` the posterior. A result knows its magnet, while
+        a Gaussian is only known to have as many parameters: that it is of this magnet is the
+        caller's word.
+
+    Returns
+    -------
+    MagneticAxis or None
+        None if the nominal magnet has no main multipole, or the middle of the bore is not free.
+
+    Raises
+    ------
+    MeasurementError
+        If the result is that of another magnet.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet, session = hf.build_magnet(hf.read_study("dipole.toml")), hf.Session.open("results")
+    >>> result = hf.infer(magnet, hf.read_map("map.csv"), session)
+    >>> hf.magnetic_axis(magnet, session, result).order
+    1
+    """
+    if isinstance(magnetizations, InferenceResult):
+        magnetizations = distributions_of(magnet, magnetizations)["posterior"]
+    return axis_of(magnet, session, magnetizations)
 
 
 @alone

@@ -73,7 +73,9 @@ def halved(
     tuple
         The cells (n, k, 2), their longest sides (n,) in m, and whether all are short enough.
     """
-    done, lengths, count = [], [], 0
+    done: list[Floats] = []
+    lengths: list[Floats] = []
+    count = 0
     while len(cells):
         middle = cells.mean(axis=2)
         sides = np.empty(middle.shape)

@@ -20,7 +20,12 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import is_cross_section
 from halbach_fe.inference.result import ALL_READINGS, HELD_OUT, HELD_OUT_MAP, TRAINING
 from halbach_fe.measurement.campaign import SAME_PLACE_M, SAME_READING, SHARED, Map, repeated
-from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
+from halbach_fe.measurement.field_map import (
+    TOTAL_COLUMN,
+    is_total_field,
+    points_of,
+    total_contradiction,
+)
 from halbach_fe.measurement.instrument import (
     in_si_and_magnet_axes,
     probe_points,
@@ -237,6 +242,9 @@ def _read(
     called = where if several else f"the {where}"
     magnet = magnet.with_study(study)
     data = in_si_and_magnet_axes(study.instrument, one.data)
+    if contradiction := total_contradiction(data):
+        warnings.warn(f"The {where.removeprefix('the ')}: {contradiction}", HalbachWarning,
+                      stacklevel=2)
     measured = _measured(one, data, where)
     if is_total_field(data):
         shown = total_without_nonlinear_part(study.instrument, data)

@@ -699,12 +699,7 @@ def _check_length(data: xr.Dataset, where: str) -> None:
     # Part by which |B| may differ from the length of the components beside it where they are
     # strong: gains of two probes differ by a few per cent, units by factors of 10.
     length_off = 0.1
-    length, total = np.linalg.norm(data["B_T"].values, axis=1), data[TOTAL_COLUMN].values
-    known = np.isfinite(length) & np.isfinite(total) & (length > 0)
-    if not known.any():
-        return
-    strong = known & (length >= np.median(length[known]))
-    times = float(np.median(total[strong] / length[strong]))
+    times, _ = _total_beside_length(data)
     if abs(times - 1) > length_off:
         raise MeasurementError(must_be(
             TOTAL_COLUMN, where, "the length of Bx, By, Bz, in their unit",
@@ -715,6 +710,41 @@ def _check_length(data: xr.Dataset, where: str) -> None:
 def is_placeholder(value: float) -> bool:
     """Tell whether a number consists of nines, as those that stand for no reading."""
     return re.fullmatch(r"9{3,}(\.9*)?", f"{abs(value):.12g}") is not None
+
+
+def _total_beside_length(data: xr.Dataset) -> tuple[float, float]:
+    """Return the median factor of a map's |B| from the length of its components, in the half of
+    the rows where they are strong, and the standard error of that; 1 and 0 if no row has both.
+    """
+    length, total = np.linalg.norm(data["B_T"].values, axis=1), data[TOTAL_COLUMN].values
+    known = np.isfinite(length) & np.isfinite(total) & (length > 0)
+    if not known.any():
+        return 1.0, 0.0
+    strong = known & (length >= np.median(length[known]))
+    factors = total[strong] / length[strong]
+    times = float(np.median(factors))
+    mad_to_sd, median_to_mean = 1.4826, np.sqrt(np.pi / 2)  # of normal numbers
+    spread = mad_to_sd * float(np.median(np.abs(factors - times)))
+    return times, float(median_to_mean * spread / np.sqrt(len(factors)))
+
+
+def total_contradiction(data: xr.Dataset) -> str:
+    """Say that a map's column of |B| is throughout not the length of its components, or nothing.
+
+    `check_magnitudes` refuses maps in which it is far off.
+    """
+    if TOTAL_COLUMN not in data or is_total_field(data):
+        return ""
+    # Part from which it is said: the gains of probes are known to a few per mille, or calibrated
+    # to less. Standard errors from which it is no noise.
+    of_gains, errors = 5e-3, 5.0
+    times, error = _total_beside_length(data)
+    if abs(times - 1) <= max(of_gains, errors * error):
+        return ""
+    return (f"{TOTAL_COLUMN} is throughout {abs(100 * (times - 1)):.1f} % "
+            f"{'larger' if times > 1 else 'smaller'} than the length of Bx, By, Bz: one of both "
+            "probes has another gain. The components alone are used; if their gain is the wrong "
+            "one, so is the strength of all blocks.")
 
 
 def check_magnitudes(data: xr.Dataset) -> None:

@@ -28,6 +28,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.discretization_error import error_bar_session, reading_errors
 from halbach_fe.response.matrix import response_matrix
@@ -259,27 +260,29 @@ def field_on_lines(
                         names[number].reshape(shape[:2]), _spacing_error(magnet, lines, mean))
 
 
-def _between(magnet: Magnet, lines: Lines) -> int:
-    """Return how many points of lines lie on faces where blocks touch, or on edges."""
-    around = magnet.surroundings(lines.points.reshape(-1, 3))
-    return int((around.no_air & ~around.inside).sum())
-
-
 def _check_faces(magnet: Magnet, lines: Lines) -> None:
-    """Refuse points inside a magnet at which B has two values, those of both blocks that touch.
+    """Refuse points on faces where blocks touch, at which B has the values of both.
 
     The advice is a number of points of which none is there, if there is one near theirs.
     """
-    if not (there := _between(magnet, lines)):
+    def around(lines: Lines) -> Surroundings:
+        return magnet.surroundings(lines.points.reshape(-1, 3))
+
+    def free(lines: Lines) -> bool:
+        found = around(lines)
+        return not (found.no_air & ~found.inside).any()
+
+    own, fewest = around(lines), 3  # Simpson's rule needs these points
+    there = int(((own.faces > 1) & ~own.inside & ~own.on_edge).sum())
+    if not there:
         return
-    others = [replace(lines, count=lines.count + more) for more in (-1, 1, -2, 2, 3, 4, 5)
-              if lines.count + more >= 3]  # Simpson's rule needs 3
-    free = next((each.count for each in others if not _between(magnet, each)), None)
+    counts = (lines.count + more for more in (-1, 1, -2, 2, 3, 4, 5))
+    other = next((count for count in counts if count >= fewest and free(
+        replace(lines, count=count))), None)
     raise StudyError(must_be(
-        "points", magnet.name, "in air or inside a block", f"{there} of {lines.points[..., 0].size}"
-        " on edges or on faces where blocks touch, at which B jumps",
-        "Move the line by 0.1 mm across or along itself." if free is None else
-        f"With --count {free} no point is there."))
+        "points", magnet.name, "in air or inside a block", f"{there} of {len(own.faces)} on faces "
+        "where blocks touch, at which B jumps", "Move the line by 0.1 mm along itself or across."
+        if other is None else f"With --count {other} no point is there."))
 
 
 def _spacing_error(magnet: Magnet, lines: Lines, mean: Floats) -> Floats:

@@ -280,11 +280,12 @@ class Region:
 
     def cells(self, surface: bool) -> Floats:
         """Return cells (n, 3, 2) of the `places` that make up the region, or its surface."""
-        turns, heights = np.linspace(0, 2 * np.pi, 17), np.linspace(-1, 1, 5)
-        flat = [[1.0, 1.0]] if surface else [[0.0, 0.5], [0.5, 1.0]]
-        kinds = [(flat, pairwise(turns), pairwise(heights))]
+        turns = list(pairwise(np.linspace(0, 2 * np.pi, 17).tolist()))
+        heights = list(pairwise(np.linspace(-1, 1, 5).tolist()))
+        halves = [(0.0, 0.5), (0.5, 1.0)]
+        kinds = [([(1.0, 1.0)] if surface else halves, turns, heights)]
         if surface and self.shape == "cylinder":
-            kinds.append(([[0.0, 0.5], [0.5, 1.0]], pairwise(turns), [[-1.0, -1.0], [1.0, 1.0]]))
+            kinds.append((halves, turns, [(-1.0, -1.0), (1.0, 1.0)]))
         return np.array([cell for kind in kinds for cell in product(*kind)], float)
 
 

@@ -96,14 +96,6 @@ def magnetic_axis(
     -------
     MagneticAxis or None
         None if the nominal magnet has no main multipole, or the middle of the bore is not free.
-
-    Examples
-    --------
-    >>> import halbach_fe as hf
-    >>> magnet, session = hf.build_magnet(hf.read_study("dipole.toml")), hf.Session.open("results")
-    >>> result = hf.infer(magnet, hf.read_map("map.csv"), session)
-    >>> hf.magnetic_axis(magnet, session, result.posterior).order
-    1
     """
     distribution_of(magnet, magnetizations, "magnetizations")
     flat, order, bore = magnet.dimension == 2, magnet.array.multipole_order, magnet.bore_radius

@@ -54,7 +54,8 @@ def measured(generator, errors, noise_T=NOISE_T):
 def test_beside_the_true_field(generator, tmp_path, errors):
     magnet = build_magnet(study())
     found = homogeneity(magnet, Session.open(tmp_path), REGION, data=measured(generator, errors))
-    points, weights, degree = region_points(magnet, REGION)
+    sampling = region_points(magnet, REGION)
+    points, weights, degree = sampling.points, sampling.weights, sampling.degree
     field = true_field(1, points, errors=errors)
     size = np.linalg.norm(field, axis=1)
     mean = float(weights @ size)
@@ -92,7 +93,8 @@ def test_a_map_of_one_component(generator, tmp_path, errors, axis):
     data = measured(generator, errors)
     data["B_T"].values[:, [other for other in range(3) if other != axis]] = np.nan
     found = homogeneity(magnet, Session.open(tmp_path), REGION, data=data)
-    points, weights, _ = region_points(magnet, REGION)
+    sampling = region_points(magnet, REGION)
+    points, weights = sampling.points, sampling.weights
     field = true_field(1, points, errors=errors)
     size = np.linalg.norm(field, axis=1)
     mean = float(weights @ size)
@@ -133,7 +135,8 @@ def test_a_map_of_the_magnitude(generator, tmp_path, errors):
     data = measured(generator, errors)
     data = total_field_map(GRID, np.linalg.norm(data["B_T"].values, axis=1))
     found = homogeneity(magnet, Session.open(tmp_path), REGION, data=data)
-    points, weights, _ = region_points(magnet, REGION)
+    sampling = region_points(magnet, REGION)
+    points, weights = sampling.points, sampling.weights
     size = np.linalg.norm(true_field(1, points, errors=errors), axis=1)
     mean = float(weights @ size)
     rms = 1e6 * float(np.sqrt(weights @ (size / mean - 1)**2))
@@ -189,7 +192,8 @@ def test_a_held_out_part_that_is_too_small(generator, tmp_path, errors):
     assert list(large.of_map) == [MAP, HELD_OUT_PART]
     assert not large.map_remarks
     # what is left is the whole map's fit, which holds the truth
-    points, weights, _ = region_points(small.magnet, REGION)
+    sampling = region_points(small.magnet, REGION)
+    points, weights = sampling.points, sampling.weights
     size = np.linalg.norm(true_field(1, points, errors=errors), axis=1)
     rms = 1e6 * float(np.sqrt(weights @ (size / (weights @ size) - 1)**2))
     low, _, high = small.of_map[MAP].rms_range_ppm
@@ -249,7 +253,8 @@ def test_a_gain_that_is_not_known_is_in_the_mean(generator, tmp_path, errors):
     """The map is 2 % too strong: by itself it does not tell that from the field."""
     data = measured(generator, errors)
     strong = data.assign(B_T=1.02 * data["B_T"])
-    points, weights, _ = region_points(build_magnet(study()), REGION)
+    sampling = region_points(build_magnet(study()), REGION)
+    points, weights = sampling.points, sampling.weights
     mean = float(weights @ np.linalg.norm(true_field(1, points, errors=errors), axis=1))
     magnets = (build_magnet(study().with_(instrument_sd=sd, inference={}))
                for sd in ({"gain": 0.02}, {}))

@@ -424,3 +424,24 @@ def test_command(tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
         main([*words, "--count", "2"])
     assert "at least 3, not 2" in " ".join(capsys.readouterr().err.split())
+
+
+def test_points_on_faces_of_blocks_that_touch():
+    """The advice, another number of points, works; B along the line is alike on both sides."""
+    magnet = build_magnet(parse_study(changed(DIPOLE, dimension=3, array={"free_blocks": {
+        "name": ["low", "high"], "shape": ["cuboid"] * 2,
+        **{f"size_{axis}_m": [0.02] * 2 for axis in "xyz"}, "x_m": [0.03] * 2, "y_m": [0.0] * 2,
+        "z_m": [-0.01, 0.01], "remanence_x_T": [1.2] * 2, "remanence_y_T": [0.0] * 2,
+        "remanence_z_T": [0.0, 0.3]}, "recoil_permeability": 1.0})))
+    nominal = magnet.nominal_magnetization
+    known = Gaussian(nominal, RELATIVE_SD * nominal[:, None])
+
+    def on(count):
+        lines = Lines(np.array([0.031, 0.002, -0.05]), np.array([0.031, 0.002, 0.05]), count=count)
+        return field_on_lines(magnet, lines, known, Session.temporary(), inside=True)
+
+    with pytest.raises(StudyError, match=r"1 of 201 on faces .* touch.*--count 200") as refused:
+        on(201)
+    assert "out of the blocks" not in str(refused.value)
+    found = on(200)
+    assert found.in_block[0, 99:101].tolist() == ["low", "high"]

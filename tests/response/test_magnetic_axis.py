@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import halbach_fe as hf
+from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -196,3 +198,21 @@ def test_there_is_none_without_the_multipole(tmp_path):
     nominal = magnet.nominal_magnetization
     exact = Gaussian(nominal, np.zeros((len(nominal), 1)))
     assert magnetic_axis(magnet, Session.open(tmp_path), exact) is None
+
+
+def test_a_result_knows_its_magnet(generator, tmp_path):
+    """A ring of another radius has as many blocks, so that only the result tells them apart."""
+    own = study(2)
+    magnet = build_magnet(own)
+    points = points_from(own.observation.positions)
+    session = Session.open(tmp_path)
+    result = infer(magnet, field_map(points, true_field(2, points) + NOISE_T * (
+        generator.standard_normal(points.shape))), session)
+    assert hf.magnetic_axis(magnet, session, result) == magnetic_axis(
+        magnet, session, result.posterior)
+    wider = build_magnet(own.with_(array=own.array.with_(
+        inner_radius_m=own.array.inner_radius_m + 0.01,
+        outer_radius_m=own.array.outer_radius_m + 0.01)))
+    with pytest.raises(MeasurementError, match="posterior"):
+        hf.magnetic_axis(wider, session, result)
+    assert hf.magnetic_axis(wider, session, result.posterior) is not None  # the caller's word
