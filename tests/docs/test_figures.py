@@ -20,6 +20,9 @@ QUOTED = {
         "nonlinear.seconds_18000", "nonlinear.speedup_vs_getdp_loop"),
     ("README.md", "linear posterior with the model's own error"): (
         "calibration.linear_p", "calibration.control_positions_p"),
+    ("README.md", "effects hidden in magnets of ten"): (
+        "diagnosis.naming_rate_single", "diagnosis.naming_rate_pairs",
+        "diagnosis.false_alarm_rate"),
     ("docs/accuracy.md", "response matrix computed from scratch"): (
         "response.seconds", "response.memory_GiB"),
     ("docs/accuracy.md", "error of the full array at every point"): ("response.error_pointwise",),
