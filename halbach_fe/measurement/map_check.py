@@ -1138,11 +1138,13 @@ def _alike(new: dict[str, NDArray[np.bool_]], whole: Evidence) -> list[str]:
     """Return the parameter, of all that are found, that explains the map best, and those that do so
     nearly as well in its place but add nothing to it.
 
-    ``new`` is what is kept (p,) with each of them.
+    ``new`` is what is kept (p,) with each of them. Of two changes with their uneven parts one may
+    contain the other, and is no other explanation.
     """
     evidence = {name: whole.log_evidence(kept) for name, kept in new.items()}
     best = max(evidence, key=evidence.__getitem__)
-    return [best, *(name for name, kept in new.items() if name != best
+    return [best, *(name for name, kept in new.items()
+                    if (kept & ~new[best]).any() and (new[best] & ~kept).any()
                     and evidence[best] - evidence[name] < ALMOST_ALIKE
                     and whole.log_evidence(kept | new[best]) - evidence[best] < ALMOST_ALIKE)]
 
