@@ -497,7 +497,8 @@ def saturated_campaign(dipole, generator, session, spread, sizes=(0.01, 0.007)):
     truth = nominal + spread * size * generator.standard_normal(len(nominal))
     finer = dipole(**changes, mesh__block_size_m=sizes[1])
     observation = observe(finer, points, np.ones((len(points), 3), bool))
-    readings = newton_readings(build_magnet(finer), observation, session, truth[None])[0]
+    readings = newton_readings(build_magnet(finer), observation, session.within("truth"),
+                               truth[None])[0]
     field = np.full((len(points), 3), np.nan)
     field[:, :2] = readings.reshape(-1, 2) + 1e-5 * generator.standard_normal((len(points), 2))
     return study, field_map(points, field), truth

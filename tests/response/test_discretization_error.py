@@ -82,9 +82,8 @@ def test_the_error_is_part_of_the_inference(dipole, session):
                    noise={"regions": [{"name": "all", "sigma_T": 1e-9}]},
                    observation__components=["x", "y"])
     points = points_from(study.observation.positions)
-    field = vacuum_part(build_magnet(study), points) + finite_element_part(build_magnet(study),
-                                                                           points, session,
-                                                            columns=False).nominal
+    field = vacuum_part(build_magnet(study), points) + finite_element_part(
+        build_magnet(study), points, session.within("truth"), columns=False).nominal
     update = infer(build_magnet(study), field_map(points, field), session)
     error = update.response.error
     assert error.min() > 1e-7
