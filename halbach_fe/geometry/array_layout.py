@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,8 @@ def blocks_of_array(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
     if not array.exceptions:
         return nominal
     places = {(block.ring, block.slot): block for block in nominal}
-    return tuple(_with_exceptions(block, exceptions_of(array, block.ring, block.slot), places)
+    of_block = exceptions_of(array)
+    return tuple(_with_exceptions(block, of_block(block.ring, block.slot), places)
                  for block in nominal)
 
 
@@ -133,10 +135,22 @@ def _displaced(block: MagnetBlock, exceptions: Sequence[BlockException]) -> Magn
                    easy_axis=vector(rotation_matrix(vector(rotation)) @ block.easy_axis))
 
 
-def exceptions_of(array: Array, ring: int, slot: int) -> list[BlockException]:
-    """Return the exceptions that hold for a block, in the order of the study."""
-    return [exception for exception in array.exceptions
-            if exception.ring in (None, ring) and exception.slot in (None, slot)]
+def exceptions_of(array: Array) -> Callable[[int, int], list[BlockException]]:
+    """Return a function of ring and slot, which returns the exceptions that hold for a block, in
+    the order of the study.
+
+    They are sorted once: oval rings of thousands of blocks have an exception for each.
+    """
+    found = defaultdict[tuple[int | None, int | None], list[int]](list)
+    for number, exception in enumerate(array.exceptions):
+        found[exception.ring, exception.slot].append(number)
+
+    def of_block(ring: int, slot: int) -> list[BlockException]:
+        return [array.exceptions[number] for number in sorted(
+            number for place in product((None, ring), (None, slot))
+            for number in found.get(place, ()))]
+
+    return of_block
 
 
 def magnetization_factor(exceptions: Sequence[BlockException]) -> float:

@@ -31,12 +31,12 @@ def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
         and the matrix (3, 3) that turns the magnetization it would have there into the
         magnetization that it has where it is mounted. The matrix is 0 for a missing block.
     """
-    array, found = magnet.array, []
+    of_block, found = exceptions_of(magnet.array), []
     for block in magnet.blocks:
         ring, slot = block.mounted_from or (block.ring, block.slot)
         number = magnet.number_of(ring, slot)
         turn = rotation_matrix(block.rotation_rad) @ block.carried_from(magnet.blocks[number])
-        factor = magnetization_factor(exceptions_of(array, block.ring, block.slot))
+        factor = magnetization_factor(of_block(block.ring, block.slot))
         found.append((number, factor * turn))
     return found
 

@@ -91,9 +91,10 @@ def register_maps(
         blocks = found[one.name][0].blocks
         probes.setdefault(one.probe, found[one.name][0])
     for name, by_overlap in known_poses.items():
+        assert joined is not None
         best, *others = found[name]
-        found[name] = [replace(best, apart=_apart(
-            best, by_overlap, found[joined[0]][0] if joined else best)), *others]
+        found[name] = [replace(best, apart=contradictions(
+            best, by_overlap, found[joined[0]][0])), *others]
     return found
 
 
@@ -109,10 +110,17 @@ def _known_poses(maps: Sequence[Map], joined: Joined | None) -> dict[str, MapPos
             "joined maps", "the campaign", f"of at least two of its maps ({', '.join(names)})",
             f"of {', '.join([frame, *(one.name for one in poses)])}",
             "Name the maps in the study as their files are named that `halbach-fe check` joined."))
+    (own,) = (one for one in maps if one.name == frame)
+    first = next(one for one in maps if one.pose == own.pose)
+    if first is not own:  # the study states where maps lie by the first one of their stage
+        raise StudyError(must_be(
+            "joined maps", "the campaign", f"in the frame of the first map of their stage, "
+            f"{first.name}", f"in that of {frame}", f"List {frame} before {first.name} in the "
+            f"study, or join the maps again with {first.name} first."))
     return known
 
 
-def _apart(best: Registration, known: MapPose, frame: Registration) -> tuple[Term, ...]:
+def contradictions(best: Registration, known: MapPose, frame: Registration) -> tuple[Term, ...]:
     """Return the numbers of a pose that contradict where a map lies in the frame of another one.
 
     A turn of the frame moves what is off its middle.
@@ -124,7 +132,8 @@ def _apart(best: Registration, known: MapPose, frame: Registration) -> tuple[Ter
                             - frame.instrument.translation_m) - by_overlap
     turn = (other.inv() * own * Rotation.from_rotvec(known.rotation_rad).inv()).as_rotvec()
     axes = other.inv().as_matrix()**2  # bars of the magnet's axes along those of the stage
-    placed = axes @ (best.translation_sd_m**2 + moved_by_turns(arm, frame.rotation_sd_rad)**2)
+    placed = axes @ (best.translation_sd_m**2 + frame.translation_sd_m**2
+                     + moved_by_turns(arm, frame.rotation_sd_rad)**2)
     turned = axes @ (best.rotation_sd_rad**2 + frame.rotation_sd_rad**2)
     return doubts([
         Term(f"{kind}_{axis}", unit, value, float(np.hypot(np.sqrt(square), sd)))

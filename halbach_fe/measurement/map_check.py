@@ -1039,14 +1039,20 @@ def _stated(
 
 
 def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
-    """Return the fit without the parameters of which the map does not tell which is off."""
-    kept = np.ones(len(fitted.at.instrument), bool)
+    """Return the fit without the parameters of which the map does not tell which is off, but for
+    those, such as parts of a change, that one which was found has as well.
+    """
     model = fitted.model
+    open_ones = stated = np.zeros(len(fitted.at.instrument), bool)
     for parameter, term in zip(all_parameters(model.prior_sd, model.shares(fitted.at)), terms,
                                strict=True):
+        waves = (parameter.row != 0) if parameter.beside else np.isin(
+            np.arange(len(open_ones)), parameter.own)
         if term.rivals:
-            kept[list(parameter.own + parameter.beside)] = False
-    return replace(fitted.at, instrument=np.where(kept, fitted.at.instrument, 0.0))
+            open_ones = open_ones | waves
+        elif term.found:
+            stated = stated | waves
+    return replace(fitted.at, instrument=np.where(open_ones & ~stated, 0.0, fitted.at.instrument))
 
 
 def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:

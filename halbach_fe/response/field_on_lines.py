@@ -279,9 +279,10 @@ def _check_faces(magnet: Magnet, lines: Lines) -> None:
     counts = (lines.count + more for more in (-1, 1, -2, 2, 3, 4, 5))
     other = next((count for count in counts if count >= fewest and free(
         replace(lines, count=count))), None)
+    way = "across itself" if there == len(own.faces) else "along itself"
     raise StudyError(must_be(
         "points", magnet.name, "in air or inside a block", f"{there} of {len(own.faces)} on faces "
-        "where blocks touch, at which B jumps", "Move the line by 0.1 mm along itself or across."
+        "where blocks touch, at which B jumps", f"Move the line by 0.1 mm {way}."
         if other is None else f"With --count {other} no point is there."))
 
 

@@ -245,7 +245,8 @@ def largest_directions(matrix: Floats, smallest: float) -> Floats:
         squares, vectors = np.linalg.eigh(gram)
     kept = squares > smallest**2
     found = vectors[:, kept]
-    return np.asarray(matrix.T @ (found / np.sqrt(squares[kept])) if wide else found)
+    # small values of a Gram matrix have vectors that its rounding has turned towards each other
+    return np.asarray(np.linalg.qr(matrix.T @ found)[0] if wide else found)
 
 
 def remounted_root(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.geometry.array_layout import position_angle_deg
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import infer as infer_module
+from halbach_fe.inference.campaign_registration import contradictions
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import inference_summary
 from halbach_fe.measurement.campaign import maps_of, read_maps
 from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.map_join import MapPose
 from halbach_fe.measurement.observation import concatenate, observe
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.response.deviation_field import Deviations
@@ -452,6 +455,19 @@ def test_maps_that_are_not_on_one_stage_disagree(generator, tmp_path):
     assert result.disagreement
 
 
+@pytest.mark.parametrize(("sd_m", "contradicts"), [(2e-5, True), (4e-4, False)])
+def test_where_a_map_lies_in_an_uncertain_frame(sd_m, contradicts):
+    """The bar of the frame's own place is in the comparison with what the overlap says."""
+    exact = np.full(3, 1e-6)
+    frame = SimpleNamespace(instrument=Instrument(), middle_m=np.zeros(3),
+                            translation_sd_m=np.full(3, sd_m), rotation_sd_rad=exact)
+    best = SimpleNamespace(instrument=Instrument(translation_m=(0.0, 0.0, 4e-4)),
+                           translation_sd_m=exact, rotation_sd_rad=exact)
+    known = MapPose("fringe", np.zeros(3), np.zeros(3), exact, np.zeros(3), exact, 1)
+    assert [one.name for one in contradictions(best, known, frame)] == (
+        ["along_z"] if contradicts else [])
+
+
 def test_a_campaign_on_one_stage_is_registered(generator, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(POSES, "fringe", SHIFTED)
     path = campaign_file(tmp_path, two_maps(generator), "stage = 'table'\n")
@@ -488,7 +504,10 @@ def test_a_campaign_on_one_stage_is_registered(generator, tmp_path, monkeypatch,
     assert apart["value"] == pytest.approx(-4e-4, abs=4 * apart["prior_sd"])
     assert apart["prior_sd"] < 1e-4
     for text, sentence in (('{"frame": "body", "poses": [{"name": "x"}]}', "a joined.json that"),
-                           (json.dumps(overlap | {"frame": "else"}), "at least two of its maps")):
+                           (json.dumps(overlap | {"frame": "else"}), "at least two of its maps"),
+                           (json.dumps({"frame": "fringe", "poses": [
+                               overlap["poses"][0] | {"name": "body"}]}),
+                            "in the frame of the first map of their stage, body")):
         (tmp_path / "joined.json").write_text(text)
         assert main(["register", str(path), "-o", str(tmp_path / "none"), "--joined",
                      str(tmp_path / "joined.json")]) in (3, 4)

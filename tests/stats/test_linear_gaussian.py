@@ -303,3 +303,11 @@ def test_largest_directions_are_those_of_the_singular_values(generator, rows, co
     assert np.allclose(found.T @ found, np.eye(found.shape[1]), rtol=0, atol=1e-6)
     outside = matrix @ (wanted - found @ (found.T @ wanted))
     assert np.linalg.norm(outside, ord=2) < 0.01 * smallest
+
+
+def test_small_directions_are_perpendicular(generator):
+    """Of few readings with little noise: values near the rounding of the Gram matrix."""
+    left, right = (np.linalg.qr(generator.standard_normal((size, 200)))[0] for size in (200, 600))
+    found = largest_directions(left * np.logspace(0, -8, 200) @ right.T, 1e-7)
+    assert found.shape[1] == 175
+    assert np.allclose(found.T @ found, np.eye(175), rtol=0, atol=1e-10)  # 0.05 without QR
