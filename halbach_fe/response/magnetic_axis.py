@@ -23,11 +23,14 @@ deviations are those of the blocks in vacuum: columns of all blocks take as long
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import product
 
 import numpy as np
+from scipy import optimize
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.block_variation import distribution_of
 from halbach_fe.response.deviation_field import Deviations, with_magnetizations
@@ -106,12 +109,9 @@ def magnetic_axis(
     angles = 2 * np.pi * np.arange(count) / count
     circle = radius * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
     around = (circle + heights[:, None, None] * [0, 0, 1.0]).reshape(-1, 3)
-    # distance of the points from which gradient and curvatures of a dipole's field follow, relative
-    # to the radius of the bore
-    step_share = 1 / 4
-    cross = np.vstack([np.zeros(3), *(sign * step_share * bore * unit for unit in _DIRECTIONS
-                                      for sign in (1, -1))])
-    points = np.vstack([around, cross]) if order == 1 and not flat else around
+    # radius of the sphere on which a dipole's field is expanded, relative to that of the bore
+    sphere = bore / 4 * _ON_SPHERE
+    points = np.vstack([around, sphere]) if order == 1 and not flat else around
     if magnet.contains(points).any():  # something stands in the bore
         return None
     size = magnet.dimension
@@ -138,8 +138,7 @@ def magnetic_axis(
     if order == 1:
         if flat:
             return MagneticAxis(order, roll, roll_sd)
-        centre = _stationary(field[len(around):], columns[len(around):], step_share * bore,
-                             magnetizations)
+        centre = _stationary(field[len(around):], columns[len(around):], bore / 4, magnetizations)
         return MagneticAxis(order, roll, roll_sd, *centre)
     below, below_root = multipole(order - 1, field), multipole(order - 1, columns)
     scale = -radius / (order - 1)
@@ -178,35 +177,47 @@ def _fields(
     return columns @ mean + external, columns @ response.nominal + external, columns
 
 
-_DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1]], float)
-"""Directions along which differences give gradient and curvatures."""
+_ON_SPHERE = np.array([place / np.linalg.norm(place)
+                       for place in product((-1.0, 0.0, 1.0), repeat=3) if any(place)])
+"""Points (26, 3) of the unit sphere: the six ends of the axes, and those between them."""
+
+_DEGREES = 6
+"""Degree of the harmonic polynomials that stand for the potential in the sphere: a field of blocks
+at four times its radius has 2e-4 of itself beyond. Differences of the field over the sphere, which
+follow it to degree 3, were off by 0.05 mm in a dipole of 24 cubes of 1 %, 18 error bars."""
 
 
 def _stationary(
-    field: Floats, columns: Floats, step: float, magnetizations: Gaussian
+    field: Floats, columns: Floats, radius: float, magnetizations: Gaussian
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | tuple[()]:
     """Return the stationary point of the component along the field, and its standard deviations.
 
-    Both are (3,) in m. They are empty if the point is too far away. The quadratic part of the
-    field, from B (13, 3) at the middle and a step in m to both sides along each of `_DIRECTIONS`,
-    counts as that of the mean magnetizations. ``columns`` (13, 3, parameters) belong to B.
+    Both are (3,) in m. They are empty if the point is not in the sphere of a ``radius`` in m, on
+    which B (26, 3) is given: farther away the field of a homogeneous magnet may be stationary
+    anywhere. The curvatures count as those of the mean magnetizations. ``columns`` (26, 3,
+    parameters) belong to B.
     """
-    direction = field[0] / np.linalg.norm(field[0])
-    along, rows = field @ direction, np.einsum("pcm,c->pm", columns, direction)
-    plus, minus = along[1::2], along[2::2]
-    gradient = (plus - minus)[:3] / (2 * step)
-    second = (plus + minus - 2 * along[0]) / step**2
-    curvature = np.diag(second[:3])
-    for number, (one, other) in zip((3, 4, 5), ((0, 1), (0, 2), (1, 2)), strict=True):
-        mixed = (second[number] - second[one] - second[other]) / 2
-        curvature[one, other] = curvature[other, one] = mixed
-    inverse = np.linalg.pinv(curvature)
-    place = -inverse @ gradient
-    # farthest stationary point of a dipole's field that counts, in steps from the middle. Farther
-    # away the field has other curvatures; that of a homogeneous magnet may be anywhere.
-    most_steps = 1
-    if not np.linalg.norm(place) <= most_steps * step:
+    fit = np.linalg.pinv(solid_harmonic_fields(_ON_SPHERE, _DEGREES).reshape(field.size, -1))
+    amplitudes = fit @ field.ravel()
+    middle = solid_harmonic_fields(np.zeros((1, 3)), _DEGREES)[0] @ amplitudes
+    direction = middle / np.linalg.norm(middle)
+    near = 1e-3  # distance for differences of these polynomials, in radii
+
+    def slopes(place: Floats) -> Floats:
+        """Return the gradient (3, amplitudes) of the component, whose unit is the radius."""
+        ends = solid_harmonic_fields(
+            np.vstack([place + near * np.eye(3), place - near * np.eye(3)]), _DEGREES)
+        along = np.einsum("pck,c->pk", ends, direction)
+        return np.asarray((along[:3] - along[3:]) / (2 * near))
+
+    small = 1e-12  # step in radii at which the search ends; it may begin where the slope is 0
+    found = optimize.least_squares(
+        lambda place: slopes(place) @ amplitudes / np.linalg.norm(amplitudes), np.zeros(3),
+        xtol=small, ftol=small, gtol=small)
+    if not found.success or np.linalg.norm(found.x) > 1:
         return ()
-    gradient_rows = (rows[1::2] - rows[2::2])[:3] / (2 * step)
-    return (tuple(place.tolist()),
-            tuple(magnetizations.sd_of(-inverse @ gradient_rows).tolist()))
+    changes = [slopes(found.x + near * axis) - slopes(found.x - near * axis) for axis in np.eye(3)]
+    curvature = np.array([change @ amplitudes for change in changes]).T / (2 * near)
+    rows = -np.linalg.solve(curvature, slopes(found.x) @ (fit @ columns.reshape(field.size, -1)))
+    return (tuple((radius * found.x).tolist()),
+            tuple((radius * magnetizations.sd_of(rows)).tolist()))

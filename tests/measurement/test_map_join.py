@@ -371,7 +371,7 @@ def test_a_turn_about_a_far_dipole_is_not_determined(monkeypatch):
     Control: counted as such, it makes bars of which errors are many.
     """
     off = []
-    for seed in (7, 5):  # of 8 draws those with the largest errors
+    for seed in (7, 5):  # the control is of the second
         maps, poses = coarse_maps(seed, 1)
         joined = join_checked(maps, QUIET)
         assert "does not determine the turn about" in answer(joined).trust

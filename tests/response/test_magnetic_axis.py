@@ -7,6 +7,7 @@ import copy
 import magpylib
 import numpy as np
 import pytest
+from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
@@ -18,6 +19,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from tests.support.cuboids import DOCUMENT
 
@@ -155,6 +157,31 @@ def test_the_centre_and_roll_of_a_dipole(generator, tmp_path):
     assert nominal.centre_m == pytest.approx([0, 0, 0], abs=1e-9)
     # control: the error is smaller than that of the nominal magnet
     assert (np.abs(error) < 0.5 * np.abs(shift)).all()
+
+
+def test_the_centre_of_blocks_that_deviate_is_where_the_field_is_stationary(generator, tmp_path):
+    """By differences of magpylib's field over 0.1 mm; and it turns with the magnet, exactly."""
+    errors = 0.02 * 1.2 * generator.standard_normal((3, 12, 3))
+    magnet, session = build_magnet(study(1)), Session.open(tmp_path)
+    deviating = magnet.nominal_magnetization + errors.ravel() / MU_0
+
+    def centre(mean):
+        return np.array(magnetic_axis(magnet, session, Gaussian(
+            mean, np.zeros((mean.size, 1)))).centre_m)
+
+    ends = 1e-4 * np.vstack([np.eye(3), -np.eye(3)])
+    direction = true_field(1, np.zeros((2, 3)), errors=errors)[0]
+
+    def gradient(place):
+        along = true_field(1, place + ends, errors=errors) @ direction
+        return along[:3] - along[3:]
+
+    found = centre(deviating)
+    assert np.linalg.norm(found) > 1e-4
+    assert found == pytest.approx(optimize.root(gradient, found).x, abs=1e-6)
+    # half a turn about z reverses a dipole: slot k comes to slot k + 6
+    turned = deviating.reshape(3, 2, 6, 3)[:, ::-1].reshape(3, 12, 3) * [-1, -1, 1]
+    assert centre(-turned.ravel()) == pytest.approx(found * [-1, -1, 1], abs=1e-9)
 
 
 def test_a_cross_section(tmp_path, dipole):
