@@ -255,7 +255,7 @@ class _Writer:
         if path.is_symlink() or not path.is_file():
             return False
         if _is_kept(path):
-            return record.kept is None or name in record.kept
+            return record.kept is None or name in record.kept or _is_of_a_run(path)
         own = [known[name] for known in (record.files, record.writing) if name in known]
         return bool(own) and _digest(path) in own
 
@@ -587,6 +587,34 @@ def _read_or_refuse(file: BinaryIO, path: Path) -> Record | None:
             raise OutputError(f"File {path} is not one of halbach-fe, which would replace it. "
                               "Name another folder, or remove this file.")
     return record
+
+
+def _is_of_a_run(path: Path) -> bool:
+    """Tell by its content whether a file without a record is one that some run keeps for later ones.
+
+    A function that is called without a command's folder leaves none, as earlier states did. Gmsh's
+    own mesh.msh of somebody else has no regions.json of these keys beside it.
+    """
+    if fnmatch(path.name, "response-*.npy"):  # the parts of a response.h5
+        return True
+    if path.name == "response.h5":
+        import h5py  # half the time of an import of this module
+
+        try:
+            with h5py.File(path) as file:
+                return {"key", "content_sha256"} <= file.attrs.keys()
+        except OSError:
+            return False
+    if path.suffix == ".msh":
+        own = path.stem.partition("mesh")[0]
+        path = path.with_name(f"{own}-regions.json" if own else "regions.json")
+    if not path.name.endswith("regions.json"):
+        return False
+    try:
+        found = from_json(path.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and {"study", "dimension", "air"} <= found.keys()
 
 
 def _is_kept(path: Path) -> bool:
