@@ -590,7 +590,7 @@ def _read_or_refuse(file: BinaryIO, path: Path) -> Record | None:
 
 
 def _is_of_a_run(path: Path) -> bool:
-    """Tell by its content whether a file without a record is one that some run keeps for later ones.
+    """Tell by its content whether a file without a record is one that a run keeps for later ones.
 
     A function that is called without a command's folder leaves none, as earlier states did. Gmsh's
     own mesh.msh of somebody else has no regions.json of these keys beside it.

@@ -1093,7 +1093,7 @@ def _asked(
 
 def selected(
     parameters: list[Parameter], told: list[Evidence], known: NDArray[np.bool_] | None = None,
-    flat: int = 0,
+    flat: int = 0, with_rivals: bool = True,
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
     """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
 
@@ -1102,6 +1102,7 @@ def selected(
     one is enough, and that explain the map about as well, are kept together: in the flat field of
     an MRI magnet a gain that drifts along x is a gradient of the field and a sensor that is off
     along x. None is found then, as none has a value without the others, unless later ones help.
+    Not ``with_rivals``, the most probable one is kept alone.
     """
     kept = np.zeros(len(told[0].sums), bool) if known is None else known.copy()
     rivals: dict[str, tuple[str, ...]] = {}
@@ -1122,7 +1123,7 @@ def selected(
                         else rivals.get(term.name, ()))
                 for term, old in zip(terms, there, strict=True))
         else:
-            alike = _alike(new, told[0])
+            alike = _alike(new, told[0])[:None if with_rivals else 1]
             rivals |= {name: tuple(other for other in alike if other != name) for name in alike}
             for parameter in parameters:
                 if parameter.name in alike:

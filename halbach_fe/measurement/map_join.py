@@ -782,7 +782,9 @@ class _Joined:
         at = np.flatnonzero(kept)
         if any(_stands_out(parameter, told[0], at) for parameter in parameters):
             told = list(self._evidence(open_terms, self._overlap, self._halves()))
-            new, _ = selected(parameters, told, kept)
+            # that one probe or its electronics has another gain in a map is likelier than anything
+            # else that differs between maps, whatever the overlap alone can tell
+            new, _ = selected(parameters, told, kept, with_rivals=False)
             if (new & ~kept).any():
                 found = self._with(new)
         common = [found._stated(parameter) for parameter in _common_terms(

@@ -187,5 +187,5 @@ def test_a_question_is_one_module(dipole, tmp_path, capsys, monkeypatch):
         assert ("Blocks by ring" in printed.out) != as_json
     assert json.loads(printed.out)["blocks"] == list(found.blocks)
     assert json.loads((tmp_path / "cli" / "run.json").read_text())["command"] == "halbach-fe count"
-    with pytest.raises(TypeError, match="has returned; instead received a str"):
+    with pytest.raises(hf.HalbachError, match="has returned; instead received a str"):
         hf.write_report("text", tmp_path / "none")

@@ -112,13 +112,13 @@ def test_a_lone_cube_far_from_the_axis(tmp_path):
 
 @pytest.mark.parametrize("count", [-1, 1])
 def test_a_posterior_of_other_blocks_is_refused(magnet, count):
-    """Zeros for as many parameters, or for a block more or less; without, the control."""
+    """1 A/m for as many parameters, or for a block more or less; without, the control."""
     size = len(magnet.parameter_names)
-    assert stray_field(magnet, magnetizations=Gaussian(np.zeros(size), np.eye(size))).radial is None
+    assert stray_field(magnet, magnetizations=Gaussian(np.ones(size), np.eye(size))).radial is None
     size += 3 * count
     for question in (stray_field, magnetic_axis):
         with pytest.raises(MeasurementError, match=r"Is it that of another magnet\?"):
-            question(magnet, NOT_KEPT, Gaussian(np.zeros(size), np.eye(size)))
+            question(magnet, NOT_KEPT, Gaussian(np.ones(size), np.eye(size)))
 
 
 def test_the_pictures_show_the_field(tmp_path, magnet):
