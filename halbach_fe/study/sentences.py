@@ -103,6 +103,7 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     most_per_k = 0.02
     # Largest intrinsic coercivity of magnets in kOe: a larger number is in kA/m.
     most_kilooersted = 45.0
+    least_square = 0.3  # smallest squareness of a magnet
     max_wrong_unit = 1e12  # values from this size on are not explained by a wrong unit
     key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
     if not abs(value) < max_wrong_unit:  # an integer may be beyond floats
@@ -117,6 +118,8 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
             continue
         given = value * factor + (ABSOLUTE_ZERO_C if unit == "kelvin" else 0.0)
         if factor < 0 and value < 0:  # no sign was lost
+            continue
+        if key.endswith("squareness") and given < least_square:
             continue
         if key.endswith(suffix) and not key.removesuffix(suffix).endswith("_per") and limits and (
                 limits.get("ge", -math.inf) <= given <= limits.get("le", math.inf)) and (

@@ -691,3 +691,17 @@ def test_gross_maps_are_written(tmp_path):
     np.testing.assert_allclose(columns[1], 1000 * columns[0], rtol=1e-9, atol=1e-6)
     assert read_map(tmp_path / "plain" / "map.csv")["time_s"].values[-1] == 23
     assert len(read_blocks(tmp_path / "millitesla" / "blocks.csv")) == 16
+
+
+@pytest.mark.parametrize("texts", [
+    ["block_flipped=1,3", "block_flipped=1,3"], ["block_missing=1,2", "block_flipped=1,2"],
+    ["gain_x=0.01", "gain_x=0.02"]])
+def test_an_effect_of_one_block_is_hidden_once(texts):
+    """Two flips of a block undo each other, and what is missing cannot be flipped; the control
+    has blocks of their own.
+    """
+    first, second = map(parse_hidden_effect, texts)
+    with pytest.raises(StudyError, match="given once"):
+        simulate_campaign(parse_study(RINGS), 1, hide=[first, second])
+    if len(second[1]) > 1:
+        simulate_campaign(parse_study(RINGS), 1, hide=[first, (second[0], (1.0, 4.0))])

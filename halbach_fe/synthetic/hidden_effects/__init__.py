@@ -92,12 +92,24 @@ def choose_effects(
     for effect_with_values in hidden:
         _check_place(site, effect_with_values)
         _check_size(site, effect_with_values)
-    names = [effect.name for effect, _ in effects
-             if "ring" not in {parameter.name for parameter in effect.parameters}]
+    names = [_as_named(one) for one in hidden[:len(effects)]]
     if twice := next((name for name in names if names.count(name) > 1), ""):
         raise StudyError(must_be(f"--hide {twice}", "the command line", "given once",
                                  "two of them", "Leave one out."))
     return tuple(hidden)
+
+
+WHOLE_BLOCK = ("block_missing", "block_flipped", "block_put_in_wrongly")
+"""Effects of which a block has one: what is not there cannot lie the wrong way round."""
+
+
+def _as_named(hidden: ChosenEffect) -> str:
+    """Return the name of an effect with the block or ring that it is of."""
+    place = [f"{value:g}" for parameter, value in zip(
+        hidden.effect.parameters, hidden.values, strict=True)
+        if parameter.name in ("ring", "slot")]
+    name = " or ".join(WHOLE_BLOCK) if hidden.effect.name in WHOLE_BLOCK else hidden.effect.name
+    return f"{name}={','.join(place)}" if place else name
 
 
 NEAREST_M = 1e-3
