@@ -349,7 +349,7 @@ def export(arguments: argparse.Namespace) -> int:
     With the format blocks, the input is a study, and the file a table of free blocks (CSV or HDF5):
     all blocks where and as they are, with their exceptions. A study reads it as array.free_blocks.
     """
-    from halbach_fe.geometry.free_blocks import blocks_table
+    from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
     from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.field_map import read_map
     from halbach_fe.measurement.formats.files import export_map
@@ -362,10 +362,12 @@ def export(arguments: argparse.Namespace) -> int:
         export_map(data, arguments.format, arguments.output)
         common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")
         return 0
-    columns = blocks_table(build_magnet(read_study(arguments.input)))
+    magnet = build_magnet(read_study(arguments.input))
+    columns, others = blocks_table(magnet), beside_blocks(magnet)
     common.own_file(arguments, arguments.input, *_free_blocks_files(arguments.input))
     write_free_blocks(columns, arguments.output)
-    common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}")
+    common.say(f"Wrote {len(columns['name'])} blocks: {arguments.output}"
+               + (f". Left out, as it is no block: {', '.join(others)}." if others else ""))
     return 0
 
 

@@ -43,7 +43,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.diagnosis.search import Say
-from halbach_fe.geometry.free_blocks import blocks_table
+from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.inference.map_homogeneity import MAP, map_homogeneity, of_other_size
@@ -217,6 +217,9 @@ def export(content: xr.Dataset | Magnet, path: str | Path, format: str = "csv") 
     with single_file(path, "halbach-fe export"):
         if isinstance(content, Magnet):
             write_free_blocks(blocks_table(content), path)
+            if others := beside_blocks(content):
+                warnings.warn(f"A table of blocks leaves out {', '.join(others)} of magnet "
+                              f"{content.name}.", HalbachWarning, stacklevel=2)
         else:
             export_map(content, format, path)
     return path

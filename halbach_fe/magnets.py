@@ -23,7 +23,7 @@ from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
 from halbach_fe.core.result_folder import single_file
-from halbach_fe.geometry.free_blocks import blocks_table, free_outline
+from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
@@ -352,13 +352,9 @@ def to_magpylib(magnet: Magnet) -> Any:
     if magnet.dimension == 2:
         raise StudyError(must_be("magnet", "to_magpylib", "of finite length", "a cross-section"))
     table = FreeBlocks.model_validate(blocks_table(magnet))
-    external = magnet.external
-    left_out = [name for name, given in (
-        ("the permeability of the blocks", any(
-            block.recoil_permeability != 1 or block.recoil_permeability_across != 1
-            for block in magnet.blocks)),
-        ("iron", magnet.iron), ("coils", external.coils), ("neighbours", external.neighbours),
-        ("dipoles", external.dipoles), ("the background", any(external.background_T))) if given]
+    permeable = any(block.recoil_permeability != 1 or block.recoil_permeability_across != 1
+                    for block in magnet.blocks)
+    left_out = ["the permeability of the blocks"] * permeable + beside_blocks(magnet)
     if left_out:
         warnings.warn(f"Sources of magpylib leave out {', '.join(left_out)} of magnet "
                       f"{magnet.name}: their field is another one.", HalbachWarning, stacklevel=2)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import read_study
 from tests.cli.test_cli import refused
-from tests.conftest import ROOT, circle
+from tests.conftest import DIPOLE, ROOT, circle
 
 HEAD = """
 name = "again"
@@ -52,3 +53,13 @@ def test_refusals(tmp_path, capsys):
     code, _ = refused(["export", study, "--format", "csv", "-o", tmp_path / "m.csv"], capsys)
     assert code == 4
     assert list(tmp_path.iterdir()) == [map_]
+
+
+def test_what_is_no_block_is_named(tmp_path, capsys):
+    """A background is in no table of blocks. Control: a magnet without."""
+    study = tmp_path / "study.toml"
+    for background, said in (([0.01, 0.0, 0.0], True), ([0.0, 0.0, 0.0], False)):
+        study.write_text(tomlkit.dumps(DIPOLE | {"external": {"background_T": background}}))
+        assert main(["export", str(study), "--format", "blocks",
+                     "-o", str(tmp_path / "blocks.csv")]) == 0
+        assert ("Left out, as it is no block: the background." in capsys.readouterr().err) == said
