@@ -185,7 +185,7 @@ def test_edges_on_one_line_need_not_meet(short_dipole, outline, holes, moved, ar
     (solid,) = magnet_of(short_dipole, body).iron
     assert solid.measures[0] == pytest.approx(area * 0.02, rel=1e-9)
     check_apart("test", [solid])
-    touching = (np.array(holes[-1]["outline_m"]) + [moved, 0.0]).tolist()  # the control
+    touching = [[x + moved, y] for x, y in holes[-1]["outline_m"]]  # the control
     with pytest.raises(StudyError, match="must lie within outline_m, and neither touch"):
         magnet_of(short_dipole, body | {"holes": [*holes[:-1], {"outline_m": touching}]})
 
