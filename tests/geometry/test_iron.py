@@ -185,6 +185,8 @@ def test_edges_on_one_line_need_not_meet(short_dipole, outline, holes, moved, ar
     (solid,) = magnet_of(short_dipole, body).iron
     assert solid.measures[0] == pytest.approx(area * 0.02, rel=1e-9)
     check_apart("test", [solid])
+    with pytest.raises(MeshError, match="draws body 1 of iron"):  # holes the wrong way round
+        check_apart("test", [replace(solid, holes=tuple(rim[::-1] for rim in solid.holes))])
     touching = [[x + moved, y] for x, y in holes[-1]["outline_m"]]  # the control
     with pytest.raises(StudyError, match="must lie within outline_m, and neither touch"):
         magnet_of(short_dipole, body | {"holes": [*holes[:-1], {"outline_m": touching}]})
