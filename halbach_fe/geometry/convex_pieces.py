@@ -246,8 +246,8 @@ def triangles_of_polygon(polygon: tuple[tuple[float, float], ...]) -> list[tuple
             if area[place] < 0:
                 continue
             a, b, c = previous[place], points[place], following[place]
-            inside = points[(_cross(b - a, points - a) > -flat) & (_cross(c - b, points - b) > -flat)
-                            & (_cross(a - c, points - c) > -flat)]
+            inside = points[np.all([_cross(end - start, points - start) > -flat
+                                    for start, end in ((a, b), (b, c), (c, a))], axis=0)]
             # its own corners, which a polygon with a slit may have twice
             own = [np.hypot(*(inside - corner).T) < np.sqrt(flat) for corner in (a, b, c)]
             if np.any(own, axis=0).all():
