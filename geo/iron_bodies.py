@@ -145,7 +145,7 @@ def _draw(name: str, bodies: Sequence[IronSolid]) -> tuple[list[list[int]], Shel
     """
     occ = gmsh.model.occ
     drawn = [_volume(body) for body in bodies]
-    rounding = 0.01  # of the chords that stand for circles in `IronSolid.measures`
+    rounding = 0.01  # of triangles, whose corners Gmsh's points may stand beside
     for number, (body, volume) in enumerate(zip(bodies, drawn, strict=True)):
         found, expected = occ.getMass(*volume), body.measures[0]
         if not abs(found - expected) <= rounding * expected:

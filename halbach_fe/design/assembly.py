@@ -16,6 +16,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.holder import HeldBlock, Plate, overlapping, plates
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.free_blocks import blocks_of_table, blocks_table
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.prism import Prism, upright
@@ -263,10 +264,12 @@ def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
     if magnet.dimension == 2:
         raise StudyError(must_be("`dimension`", f"study {magnet.name}", "3 for solids", "2",
                                  "Use dimension = 3, and give array.ring_length_m."))
-    if any(body.sphere or not body.in_place for body in magnet.iron):
-        raise StudyError(must_be(
-            "`iron.bodies`", f"study {magnet.name}", "tubes and prisms along z, for solids",
-            "a sphere, or a body with centre_m or rotation_deg", "Leave it out."))
+    for body in magnet.iron:
+        if body.sphere or not body.in_place:
+            raise StudyError(must_be(
+                "`iron.bodies`", f"study {magnet.name}", "tubes, boxes, and prisms without "
+                "holes, all without centre_m, step_m and rotation_deg, for solids",
+                _kind_in_words(body), "Leave it out."))
     there = [number for number, block in enumerate(magnet.blocks) if block.remanence]
     most_blocks = 20_000  # largest number of blocks: their STEP file has 15 MB
     if len(there) > most_blocks:
@@ -286,6 +289,19 @@ def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
                              axes[original], plate_of.get(number))
               for number, (block, original) in enumerate(zip(own, there, strict=True))),
         found, reasons, 0 if blocks is None else int(np.sum(blocks.ring == 0)))
+
+
+def _kind_in_words(body: IronSolid) -> str:
+    """Return what a body of iron is that has no solid."""
+    if body.sphere:
+        return "a sphere"
+    if body.profile is not None:
+        return "a body of the kind 'revolved'"
+    if body.holes:
+        return "a prism with holes"
+    if body.triangles is not None:
+        return "a body of the kind 'stl'"
+    return "a body with centre_m, step_m or rotation_deg"
 
 
 def _plates(

@@ -246,12 +246,11 @@ def triangles_of_polygon(polygon: tuple[tuple[float, float], ...]) -> list[tuple
             if area[place] < 0:
                 continue
             a, b, c = previous[place], points[place], following[place]
-            others = np.delete(points, [place - 1, place, (place + 1) % len(left)], axis=0)
-            # a polygon with a slit has corners twice
-            inside = ((_cross(b - a, others - a) > -flat) & (_cross(c - b, others - b) > -flat)
-                      & (_cross(a - c, others - c) > -flat))
-            own = [np.hypot(*(others - corner).T) < np.sqrt(flat) for corner in (a, b, c)]
-            if not (inside & ~np.any(own, axis=0)).any():
+            inside = points[np.all([_cross(end - start, points - start) > -flat
+                                    for start, end in ((a, b), (b, c), (c, a))], axis=0)]
+            # its own corners, which a polygon with a slit may have twice
+            own = [np.hypot(*(inside - corner).T) < np.sqrt(flat) for corner in (a, b, c)]
+            if np.any(own, axis=0).all():
                 found.append((left[place - 1], left[place], left[(place + 1) % len(left)]))
                 break
         left.pop(int(place))

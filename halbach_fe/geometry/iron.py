@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
@@ -22,6 +24,7 @@ from halbach_fe.geometry.surface import (
     contact_of_tube,
 )
 from halbach_fe.study.iron import (
+    CHORDS,
     Iron,
     IronBody,
     IronCurve,
@@ -32,6 +35,9 @@ from halbach_fe.study.iron import (
 )
 from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import curve_from
+
+AROUND = 96
+"""Number of chords that stand for circles in the triangles of a body of revolution."""
 
 
 @dataclass(frozen=True)
@@ -132,8 +138,8 @@ class IronSolid:
             a, b, c = np.moveaxis(self.triangles, 1, 0)
             areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
             box = np.ptp(self.triangles.reshape(-1, 3), axis=0)  # its edges stand for all of them
-            return float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6, float(areas.sum()), float(
-                4 * box.sum())
+            volume = float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6
+            return self._rounded(volume), float(areas.sum()), float(4 * box.sum())
         if self.outline is None:
             rim = 2 * np.pi * (self.inner_radius + self.outer_radius)
             area, corners = np.pi * (self.outer_radius**2 - self.inner_radius**2), 0
@@ -143,6 +149,16 @@ class IronSolid:
             rim, corners = sum(edge.length for edge in self.outline), len(self.outline)
         length = self.z_max - self.z_min
         return area * length, 2 * area + rim * length, 2 * rim + corners * length
+
+    def _rounded(self, volume: float) -> float:
+        """Return the volume in m^3 with circles, from that with the chords of the triangles."""
+        def share(chords: int) -> float:
+            return float(np.sinc(2 / chords))  # of a circle's area that is within its chords
+
+        if self.profile is not None:
+            return volume / share(AROUND)
+        holes = sum(np.pi * hole[2]**2 for hole in self.holes if hole.ndim == 1)
+        return volume - (1 - share(CHORDS)) * float(holes) * (self.z_max - self.z_min)
 
     @property
     def radius(self) -> float:
@@ -210,7 +226,7 @@ def iron_solids(
             found = [_prism(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]), (-z, z))]
         else:
             corners = counter_clockwise(np.array(body.outline_m))
-            found = [_prism(corners @ turn.T, limits(body.length_m, body.z_m), body.holes, turn)
+            found = [_prism(corners, limits(body.length_m, body.z_m), body.holes, turn)
                      for turn in (rotation_about_z(2 * np.pi * n / body.copies)[:2, :2]
                                   for n in range(body.copies))]
         law = law_of(body.own_material or iron)
@@ -221,26 +237,25 @@ def iron_solids(
 def _prism(corners: Floats, ends: tuple[float, float], holes: tuple[IronHole, ...] = (),
            turn: Floats | None = None) -> IronSolid:
     """Return a prism on a polygon (n, 2) in m with holes, which are yet to be turned (2, 2)."""
-    outline = closed_outline(corners)
+    axes = np.eye(2) if turn is None else turn
+    outline = closed_outline(corners @ axes.T)
     t = np.linspace(0.0, 1.0, 17)
     radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
     solid = IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
     if not holes or np.isinf(ends).any():  # in 2D the study is refused
         return replace(solid, holes=tuple(hole.corners for hole in holes))
-    axes = np.eye(2) if turn is None else turn
     drawn = tuple(hole.corners @ axes.T if hole.radius_m is None else np.array(
         [*(axes @ (hole.x_m, hole.y_m)), hole.radius_m]) for hole in holes)
-    return replace(solid, holes=drawn, triangles=_of_prism(
-        corners, [hole.corners @ axes.T for hole in holes], ends))
+    return replace(solid, holes=drawn, triangles=_of_prism(corners, holes, ends, axes))
 
 
-def _of_prism(corners: Floats, holes: list[Floats], ends: tuple[float, float]) -> Floats:
-    """Return the triangles (n, 3, 3) of a prism with holes, which run clockwise."""
-    flat = _slit(corners, holes)
-    cap = flat[np.array(triangles_of_polygon(tuple(map(tuple, flat.tolist()))))]
+def _of_prism(corners: Floats, holes: tuple[IronHole, ...], ends: tuple[float, float],
+              axes: Floats) -> Floats:
+    """Return the triangles (n, 3, 3) of a prism with holes, which is yet to be turned (2, 2)."""
+    cap = _cap(tuple(map(tuple, corners.tolist())), holes) @ axes.T
     low, high = (np.concatenate([cap, np.full((*cap.shape[:2], 1), z)], axis=2) for z in ends)
     sides = [low[:, ::-1], high]
-    for rim in (corners, *holes):
+    for rim in (corners @ axes.T, *(hole.corners @ axes.T for hole in holes)):
         after = np.roll(rim, -1, axis=0)
         a, b, c, d = (np.column_stack([place, np.full(len(rim), z)]) for place, z in (
             (rim, ends[0]), (after, ends[0]), (after, ends[1]), (rim, ends[1])))
@@ -248,18 +263,22 @@ def _of_prism(corners: Floats, holes: list[Floats], ends: tuple[float, float]) -
     return np.concatenate(sides)
 
 
+@lru_cache(maxsize=64)  # copies of a pole, and its magnet when it is built again
+def _cap(corners: tuple[tuple[float, float], ...], holes: tuple[IronHole, ...]) -> Floats:
+    """Return the triangles (n, 3, 2) of a polygon with holes."""
+    flat = _slit(np.array(corners), [hole.corners for hole in holes])
+    cap = flat[np.array(triangles_of_polygon(tuple(map(tuple, flat.tolist()))))]
+    cap.setflags(write=False)
+    return cap
+
+
 def _slit(corners: Floats, holes: list[Floats]) -> Floats:
-    """Return a polygon with slits to its holes, along the shortest ways that meet no edge."""
+    """Return a polygon with slits to its holes, along short ways that meet no edge."""
     rest = list(holes)
     while rest:
         edges = np.concatenate([np.stack([rim, np.roll(rim, -1, axis=0)], axis=1)
                                 for rim in (corners, *rest)])
-        # from a corner without a slit: at one with a slit it matters on which side the next begins
-        _, first, times = np.unique(corners, axis=0, return_index=True, return_counts=True)
-        ways = [(float(np.hypot(*(hole[j] - corners[i]))), number, i, j)
-                for number, hole in enumerate(rest) for i in first[times == 1].tolist()
-                for j in range(len(hole))]
-        for _, number, i, j in sorted(ways):
+        for i, number, j in _ways(corners, rest):
             if not _meets(corners[i], rest[number][j], edges):
                 hole = rest.pop(number)
                 corners = np.concatenate([
@@ -269,6 +288,27 @@ def _slit(corners: Floats, holes: list[Floats]) -> Floats:
             raise StudyError("The holes of a prism of iron cannot be cut out: no straight way "
                              "leads to one. Please report this with the study.")
     return corners
+
+
+def _ways(corners: Floats, holes: list[Floats]) -> Iterator[tuple[int, int, int]]:
+    """Yield ways to holes: the corner that each starts from, and the hole and its corner.
+
+    The shortest to every corner of a hole come first, from the shortest on; all others follow.
+    """
+    # from a corner without a slit: at one with a slit it matters on which side the next begins
+    _, first, times = np.unique(corners, axis=0, return_index=True, return_counts=True)
+    free = first[times == 1]
+    tree = KDTree(corners[free])
+    ends = [(number, j) for number, hole in enumerate(holes) for j in range(len(hole))]
+    places = np.concatenate(holes)
+    before = 0
+    while before < len(free):
+        count = min(len(free), max(1, 8 * before))
+        lengths, nearest = tree.query(places, np.arange(before, count) + 1)
+        for one in np.argsort(lengths, axis=None, kind="stable").tolist():
+            end, neighbour = divmod(one, count - before)
+            yield int(free[nearest[end, neighbour]]), *ends[end]
+        before = count
 
 
 def _meets(start: Floats, end: Floats, edges: Floats) -> bool:
@@ -290,8 +330,8 @@ def _meets(start: Floats, end: Floats, edges: Floats) -> bool:
 def _revolved(profile: Floats) -> IronSolid:
     """Return a body of revolution with the corners r and z (n, 2) in m."""
     profile = counter_clockwise(profile)
-    angle = 2 * np.pi / 96 * np.arange(97)
-    rims = [np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(97, z)])
+    angle = 2 * np.pi / AROUND * np.arange(AROUND + 1)
+    rims = [np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(AROUND + 1, z)])
             for r, z in profile]
     found = []
     for (first, start), (last, end) in zip(

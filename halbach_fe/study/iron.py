@@ -246,6 +246,10 @@ Polygon = Annotated[tuple[tuple[Coordinate, Coordinate], ...],
                     Field(min_length=3, max_length=1000)]
 
 
+CHORDS = 48
+"""Number of chords that stand for the circle of a round hole."""
+
+
 class IronHole(StudyModel):
     """A hole through a prism along its z axis: a polygon ``outline_m``, or a round one.
 
@@ -270,9 +274,9 @@ class IronHole(StudyModel):
 
     @property
     def corners(self) -> Floats:
-        """Corners (n, 2) in m, clockwise; 48 around a circle for a round hole."""
+        """Corners (n, 2) in m, clockwise; `CHORDS` around a circle for a round hole."""
         if self.radius_m is not None:
-            angle = -2 * np.pi / 48 * np.arange(48)
+            angle = -2 * np.pi / CHORDS * np.arange(CHORDS)
             return np.asarray(np.column_stack([self.x_m + self.radius_m * np.cos(angle),
                                                self.y_m + self.radius_m * np.sin(angle)]))
         corners = np.array(self.outline_m)
@@ -350,7 +354,11 @@ def _edges_meet(first: Floats, second: Floats) -> bool:
 
     of_second = sides(a, b, c) * sides(a, b, d)
     of_first = (sides(c, d, a) * sides(c, d, b)).T
-    return bool(((of_first <= 0) & (of_second <= 0)).any())
+    near = [(np.minimum(p, q)[:, None] <= np.maximum(r, s) + 1e-12)  # rounding of coordinates
+            & (np.maximum(p, q)[:, None] >= np.minimum(r, s) - 1e-12)
+            for p, q, r, s in ((a.real, b.real, c.real, d.real), (a.imag, b.imag, c.imag, d.imag))]
+    # edges on one line have no sides, and meet only where their boxes do
+    return bool(((of_first <= 0) & (of_second <= 0) & near[0] & near[1]).any())
 
 
 class IronRevolved(PlacedIron):

@@ -232,6 +232,40 @@ def test_holders_that_cannot_be_made(holder, said):
         cad(build_magnet(study(**holder)))
 
 
+BOX = {"kind": "box", "size_m": [0.02, 0.02, 0.01]}
+PLATE = {"kind": "prism", "outline_m": [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]],
+         "length_m": 0.01, "z_m": 0.1}
+
+
+def with_iron(body):
+    return build_magnet(parse_study(DOCUMENT | {"iron": {
+        "relative_permeability": 1000.0, "bodies": [body]}}))
+
+
+@pytest.mark.parametrize(("body", "said"), [
+    ({"kind": "sphere", "radius_m": 0.01, "centre_m": [0, 0, 0.1]}, "a sphere"),
+    (PLATE | {"holes": [{"radius_m": 0.01}]}, "a prism with holes"),
+    ({"kind": "revolved", "profile_m": [[0, 0.1], [0.02, 0.1], [0, 0.12]]},
+     "a body of the kind 'revolved'"),
+    ({"kind": "stl", "triangles_m": [[[0, 0, 0.1], [0, 0.1, 0.1], [0.1, 0, 0.1]],
+                                     [[0, 0, 0.1], [0.1, 0, 0.1], [0, 0, 0.2]],
+                                     [[0, 0, 0.1], [0, 0, 0.2], [0, 0.1, 0.1]],
+                                     [[0.1, 0, 0.1], [0, 0.1, 0.1], [0, 0, 0.2]]]},
+     "a body of the kind 'stl'"),
+    (BOX | {"centre_m": [0, 0, 0.1]}, "a body with centre_m, step_m or rotation_deg"),
+    (PLATE | {"rotation_deg": [0, 0, 9]}, "a body with centre_m, step_m or rotation_deg"),
+    (PLATE | {"repeats": 2, "step_m": [0, 0, 0.1]}, "a body with centre_m, step_m or rot")])
+def test_iron_that_has_no_solid_is_named(body, said):
+    with pytest.raises(StudyError, match=f"`iron.bodies` of study held must be .*received {said}"):
+        cad(with_iron(body))
+
+
+@pytest.mark.parametrize("body", [
+    BOX, PLATE, {"kind": "tube", "inner_radius_m": 0.09, "outer_radius_m": 0.1}])
+def test_iron_that_has_a_solid(body):
+    assert len(cad(with_iron(body)).magnet.iron) == 1
+
+
 def test_blocks_without_places():
     table = simulate_delivery(study(), 2)
     loose = replace(table, ring=0 * table.ring, slot=0 * table.slot)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import meshio
 import numpy as np
 import pytest
 
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import GetDPError, StudyError
 from halbach_fe.geo.iron_bodies import Sizes, mesh_iron
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
@@ -152,6 +153,63 @@ def test_a_profile_is_as_a_tube(session):
     scale = np.abs(found[0]).max()
     assert np.abs(found[1] - found[0]).max() < 0.01 * scale  # 0.3 % were measured
     assert np.abs(found[2] - found[0]).max() > 0.02 * scale
+
+
+SLAB = {"kind": "box", "size_m": [0.03, 0.002, 0.03], "centre_m": [0.05, 0.0, 0.0]}
+
+
+def assembled(session):
+    """The problem of a slab on a coarse mesh, assembled anew."""
+    iron_bodies._assembled.cache_clear()
+    magnet = build_magnet(study_with(SLAB, mesh={"block_size_m": 0.02, "growth": 2.6}))
+    return assemble_bodies(magnet, session, 2.0)
+
+
+def test_a_rough_solution_verifies_the_matrix(session, monkeypatch):
+    """GetDP's solution has a larger residual in the maximum norm than where it stopped; that of a
+    wrong numbering is larger yet.
+    """
+    limit = str(0.9 * iron_bodies.ROUGH_RESIDUAL)
+    monkeypatch.setattr(iron_bodies, "ROUGHLY", (*iron_bodies.ROUGHLY[:-1], limit))
+    found = {}
+    check = iron_bodies.check_matrix
+    monkeypatch.setattr(iron_bodies, "check_matrix", lambda *given: found.update(given=given))
+    assembled(session)
+    problem, surface, solution = found["given"]
+    check(problem, surface, solution)
+    monkeypatch.setattr(iron_bodies, "SOLUTION_TOLERANCE", 1e-3)  # the residual that is asked for
+    with pytest.raises(GetDPError, match=r"matrix differs by .*e-0[23]"):
+        check(problem, surface, solution)
+    monkeypatch.undo()
+    count = len(solution)
+    everything = np.arange(count)  # as if it were all surface
+    for shift in (1, 7, count // 2):  # the control
+        wrong = replace(problem, nodes=(problem.nodes + shift) % count)
+        with pytest.raises(GetDPError, match="matrix differs by"):
+            check(wrong, everything, solution)
+    iron_bodies._assembled.cache_clear()
+
+
+def test_two_unknowns_that_change_places_are_told(session, monkeypatch):
+    """Inside the iron, whose magnetization along z has no divergence there."""
+    found = {}
+    check = iron_bodies.check_matrix
+    monkeypatch.setattr(iron_bodies, "check_matrix", lambda *given: found.update(given=given))
+    assembled(session)
+    problem, surface, solution = found["given"]
+    check(problem, surface, solution)
+    inside = np.setdiff1d(problem.nodes, surface)
+    assert len(inside) > 100
+    order = np.arange(len(solution))
+    order[inside[[0, -1]]] = inside[[-1, 0]]
+    wrong = replace(problem, nodes=order[problem.nodes])
+    with pytest.raises(GetDPError, match="matrix differs by"):
+        check(wrong, surface, solution)
+    check(wrong, order, solution)  # the solution does not tell
+    moved = replace(problem, weights=np.roll(problem.weights, 1, axis=1))  # other Gauss points
+    with pytest.raises(GetDPError, match="matrix differs by"):
+        check(moved, surface, solution)
+    iron_bodies._assembled.cache_clear()
 
 
 def nodes_of(*bodies):
