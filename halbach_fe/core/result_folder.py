@@ -595,8 +595,8 @@ def _is_of_a_run(path: Path) -> bool:
     A function that is called without a command's folder leaves none, as earlier states did. Gmsh's
     own mesh.msh of somebody else has no regions.json of these keys beside it.
     """
-    if fnmatch(path.name, "response-*.npy"):  # the parts of a response.h5
-        return True
+    if fnmatch(path.name, "response-*.npy"):  # a part of the response beside it
+        path = path.with_name("response.h5")
     if path.name == "response.h5":
         import h5py  # half the time of an import of this module
 

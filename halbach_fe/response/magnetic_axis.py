@@ -177,7 +177,7 @@ def _fields(
     return columns @ mean + external, columns @ response.nominal + external, columns
 
 
-_ON_SPHERE = np.array([place / np.linalg.norm(place)
+_ON_SPHERE = np.array([np.array(place) / np.linalg.norm(place)
                        for place in product((-1.0, 0.0, 1.0), repeat=3) if any(place)])
 """Points (26, 3) of the unit sphere: the six ends of the axes, and those between them."""
 
