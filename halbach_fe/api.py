@@ -378,6 +378,7 @@ def diagnose(
                                    floor_T=floor_T, time_limit_s=time_limit_s)
 
 
+@typed
 def magnetic_axis(
     magnet: Magnet, session: Session, magnetizations: Gaussian | InferenceResult
 ) -> MagneticAxis | None:

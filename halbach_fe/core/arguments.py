@@ -6,7 +6,7 @@ import functools
 import inspect
 import os
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from numbers import Real
 from pathlib import Path
@@ -26,6 +26,8 @@ READERS = {"BlockTable": "Read the file by hf.read_blocks.",
            "FreeBlocks": 'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.',
            "path": "Give it as text."}
 """How to come by an object of a class."""
+ONCE = "It can be read only once; make a list of it."
+"""What to do with a generator or another iterator, which a look at its kinds would empty."""
 MOST = 1000
 """Most elements of a list whose kinds are looked at."""
 
@@ -63,6 +65,7 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
                     name, called, " or ".join(wanted),
                     repr(value) if text else value if isinstance(value, Real)
                     else f"a {type(value).__name__}",
+                    ONCE if isinstance(value, Iterator) and "a list" in wanted else
                     READERS.get(wanted[0].split()[-1], "")))
         return function(*arguments, **options)
 
@@ -86,8 +89,9 @@ def _fits(value: object, hint: Any) -> bool:
     if origin in (Sequence, list, tuple):
         if isinstance(value, str):
             return str in parts or any(str in typing.get_args(part) for part in parts)
-        return isinstance(value, Iterable) and not isinstance(value, bytes | Mapping) and (
-            getattr(value, "shape", None) != () and all(
+        return isinstance(value, Iterable) and not isinstance(
+            value, bytes | Iterator | Mapping) and (
+                getattr(value, "shape", None) != () and all(
                 _fits(one, part) for part in parts[:1] for one in islice(value, MOST)))
     if origin is Mapping:  # or a DataFrame
         return isinstance(value, Mapping) or (

@@ -306,7 +306,6 @@ def points_of(data: xr.Dataset) -> Floats:
 
 
 @typed
-@typed
 def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 

@@ -11,7 +11,7 @@ import halbach_fe as hf
 from halbach_fe.core.arguments import typed
 
 FUNCTIONS = [name for name in hf.__all__ if not inspect.isclass(getattr(hf, name))]
-WRONG = (object(), 1j, b"bytes", int)
+WRONG = (object(), 1j, b"bytes", int, iter(["gain_x"]))
 """What no argument is, but for those of `ANYTHING`; a class is taken where a function is."""
 ANYTHING = {("write_report", "result"), ("field_map", "points_m"), ("field_map", "B_T"),
             ("field_map", "sigma_T"), ("from_magpylib", "sources")}
@@ -83,7 +83,31 @@ def test_what_is_taken(right):
     ({"number": 10**400}, "must be a number"), ({"number": np.ones(2)}, "a ndarray"),
     ({"flag": 1}, "must be True or False; instead received 1"), ({"names": [1]}, "a list"),
     ({"names": 3}, "must be a list"), ({"several": {"a": 1}}, "must be a list; .* a dict"),
-    ({"several": ["a"]}, "must be a list")])
+    ({"several": ["a"]}, "must be a list"),
+    ({"names": (one for one in "ab")}, "a generator. It can be read only once; make a list"),
+    ({"several": iter([1])}, "must be a list"), ({"names": map(str, [1])}, "make a list of it")])
 def test_what_is_not_taken(wrong, said):
     with pytest.raises(hf.HalbachError, match=said):
         sample(**wrong)
+
+
+def test_what_the_axis_is_asked_of(known):
+    """Of a result of `infer` too, which the refusal says."""
+    with pytest.raises(hf.HalbachError, match=r"missing a required argument: 'session'"):
+        hf.magnetic_axis(known["magnet"])
+    with pytest.raises(hf.HalbachError, match="a Gaussian or an InferenceResult; instead .* 3"):
+        hf.magnetic_axis(known["magnet"], known["session"], 3)
+    assert hf.magnetic_axis(known["magnet"], known["session"], known["result"]).order == 1
+
+
+@pytest.mark.parametrize("names", [("prior", "posterior"), ("posterior", "prior")])
+def test_the_posterior_is_taken_by_its_name(known, names):
+    """In any order. Control: that of the prior is wider."""
+    lines = hf.Lines((0, 0, 0), (0.01, 0, 0), count=3)
+
+    def spread(of):
+        return hf.field(known["magnet"], lines, posterior=of).sd.max()
+
+    both = {name: getattr(known["result"], name) for name in names}
+    assert spread(both) == pytest.approx(spread(known["result"]), rel=1e-9)  # of the same numbers
+    assert spread({"prior": both["prior"]}) > 2 * spread(both)
