@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,7 @@ def _by_labels(values: Any, axes: Sequence[str]) -> Any:
     labels = {name: [str(label) for label in values.coords[name].values]
               for name in values.dims if name in values.coords
               and any(isinstance(label, str) for label in values.coords[name].values)}
-    for text in (str(values.attrs.get("units", "")), *sum(labels.values(), [])):
+    for text in (str(values.attrs.get("units", "")), *chain(*labels.values())):
         if OTHER_UNIT.search(text):
             raise ValueError(f"numbers in {text}; convert them to m and T")
     for name in [*values.dims][::-1]:

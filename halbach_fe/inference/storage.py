@@ -62,8 +62,9 @@ def check_same_magnet(
 def distributions_of(
     magnet: Magnet, posterior: Mapping[str, Gaussian] | InferenceResult
 ) -> dict[str, Gaussian]:
-    """Return the distributions of a magnet's magnetizations in A/m, by name; the last is the best known,
-    the posterior if there is one.
+    """Return the distributions of a magnet's magnetizations in A/m, by name.
+
+    The last is the best known: the posterior if there is one.
 
     Raises
     ------

@@ -95,7 +95,7 @@ def test_what_the_axis_is_asked_of(known):
     """Of a result of `infer` too, which the refusal says."""
     with pytest.raises(hf.HalbachError, match=r"missing a required argument: 'session'"):
         hf.magnetic_axis(known["magnet"])
-    with pytest.raises(hf.HalbachError, match="a Gaussian or an InferenceResult; instead .* 3"):
+    with pytest.raises(hf.HalbachError, match=r"a Gaussian or an InferenceResult; instead .* 3"):
         hf.magnetic_axis(known["magnet"], known["session"], 3)
     assert hf.magnetic_axis(known["magnet"], known["session"], known["result"]).order == 1
 

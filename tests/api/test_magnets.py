@@ -449,8 +449,7 @@ def test_labelled_arrays(generator):
 @pytest.mark.parametrize("labels", [
     ["Bz", "By", "Bx"], ["Z", "Y", "X"], ["z_m", "y_m", "x_m"], ["Bz_T", "By_T", "Bx_T"]])
 def test_labels_are_read_as_names_of_columns(generator, labels):
-    """Numbers say nothing. Control: what is no axis, not all of them, or another unit is refused.
-    """
+    """Control: what is no axis, not all of them, or in another unit is refused."""
     points, field = 0.01 * generator.standard_normal((2, 4, 3))
 
     def read(names, **options):
