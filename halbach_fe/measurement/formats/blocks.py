@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -97,6 +98,17 @@ class DeclaredBlocks(DeclaredFormat):
     axes: tuple[str, str, str] = ("x", "y", "z")
     along_block: bool = False
     fixed: Mapping[str, str] = field(default_factory=dict)
+    unused: ClassVar[tuple[str, ...]] = ("component", "at", "origin_m", "positions")
+
+    def _wrong(self) -> dict[str, str]:
+        """Return what each statement must be that has a value of no meaning."""
+        wrong = super()._wrong()
+        if sorted(one.removeprefix("-") for one in self.axes) != sorted(COMPONENTS):
+            wrong["axes"] = "x, y and z in some order, with a minus or without"
+        if not {*self.fixed} <= {*QUANTITIES} or not all(
+                isinstance(text, str) and text.strip() for text in self.fixed.values()):
+            wrong["fixed"] = f"a dict such as {{'volume': '12 cm^3'}} of {', '.join(QUANTITIES)}"
+        return wrong
 
 
 @dataclass(frozen=True)
