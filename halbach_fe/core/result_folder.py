@@ -349,9 +349,9 @@ def is_run_folder(path: Path) -> bool:
 def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     """Let a command write one file in the block, but replace only one that it has written itself.
 
-    The same holds for files ``beside`` it, in the same folder. It is known by its SHA-256 in a
-    hidden file beside it, one of each command in a folder. Within a run that has a record of its
-    own, that decides.
+    The same holds for files ``beside`` it, in the same folder. Each is known by its SHA-256 in a
+    note of its own, in a hidden folder of each command; earlier versions wrote the notes of all
+    files into one. Within a run that has a record of its own, that decides.
 
     Raises
     ------
@@ -364,16 +364,35 @@ def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     for one in (path, *beside):
         keep_results(one)
     whole = path.absolute()
-    notes = whole.with_name(f".{command.replace(' ', '-')}.json")
-    new = Record(command=command, study="", kept=[])
-    _Writer(whole.parent, _record_at(notes) or new, "file").refuse(
-        [whole, *(one.absolute() for one in beside)])
+    notes = whole.with_name(f".{command.replace(' ', '-')}")
+
+    def note_of(one: Path) -> Path:
+        """Return the path of the note about a file."""
+        return notes / f"{hashlib.sha256(os.fsencode(one.name)).hexdigest()[:32]}.json"
+
+    def noted_before(one: Path) -> Record:
+        """Return the record of a file that has no note of its own."""
+        there = os.path.lexists(one)
+        earlier = _record_at(notes.with_name(f"{notes.name}.json")) if there else None
+        files, writing = ({name: digest for name, digest in known.items() if name == one.name}
+                          for known in ((earlier.files, earlier.writing) if earlier else ({}, {})))
+        return Record(command=command, study="", kept=[], files=files, writing=writing)
+
+    for one in (whole, *(other.absolute() for other in beside)):
+        _Writer(whole.parent, _record_at(note_of(one)) or noted_before(one), "file").refuse([one])
 
     @contextlib.contextmanager
     def writing(target: Path, temporary: Path) -> Iterator[None]:
-        with _opened(notes, wait=True) as file:
-            writer = _Writer(whole.parent, _read_or_refuse(file, notes) or new, "file", file)
-            with writer(target, temporary):
+        target = target.absolute()
+        if target.parent != whole.parent:
+            yield
+            return
+        if notes.is_symlink():
+            raise OutputError(f"Cannot write into {notes}, which is a link. Remove it.")
+        note = make_folder(notes) / note_of(target).name
+        with _opened(note, wait=True) as file:
+            record = _read_or_refuse(file, note) or noted_before(target)
+            with _Writer(whole.parent, record, "file", file)(target, temporary):
                 yield
 
     with telling(writing):

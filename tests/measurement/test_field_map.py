@@ -181,7 +181,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match="No space left"):
         write_map(field_map(np.eye(3), np.zeros((3, 3))), path)
     assert path.read_bytes() == before
-    assert {one.name for one in tmp_path.iterdir()} == {path.name, ".hf.write_map.json"}
+    assert {one.name for one in tmp_path.iterdir()} == {path.name, ".hf.write_map"}
 
 
 def test_single_rows_that_are_no_readings():
