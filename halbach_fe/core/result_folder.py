@@ -76,6 +76,9 @@ WRITES = {
 unless it is its own. A name that is missing here is refused only as it is written."""
 
 
+SESSION = "halbach-fe"
+"""Command in the records of sessions of Python, whose folders belong to no command."""
+
 RUNS = "getdp-"
 """Beginning of the names of run folders of GetDP."""
 
@@ -241,11 +244,15 @@ class _Writer:
         changed = set(names) <= self.record.files.keys()
         named = 5  # largest number of files that a refusal names
         others = f" and {len(names) - named} more" if len(names) > named else ""
+        # earlier versions kept no record of what sessions of Python wrote
+        of_session = self.record.command == SESSION and all(map(_is_kept, foreign))
         raise OutputError(
             f"File {', '.join(names[:named])}{others} in folder {self.base} "
             + (f"changed after `{self.record.command}` had written it" if changed else
                f"was not written by `{self.record.command}`")
-            + f", which would replace it. Name another {self.other}, or move this elsewhere.")
+            + f", which would replace it. Name another {self.other}, or move this elsewhere."
+            + (" If an earlier version of halbach-fe wrote it, remove it: it is computed again."
+               if of_session else ""))
 
     def _owns(self, path: Path) -> bool:
         """Tell whether runs have written what is at a path, and nobody has changed it since."""
@@ -255,7 +262,7 @@ class _Writer:
         if path.is_symlink() or not path.is_file():
             return False
         if _is_kept(path):
-            return record.kept is None or name in record.kept
+            return record.kept is None or name in record.kept or _is_of_another(path, self.base)
         own = [known[name] for known in (record.files, record.writing) if name in known]
         return bool(own) and _digest(path) in own
 
@@ -499,7 +506,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         return
     with _locked(folder) as file:
         record = _read_or_refuse(file, folder / RECORD) or Record(
-            command="halbach-fe", study="", kept=[])
+            command=SESSION, study="", kept=[])
         writer = _Writer(folder.absolute(), record, "folder", file)
         writer.refuse(_writable_paths(writer.base, (), solving=True))
         with telling(writer):
@@ -606,6 +613,15 @@ def _read_or_refuse(file: BinaryIO, path: Path) -> Record | None:
             raise OutputError(f"File {path} is not one of halbach-fe, which would replace it. "
                               "Name another folder, or remove this file.")
     return record
+
+
+def _is_of_another(path: Path, base: Path) -> bool:
+    """Tell whether a file `KEPT` is recorded in another folder, inside or around ``base``."""
+    for folder in path.parents:
+        record = None if folder == base else _record_at(folder / RECORD)
+        if record and str(path.relative_to(folder)) in (record.kept or []):
+            return True
+    return False
 
 
 def _is_kept(path: Path) -> bool:

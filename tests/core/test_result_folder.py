@@ -370,6 +370,28 @@ def test_a_lock_without_a_record(tmp_path):
     assert listed(folder) == {RECORD, "report.html"}  # the owner stays
 
 
+@pytest.mark.parametrize("inner", [True, False])
+def test_sessions_within_each_other(tmp_path, inner):
+    """They renew each other's files. Control: a file of nobody, of which an earlier version is
+    said to be a possible author, is refused until it is removed, as the sentence advises.
+    """
+    part = tmp_path / "objective"
+    first, second = (part, tmp_path) if inner else (tmp_path, part)
+    for number, folder in enumerate((first, second, first, second)):
+        with locked_folder(folder):
+            write_text(part / "response.h5", str(number))
+    assert (part / "response.h5").read_text() == "3"
+    (part / "mesh.msh").write_text("mine")
+    with pytest.raises(OutputError, match=r"mesh\.msh .* earlier version .* remove it"), (
+            locked_folder(second)):
+        write_text(part / "mesh.msh", "4")
+    assert (part / "mesh.msh").read_text() == "mine"
+    (part / "mesh.msh").unlink()
+    with locked_folder(second):
+        write_text(part / "mesh.msh", "4")
+    assert (part / "mesh.msh").read_text() == "4"
+
+
 def test_a_lock_that_is_removed_meanwhile(tmp_path, monkeypatch):
     """A run that opens the record just before another removes it does not lock a deleted file."""
     flock, first = fcntl.flock, []

@@ -191,6 +191,9 @@ def test_single_rows_that_are_no_readings():
     field[7, 1] = 9999.0
     with pytest.raises(MeasurementError, match=r"reading 8 .*1 of 40 rows"):
         check_magnitudes(field_map(points, field))
+    field[3, 0] = 35.0  # the row is that of the number that is told
+    with pytest.raises(MeasurementError, match=r"reading 8 .* 9999, .*2 of 40 rows"):
+        check_magnitudes(field_map(points, field))
     with pytest.raises(MeasurementError, match="Are they in gauss"):
         check_magnitudes(field_map(points, 1e4 * (0.1 + points)))
     tail = 300 * np.exp(-(np.arange(40.0) / 1.5)**2)  # in mT, of a short magnet

@@ -219,11 +219,24 @@ def _header(
                    if text != "-" and not name]:
         raise MeasurementError(must_be("--columns", where, f"made of {', '.join(QUANTITIES)} and -",
                                        f"'{unknown[0]}'"))
+    for (name, unit), other in zip([quantity_of(text) for text in own], below, strict=False):
+        if unit and other and not _same_unit(name, unit, other):
+            raise MeasurementError(must_be(
+                f"unit of {name}", where, "the same in the header and in the line of units below",
+                f"'{unit[:20]}' and '{other[:20]}'", "Remove the wrong one."))
     for said in ([names.split_unit(text)[1].strip() for text in own], below):
         if len(said) == len(header):
             header = [(name, unit or other)
                       for (name, unit), other in zip(header, said, strict=True)]
     return header
+
+
+def _same_unit(name: str, one: str, other: str) -> bool:
+    """Tell whether two texts are one unit of a quantity."""
+    if name == "temperature":
+        return (one in KELVIN) == (other in KELVIN)
+    return name not in KIND or (units.unit_symbol(one) or one) == (
+        units.unit_symbol(other) or other)
 
 
 def _columns(
@@ -418,7 +431,8 @@ def _measured_blocks(
 def _check_strength(polarization: Floats, strength: str, table: _Table) -> None:
     """Raise MeasurementError for polarizations (n, 3) in T that no magnet has; NaN is unknown."""
     most_T = 10.0  # no material has a quarter of it, and mT or kG taken for T are beyond
-    size = np.nan_to_num(np.linalg.norm(polarization, axis=1))
+    size = np.linalg.norm(polarization, axis=1)
+    size[~np.isfinite(size)] = 0.0  # without a volume, which is refused later
     if (size > most_T).any():
         row = int(np.argmax(size > most_T))
         raise MeasurementError(must_be(
