@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from math import isfinite
 from numbers import Real
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from halbach_fe.core.arguments import check_options
 from halbach_fe.core.errors import StudyError, must_be
@@ -83,8 +83,10 @@ class DeclaredFormat:
         path = given.get("positions")
         given = {**given} | ({"positions": as_path(path)} if isinstance(path, str) else {})
         check_options(given, cls, where, *cls.unused)
-        found = cls(**{name: tuple(value) if isinstance(value, Iterable) and not isinstance(
-            value, str | Mapping) else value for name, value in given.items()})
+        stated: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, Iterable) and not isinstance(
+                value, str | Mapping) else value for name, value in given.items()}
+        found = cls(**stated)
         for name, wanted in found._wrong().items():
             raise StudyError(must_be(name, where, wanted, repr(given[name])))
         return replace(found, length_unit=unit_symbol(found.length_unit),
