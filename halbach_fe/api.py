@@ -10,14 +10,14 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from dataclasses import field as value_of
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from halbach_fe.core.arguments import refuse_unknown, typed
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
@@ -109,7 +109,7 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
     Raises
     ------
     StudyError
-        If an option has another name.
+        If an option has another name, kind or value.
     MeasurementError
         If the file cannot be read as a map; the message says what to add.
 
@@ -121,13 +121,11 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
     >>> float(hf.import_map("mm.txt")["B_T"][0, 2])
     0.006
     """
-    refuse_unknown(declared, [one.name for one in fields(DeclaredFormat)], "hf.import_map")
+    stated = DeclaredFormat.of(declared, "hf.import_map")
     if format not in ("", *FORMATS):
         raise MeasurementError(must_be("format", "hf.import_map", f"one of {', '.join(FORMATS)}",
                                        f"'{format}'"))
-    if "columns" in declared:
-        declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
-    found = read_foreign_map(as_path(path), DeclaredFormat(**declared), format)  # type: ignore[arg-type]
+    found = read_foreign_map(as_path(path), stated, format)
     if remarks := found.imported.remarks:
         warnings.warn(f"Of {path}: {' '.join(remarks)}", HalbachWarning, stacklevel=3)
     return found.data
@@ -153,7 +151,7 @@ def import_blocks(path: str | Path, **declared: object) -> BlockTable | FreeBloc
     Raises
     ------
     StudyError
-        If an option has another name.
+        If an option has another name, kind or value.
     MeasurementError
         If the table cannot be read; the message says what to add.
 
@@ -167,13 +165,7 @@ def import_blocks(path: str | Path, **declared: object) -> BlockTable | FreeBloc
     >>> float(table.moment[0, 0])
     0.5
     """
-    refuse_unknown(declared, [one.name for one in fields(DeclaredBlocks)], "hf.import_blocks")
-    if not isinstance(declared.get("fixed", {}), Mapping):
-        raise StudyError(must_be("fixed", "hf.import_blocks", "a dict such as {'volume': '12 "
-                                 "cm^3'}", repr(declared["fixed"])))
-    if "columns" in declared:
-        declared["columns"] = tuple(declared["columns"])  # type: ignore[arg-type]
-    return read_foreign_blocks(as_path(path), DeclaredBlocks(**declared))  # type: ignore[arg-type]
+    return read_foreign_blocks(as_path(path), DeclaredBlocks.of(declared, "hf.import_blocks"))
 
 
 @typed
@@ -381,6 +373,7 @@ def diagnose(
                                    floor_T=floor_T, time_limit_s=time_limit_s)
 
 
+@typed
 def magnetic_axis(
     magnet: Magnet, session: Session, magnetizations: Gaussian | InferenceResult
 ) -> MagneticAxis | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arguments import refuse_unknown, typed
+from halbach_fe.core.arguments import check_options, typed
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
@@ -424,7 +424,7 @@ def new(path: str | Path, **values: object) -> Magnet:
     >>> hf.new("quadrupole.toml", multipole_order=2, inner_radius_m=0.02).name
     'quadrupole'
     """
-    refuse_unknown(values, [one.name for one in fields(MagnetTemplate)], "hf.new")
+    check_options(values, MagnetTemplate, "hf.new")
     if "inner_radius_m" in values and "outer_radius_m" not in values:
         values["outer_radius_m"] = round(OUTER_RADIUS * float(str(values["inner_radius_m"])), 6)
     path = as_path(path)

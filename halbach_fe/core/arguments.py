@@ -6,9 +6,11 @@ import functools
 import inspect
 import os
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from fractions import Fraction
 from itertools import islice
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar
@@ -26,6 +28,8 @@ READERS = {"BlockTable": "Read the file by hf.read_blocks.",
            "FreeBlocks": 'One block is {"shape": ["cuboid"], "x_m": [0.0], ...}.',
            "path": "Give it as text."}
 """How to come by an object of a class."""
+ONCE = "It can be read only once; make a list of it."
+"""What to do with a generator or another iterator, which a look at its kinds would empty."""
 MOST = 1000
 """Most elements of a list whose kinds are looked at."""
 
@@ -56,17 +60,23 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
                              f"{error}.") from None
         for name, value in bound.arguments.items():
             if name in hints() and not _fits(value, hints()[name]):
-                wanted = _kinds(hints()[name])
-                text = isinstance(value, str) and "a number" in wanted
-                refusal = MeasurementError if "a Dataset" in wanted else StudyError
-                raise refusal(must_be(
-                    name, called, " or ".join(wanted),
-                    repr(value) if text else value if isinstance(value, Real)
-                    else f"a {type(value).__name__}",
-                    READERS.get(wanted[0].split()[-1], "")))
+                raise _refusal(name, called, value, hints()[name])
         return function(*arguments, **options)
 
     return checked
+
+
+def _refusal(name: str, where: str, value: object, hint: Any) -> MeasurementError | StudyError:
+    """Return the error of a value that is not of the kind that an annotation names."""
+    wanted = _kinds(hint)
+    text = isinstance(value, str) and "a number" in wanted
+    refusal = MeasurementError if "a Dataset" in wanted else StudyError
+    return refusal(must_be(
+        name, where, " or ".join(wanted),
+        repr(value) if text else value if isinstance(value, Real) else f"a {type(value).__name__}",
+        ONCE if isinstance(value, Iterator) and any(one.startswith("a list") for one in wanted) else
+        "Take float() of it." if isinstance(value, Fraction) and "a number" in wanted else
+        READERS.get(wanted[0].split()[-1], "")))
 
 
 def _fits(value: object, hint: Any) -> bool:
@@ -86,10 +96,11 @@ def _fits(value: object, hint: Any) -> bool:
     if origin in (Sequence, list, tuple):
         if isinstance(value, str):
             return str in parts or any(str in typing.get_args(part) for part in parts)
-        return isinstance(value, Iterable) and not isinstance(value, bytes | Mapping) and (
-            getattr(value, "shape", None) != () and all(
+        return isinstance(value, Iterable) and not isinstance(
+            value, bytes | Iterator | Mapping) and (
+                getattr(value, "shape", None) != () and all(
                 _fits(one, part) for part in parts[:1] for one in islice(value, MOST)))
-    if origin is Mapping:  # or a DataFrame
+    if origin in (Mapping, dict):  # or a DataFrame
         return isinstance(value, Mapping) or (
             hasattr(value, "keys") and not isinstance(value, type))
     if origin is Callable:
@@ -107,7 +118,8 @@ def _is_number(value: object) -> bool:
     except (TypeError, ValueError, OverflowError):
         return False
     kind = getattr(getattr(value, "dtype", None), "kind", "")
-    return kind in "iuf" if kind else isinstance(value, Real) and not isinstance(value, bool)
+    return kind in "iuf" if kind else (
+        isinstance(value, float | Integral) and not isinstance(value, bool))
 
 
 def _kinds(hint: Any) -> list[str]:
@@ -119,15 +131,30 @@ def _kinds(hint: Any) -> list[str]:
         return list(dict.fromkeys(kind for part in parts for kind in _kinds(part)))
     if hint is NoneType:
         return []
+    if origin in (Sequence, list, tuple) and parts[0] in (str, int, float):
+        return ["a list of text" if parts[0] is str else "a list of numbers"]
     words = {int: "a number", float: "a number", bool: "True or False", str: "text",
              Literal: "text", Path: "a path", Sequence: "a list", list: "a list", tuple: "a list",
-             Mapping: "a dict", Callable: "a function"}
+             Mapping: "a dict", dict: "a dict", Callable: "a function"}
     name = getattr(hint, "__name__", str(hint))
     return [words.get(origin or hint) or f"{'an' if name[0] in 'AEIO' else 'a'} {name}"]
 
 
-def refuse_unknown(given: Mapping[str, object], names: Sequence[str], where: str) -> None:
-    """Refuse options of other names by a StudyError."""
-    if unknown := sorted(given.keys() - {*names}):
-        raise StudyError(must_be(unknown[0], where, f"left out, or one of {', '.join(names)}",
-                                 repr(given[unknown[0]])))
+def check_options(given: Mapping[str, object], kind: type, where: str, *unused: str) -> None:
+    """Refuse options that are no fields of a dataclass, or are of other kinds than it annotates.
+
+    Fields that are ``unused`` are refused too; so is a text in place of a list.
+
+    Raises
+    ------
+    StudyError
+    """
+    hints = {name: hint for name, hint in typing.get_type_hints(kind).items()
+             if name in {one.name for one in fields(kind)} - {*unused}}
+    for name, value in given.items():
+        if name not in hints:
+            raise StudyError(must_be(name, where, f"left out, or one of {', '.join(hints)}",
+                                     repr(value)))
+        of_list = typing.get_origin(hints[name]) is tuple and isinstance(value, str)
+        if of_list or not _fits(value, hints[name]):
+            raise _refusal(name, where, value, hints[name])

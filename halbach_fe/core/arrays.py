@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,14 +24,14 @@ OTHER_UNIT = re.compile(r"(?<![A-Za-z])(mm|cm|um|inch|mT|uT|nT|k?G|gauss)\W?$")
 def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     """Return a copy of numbers as floats, NaN where an array is masked.
 
-    A DataArray with labels x, y and z has those of ``axes`` along the last dimension.
+    A DataArray whose labels name x, y and z has those of ``axes`` along the last dimension.
 
     Raises
     ------
     TypeError, ValueError
         If they are no real numbers, have a unit of their own, are a DataFrame whose columns are
         named after other axes than ``axes``, are in another order, or state a unit but m or T, or
-        a DataArray that lacks one of the axes.
+        a DataArray that lacks one of the axes or has labels of another meaning.
     """
     values = _by_labels(values, axes)
     if np.iscomplexobj(values):
@@ -50,22 +51,27 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
 
 
 def _by_labels(values: Any, axes: Sequence[str]) -> Any:
-    """Return an array whose labels name the axes (a DataArray) with ``axes`` along its last
-    dimension; anything else as it is.
+    """Return an array whose labels name axes (a DataArray), as columns of a DataFrame do, with
+    ``axes`` along its last dimension; anything else as it is. Numbers as labels say nothing.
     """
     if not (hasattr(values, "dims") and hasattr(values, "coords")):
         return values
-    unit = str(values.attrs.get("units", ""))
-    if OTHER_UNIT.search(unit):
-        raise ValueError(f"numbers in {unit}; convert them to m and T")
-    for name in values.dims:
-        labels = [str(label) for label in values.coords[name].values] if (
-            name in values.coords) else []
-        if labels and {*labels} <= {"x", "y", "z"}:
-            if lacking := [axis for axis in axes if labels.count(axis) != 1]:
-                raise ValueError(f"{name} labelled {', '.join(labels)}, of which {lacking[0]} is "
-                                 "not there once")
-            return values.sel({name: list(axes)}).transpose(..., name)
-    if "component" in values.dims:
-        return values.transpose(..., "component")
-    return values
+    labels = {name: [str(label) for label in values.coords[name].values]
+              for name in values.dims if name in values.coords
+              and any(isinstance(label, str) for label in values.coords[name].values)}
+    for text in (str(values.attrs.get("units", "")), *chain(*labels.values())):
+        if OTHER_UNIT.search(text):
+            raise ValueError(f"numbers in {text}; convert them to m and T")
+    for name in [*values.dims][::-1]:
+        found = [AXIS.match(label) for label in labels.get(name, [])]
+        named = [one[1].lower() for one in found if one]
+        if named and all(found):
+            if lacking := [axis for axis in axes if named.count(axis) != 1]:
+                raise ValueError(f"{name} labelled {', '.join(labels[name])}, of which "
+                                 f"{lacking[0]} is not there once")
+            return values.isel({name: [named.index(axis) for axis in axes]}).transpose(..., name)
+    last = "component" if "component" in values.dims else ["", *values.dims][-1]
+    if last in labels and (last == "component" or len(labels[last]) == len(axes)):
+        raise ValueError(f"{last} labelled {', '.join(labels[last])} in place of "
+                         f"{', '.join(axes)}; name or drop these labels")
+    return values.transpose(..., "component") if last == "component" else values

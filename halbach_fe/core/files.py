@@ -56,9 +56,10 @@ def remove_orphans(folder: Path) -> None:
     Output of processes on other machines, which may share the folder, stays.
     """
     with contextlib.suppress(OSError):
-        for path in folder.iterdir():
-            match = _NAME.match(path.name)
+        for name in os.listdir(folder):  # a folder of many results is looked through often
+            match = _NAME.match(name) if "~" in name else None
             if match and match["host"] == _here() and not _runs(int(match["process"])):
+                path = folder / name
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
                 else:

@@ -76,6 +76,9 @@ WRITES = {
 unless it is its own. A name that is missing here is refused only as it is written."""
 
 
+SESSION = "halbach-fe"
+"""Command in the records of sessions of Python, whose folders belong to no command."""
+
 RUNS = "getdp-"
 """Beginning of the names of run folders of GetDP."""
 
@@ -241,11 +244,15 @@ class _Writer:
         changed = set(names) <= self.record.files.keys()
         named = 5  # largest number of files that a refusal names
         others = f" and {len(names) - named} more" if len(names) > named else ""
+        # earlier versions kept no record of what sessions of Python wrote
+        of_session = self.record.command == SESSION and all(map(_is_kept, foreign))
         raise OutputError(
             f"File {', '.join(names[:named])}{others} in folder {self.base} "
             + (f"changed after `{self.record.command}` had written it" if changed else
                f"was not written by `{self.record.command}`")
-            + f", which would replace it. Name another {self.other}, or move this elsewhere.")
+            + f", which would replace it. Name another {self.other}, or move this elsewhere."
+            + (" If an earlier version of halbach-fe wrote it, remove it: it is computed again."
+               if of_session else ""))
 
     def _owns(self, path: Path) -> bool:
         """Tell whether runs have written what is at a path, and nobody has changed it since."""
@@ -255,7 +262,8 @@ class _Writer:
         if path.is_symlink() or not path.is_file():
             return False
         if _is_kept(path):
-            return record.kept is None or name in record.kept or _is_of_a_run(path)
+            return (record.kept is None or name in record.kept or _is_of_another(path, self.base)
+                    or _is_of_a_run(path))
         own = [known[name] for known in (record.files, record.writing) if name in known]
         return bool(own) and _digest(path) in own
 
@@ -349,9 +357,9 @@ def is_run_folder(path: Path) -> bool:
 def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     """Let a command write one file in the block, but replace only one that it has written itself.
 
-    The same holds for files ``beside`` it, in the same folder. It is known by its SHA-256 in a
-    hidden file beside it, one of each command in a folder. Within a run that has a record of its
-    own, that decides.
+    The same holds for files ``beside`` it, in the same folder. Each is known by its SHA-256 in a
+    note of its own, in a hidden folder of each command; earlier versions wrote the notes of all
+    files into one. Within a run that has a record of its own, that decides.
 
     Raises
     ------
@@ -364,16 +372,35 @@ def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     for one in (path, *beside):
         keep_results(one)
     whole = path.absolute()
-    notes = whole.with_name(f".{command.replace(' ', '-')}.json")
-    new = Record(command=command, study="", kept=[])
-    _Writer(whole.parent, _record_at(notes) or new, "file").refuse(
-        [whole, *(one.absolute() for one in beside)])
+    notes = whole.with_name(f".{command.replace(' ', '-')}")
+
+    def note_of(one: Path) -> Path:
+        """Return the path of the note about a file."""
+        return notes / f"{hashlib.sha256(os.fsencode(one.name)).hexdigest()[:32]}.json"
+
+    def noted_before(one: Path) -> Record:
+        """Return the record of a file that has no note of its own."""
+        there = os.path.lexists(one)
+        earlier = _record_at(notes.with_name(f"{notes.name}.json")) if there else None
+        files, writing = ({name: digest for name, digest in known.items() if name == one.name}
+                          for known in ((earlier.files, earlier.writing) if earlier else ({}, {})))
+        return Record(command=command, study="", kept=[], files=files, writing=writing)
+
+    for one in (whole, *(other.absolute() for other in beside)):
+        _Writer(whole.parent, _record_at(note_of(one)) or noted_before(one), "file").refuse([one])
 
     @contextlib.contextmanager
     def writing(target: Path, temporary: Path) -> Iterator[None]:
-        with _opened(notes, wait=True) as file:
-            writer = _Writer(whole.parent, _read_or_refuse(file, notes) or new, "file", file)
-            with writer(target, temporary):
+        target = target.absolute()
+        if target.parent != whole.parent:
+            yield
+            return
+        if notes.is_symlink():
+            raise OutputError(f"Cannot write into {notes}, which is a link. Remove it.")
+        note = make_folder(notes) / note_of(target).name
+        with _opened(note, wait=True) as file:
+            record = _read_or_refuse(file, note) or noted_before(target)
+            with _Writer(whole.parent, record, "file", file)(target, temporary):
                 yield
 
     with telling(writing):
@@ -480,7 +507,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         return
     with _locked(folder) as file:
         record = _read_or_refuse(file, folder / RECORD) or Record(
-            command="halbach-fe", study="", kept=[])
+            command=SESSION, study="", kept=[])
         writer = _Writer(folder.absolute(), record, "folder", file)
         writer.refuse(_writable_paths(writer.base, (), solving=True))
         with telling(writer):
@@ -615,6 +642,15 @@ def _is_of_a_run(path: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(found, dict) and {"study", "dimension", "air"} <= found.keys()
+
+
+def _is_of_another(path: Path, base: Path) -> bool:
+    """Tell whether a file `KEPT` is recorded in another folder, inside or around ``base``."""
+    for folder in path.parents:
+        record = None if folder == base else _record_at(folder / RECORD)
+        if record and str(path.relative_to(folder)) in (record.kept or []):
+            return True
+    return False
 
 
 def _is_kept(path: Path) -> bool:

@@ -24,7 +24,13 @@ from halbach_fe.inference.instrument_fit import (
     readings_of_field,
 )
 from halbach_fe.inference.overlap import left_out, overlaps
-from halbach_fe.inference.readings import Noises, Readings, check_validation_map, read_campaign
+from halbach_fe.inference.readings import (
+    Noises,
+    Readings,
+    check_validation_map,
+    read_campaign,
+    warn_of_another_gain,
+)
 from halbach_fe.inference.result import (
     Amplitudes,
     InferenceResult,
@@ -152,6 +158,7 @@ def infer(
             HalbachWarning, stacklevel=2)
     last = search.last
     warn_of_bent_readings(last.readings, last.magnitudes)
+    warn_of_another_gain(search.maps)
     # relative change of a posterior variance (1 % of a standard deviation) that discarded
     # information may cause without a warning
     harmless = 0.02

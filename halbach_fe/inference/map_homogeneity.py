@@ -32,7 +32,12 @@ from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import decimals
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.instrument_fit import OpenTerms
-from halbach_fe.inference.readings import Readings, read_campaign, unit_vectors
+from halbach_fe.inference.readings import (
+    Readings,
+    read_campaign,
+    unit_vectors,
+    warn_of_another_gain,
+)
 from halbach_fe.inference.result import HELD_OUT
 from halbach_fe.measurement.campaign import Map, maps_of
 from halbach_fe.measurement.harmonic_field import (
@@ -99,6 +104,7 @@ def map_homogeneity(
     """
     maps = maps_of(magnet.study, data)
     readings = read_campaign(magnet, maps)
+    warn_of_another_gain(maps)
     _check_within(readings, model)
     held_out = np.array(readings.parts) == HELD_OUT
     free = _free_radius(magnet, np.array(model.region.centre_m))

@@ -27,6 +27,7 @@ from halbach_fe.measurement.field_map import (
     total_contradiction,
 )
 from halbach_fe.measurement.instrument import (
+    field_read,
     in_si_and_magnet_axes,
     probe_points,
     remove_nonlinear_part,
@@ -174,6 +175,21 @@ def read_campaign(
     return reduce(_stacked, found)
 
 
+def warn_of_another_gain(maps: Sequence[Map]) -> None:
+    """Warn of a column of |B| that is the length of the components neither as they were read nor
+    as the instrument is known.
+    """
+    several = sum(not one.is_validation for one in maps) > 1
+    for one in maps:
+        instrument = one.study.instrument
+        data = in_si_and_magnet_axes(instrument, one.data)
+        if total_contradiction(data) and (contradiction := total_contradiction(
+                data.assign(B_T=data["B_T"].copy(data=field_read(instrument, data))))):
+            where = one.name if one.is_validation or not several else f"map {one.name}"
+            warnings.warn(f"The {where.removeprefix('the ')}: {contradiction}", HalbachWarning,
+                          stacklevel=3)
+
+
 def _check_plane(points: Floats, where: str) -> None:
     """Raise a MeasurementError if the points (n, 3) in m of a 2D study are at several heights."""
     heights = points[:, 2]
@@ -242,9 +258,6 @@ def _read(
     called = where if several else f"the {where}"
     magnet = magnet.with_study(study)
     data = in_si_and_magnet_axes(study.instrument, one.data)
-    if contradiction := total_contradiction(data):
-        warnings.warn(f"The {where.removeprefix('the ')}: {contradiction}", HalbachWarning,
-                      stacklevel=2)
     measured = _measured(one, data, where)
     if is_total_field(data):
         shown = total_without_nonlinear_part(study.instrument, data)

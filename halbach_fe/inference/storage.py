@@ -64,6 +64,8 @@ def distributions_of(
 ) -> dict[str, Gaussian]:
     """Return the distributions of a magnet's magnetizations in A/m, by name.
 
+    The last is the best known: the posterior if there is one.
+
     Raises
     ------
     MeasurementError
@@ -78,7 +80,8 @@ def distributions_of(
         raise MeasurementError(must_be(
             "posterior", f"study {magnet.name}", "the result of hf.infer, or distributions by name",
             f"a {type(posterior).__name__}{' without any' if posterior == {} else ''}"))
-    return {name: distribution_of(magnet, one, name) for name, one in posterior.items()}
+    return {name: distribution_of(magnet, one, name) for name, one in sorted(
+        posterior.items(), key=lambda item: item[0] == "posterior")}
 
 
 def disagreement_of(posterior: Mapping[str, Gaussian] | InferenceResult | None) -> str | None:

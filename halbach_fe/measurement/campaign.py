@@ -306,7 +306,9 @@ def _no_chance(copies: int, pairs: int, field: Floats, noise: float) -> bool:
     return bool(special.bdtrc(copies - 1, pairs, alike) < BY_CHANCE)
 
 
-def refuse_shared(maps: Mapping[str, tuple[Floats, Floats, float]]) -> None:
+def refuse_shared(
+    maps: Mapping[str, tuple[Floats, Floats, float]], where: str = "the campaign"
+) -> None:
     """Raise a MeasurementError if many readings of a map are in another one too.
 
     ``maps`` are points (n, 3) in m, values (n, k) in T and typical noise in T of each, by its name.
@@ -331,7 +333,7 @@ def refuse_shared(maps: Mapping[str, tuple[Floats, Floats, float]]) -> None:
         if rounded or _no_chance(copies, there, of_fewer[:, both], min(noise, sigma)):
             count = max(shared, FEWEST_COPIES) if rounded else copies
             _refuse(count, must_be(
-                f"`maps` '{one}' and '{other}'", "the campaign",
+                f"`maps` '{one}' and '{other}'", where,
                 "different maps, as the same readings must not count twice",
                 f"the same readings in {shared if rounded else copies} of {len(fewer)} rows",
                 "Remove one of them, or these rows of one."))

@@ -306,7 +306,6 @@ def points_of(data: xr.Dataset) -> Floats:
 
 
 @typed
-@typed
 def write_map(data: xr.Dataset, path: str | Path) -> None:
     """Write a map in the format of the suffix: .h5, .csv or .vtu.
 
@@ -765,8 +764,8 @@ def check_magnitudes(data: xr.Dataset) -> None:
         values, sigmas = data[TOTAL_COLUMN].values, data.get(TOTAL_SIGMA_COLUMN)
     by_component = np.nan_to_num(np.abs(values)).max(axis=0).reshape(-1)
     largest = float(by_component.max())
-    beyond = np.flatnonzero((np.nan_to_num(np.abs(values)) > MAX_FIELD_T).reshape(
-        len(values), -1).any(axis=1))
+    by_row = np.nan_to_num(np.abs(values)).reshape(len(values), -1).max(axis=1)
+    beyond, row = np.flatnonzero(by_row > MAX_FIELD_T), int(np.argmax(by_row)) + 1
     if len(beyond):
         unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
                                ("millitesla", "mT", 1e-3))
@@ -779,13 +778,13 @@ def check_magnitudes(data: xr.Dataset) -> None:
             "halbach-fe import-map.")
         if is_placeholder(largest):
             raise MeasurementError(must_be(
-                f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T",
+                f"reading {row}", where, f"below {MAX_FIELD_T:g} T",
                 f"{largest:g}, which looks like a placeholder, one of {len(beyond)} of "
                 f"{len(values)} rows that are not",
                 "Where nothing was read, leave the cell empty, or remove the row."))
         if len(beyond) < PLACEHOLDERS * len(values):
             raise MeasurementError(must_be(
-                f"reading {beyond[0] + 1}", where, f"below {MAX_FIELD_T:g} T, as most are",
+                f"reading {row}", where, f"below {MAX_FIELD_T:g} T, as most are",
                 f"{largest:g}, one of {len(beyond)} of {len(values)} rows that are not",
                 "If the meter had no reading there, leave the cell empty, or remove the row. Or is "
                 f"all of the map {units}"))

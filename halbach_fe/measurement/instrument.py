@@ -291,6 +291,14 @@ def remove_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
         "a law whose inversion does not converge", "Make its nonlinear terms smaller."))
 
 
+def field_read(instrument: Instrument, data: xr.Dataset) -> Floats:
+    """Return B (n, 3) in T of a map, along the magnet's axes, by the law of the sensors; NaN where
+    a component was not measured.
+    """
+    values = remove_nonlinear_part(instrument, data)
+    return np.asarray(np.linalg.solve(sensor_matrix(instrument), values.T).T)
+
+
 def total_without_nonlinear_part(instrument: Instrument, data: xr.Dataset) -> Floats:
     """Return |B| (n,) in T of a map of |B| alone without the part that is not linear in |B|.
 

@@ -440,7 +440,7 @@ def join_maps(
         _refuse_disobedient(name, check)
         checked.append(Checked.of(name, data, check))
     refuse_shared({one.name: (points_of(one.data), one.data["B_T"].values, one.check.noise_T)
-                   for one in checked})
+                   for one in checked}, "join_maps")
     return join_checked(checked, Pace(say, progress), turn_rad)
 
 

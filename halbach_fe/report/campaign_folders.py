@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -488,8 +489,8 @@ def _short(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list) and all(isinstance(one, float) for one in value):
-        rounding = 1e-9 * max(map(abs, value), default=0.0)
-        text = ", ".join(f"{one if abs(one) > rounding else 0.0:.4g}" for one in value)
+        rounding = 1e-9 * max((abs(one) for one in value if math.isfinite(one)), default=0.0)
+        text = ", ".join(f"{0.0 if abs(one) <= rounding else one:.4g}" for one in value)
     else:
         text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= MOST_VALUE else f"{text[:MOST_VALUE]}…"

@@ -31,7 +31,7 @@ from halbach_fe.report.campaign_folders import (
     versions,
 )
 from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
-from halbach_fe.report.words import counted, in_a_row, in_one_line
+from halbach_fe.report.words import counted, in_a_row, in_one_line, within_a_sentence
 from halbach_fe.study.model import Study
 
 PAGE, PAGES = "report.html", (".html", ".htm")
@@ -231,8 +231,8 @@ class Campaign:
             return "Yes"
         last = [answer for chapter, _, answer in self.answered
                 if chapter.label == left[-1] and not answer.sound][-1].short_trust
-        why = re.match(r"No[:.,] (.)(.*?)\.?$", last)
-        reason = f"{why[1].lower()}{why[2]}" if why else "for the reasons that stand below"
+        why = re.match(r"No[:.,] (.*?)\.?$", last)
+        reason = within_a_sentence(why[1]) if why else "for the reasons that stand below"
         if not any(answer.sound for _, _, answer in self.answered):
             return f"No: {reason}. But the results belong together"
         return f"Not {in_a_row([f'folder {each}' for each in left])}: {reason}. The others, yes"
@@ -243,7 +243,7 @@ class Campaign:
         """
         said = [answer.trust.removeprefix("Yes. ").partition(". ")[0].rstrip(".")
                 for _, answer in self._used("infer")[-1:] if answer.sound]
-        return f"{said[0][:1].lower()}{said[0][1:]}. The results are" if said else "they are"
+        return f"{within_a_sentence(said[0])}. The results are" if said else "they are"
 
     def _newest(self) -> list[str]:
         """Return the last answer about the measured magnet that may be used, and before it that of

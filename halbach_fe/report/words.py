@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 
 import numpy as np
@@ -235,6 +236,19 @@ def iron_description(magnet: Magnet) -> str:
         if iron.curve.kind == "steel":
             material = f"steel {iron.curve.name}"
     return f"{material}; {'; '.join(bodies[:4])}{more}"
+
+
+def within_a_sentence(text: str) -> str:
+    """Return a sentence whose first letter is small, unless it is that of a name such as Bx.
+
+    Examples
+    --------
+    >>> within_a_sentence("The noise is known"), within_a_sentence("Bx and By disagree")
+    ('the noise is known', 'Bx and By disagree')
+    """
+    first = re.match(r"[A-Z][a-z]*(?![\w|²'])", text)
+    name = first is None or re.fullmatch(r"[B-Z]|B(?:[xyzr]|phi|abs)", first[0])
+    return text if name else f"{text[0].lower()}{text[1:]}"
 
 
 def _range(values: Iterable[float], digits: int) -> str:

@@ -446,6 +446,25 @@ def test_labelled_arrays(generator):
             hf.field_map(points, wrong)
 
 
+@pytest.mark.parametrize("labels", [
+    ["Bz", "By", "Bx"], ["Z", "Y", "X"], ["z_m", "y_m", "x_m"], ["Bz_T", "By_T", "Bx_T"]])
+def test_labels_are_read_as_names_of_columns(generator, labels):
+    """Control: what is no axis, not all of them, or in another unit is refused."""
+    points, field = 0.01 * generator.standard_normal((2, 4, 3))
+
+    def read(names, **options):
+        return hf.field_map(points, xr.DataArray(field[:, ::-1], dims=("point", "axis"), coords={
+            "axis": names, "point": ["a", "b", "c", "d"]}), **options)["B_T"].values
+
+    assert np.array_equal(read(labels), field)
+    assert np.array_equal(read(labels, components=["x"])[:, 0], field[:, 0])
+    assert np.array_equal(read([0, 1, 2]), field[:, ::-1])
+    for wrong in (["u", "v", "w"], ["radial", "y", "x"], ["By", "By", "Bx"], [
+            f"{one[0]}_mm" for one in "zyx"]):
+        with pytest.raises(hf.HalbachError, match=r"axis labelled|numbers in z_mm"):
+            read(wrong)
+
+
 def test_a_table_that_was_written_and_read(tmp_path):
     """By pandas, which reads outlines as text."""
     prism = hf.magnet_of_blocks({

@@ -243,6 +243,66 @@ def test_single_files(tmp_path):
         one(tmp_path / "response.h5", "third")
 
 
+def test_notes_of_many_files(tmp_path, monkeypatch):
+    """To write one more takes no more of them. Control: the note of the file itself is read."""
+    read, parse = [], Record.model_validate_json
+
+    def counted(content):
+        read.append(len(content))
+        return parse(content)
+
+    monkeypatch.setattr(Record, "model_validate_json", counted)
+    sizes = []
+    for number in [*range(20), 19]:
+        read.clear()
+        with single_file(tmp_path / f"{number:02}.csv", "hf.write_map"):
+            write_text(tmp_path / f"{number:02}.csv", "map")
+        sizes.append(sum(read))
+    assert sizes[19] == sizes[0] < sizes[20]
+
+
+@pytest.mark.parametrize("text", ["ours", "edited"])
+def test_notes_of_earlier_versions(tmp_path, text):
+    """They told all files of a command in one; a file that was changed since is refused."""
+    path, other = tmp_path / "map.csv", tmp_path / "other.csv"
+    path.write_text(text)
+    other.write_text("ours")
+    digest = hashlib.sha256(b"ours").hexdigest()
+    (tmp_path / ".hf.write_map.json").write_text(Record(
+        command="hf.write_map", study="", kept=[],
+        files={"map.csv": digest, "other.csv": digest}).model_dump_json())
+
+    def write(path, text):
+        with single_file(path, "hf.write_map"):
+            write_text(path, text)
+
+    if text == "edited":
+        with pytest.raises(OutputError, match=r"map\.csv in folder .* changed after"):
+            write(path, "new")
+        return
+    for content in ("new", "newer"):
+        write(path, content)
+    write(other, "other")
+    path.write_text("ours")  # as the earlier note has it, but a later one does not
+    with pytest.raises(OutputError, match=r"map\.csv"):
+        write(path, "newest")
+    assert (path.read_text(), other.read_text()) == ("ours", "other")
+
+
+def test_planted_notes(tmp_path):
+    """No note is written through a link. Control: into a folder it is."""
+    (tmp_path / "elsewhere").mkdir()
+    os.symlink(tmp_path / "elsewhere", tmp_path / ".hf.write_map")
+    with pytest.raises(OutputError, match="is a link"), single_file(
+            tmp_path / "map.csv", "hf.write_map"):
+        write_text(tmp_path / "map.csv", "map")
+    assert not list((tmp_path / "elsewhere").iterdir())
+    (tmp_path / ".hf.write_map").unlink()
+    with single_file(tmp_path / "map.csv", "hf.write_map"):
+        write_text(tmp_path / "map.csv", "map")
+    assert len(list((tmp_path / ".hf.write_map").iterdir())) == 1
+
+
 def test_two_runs_at_once(tmp_path):
     with (result_folder(tmp_path, "solve", "a"),
           pytest.raises(OutputError, match="in use by another run")):
@@ -308,6 +368,28 @@ def test_a_lock_without_a_record(tmp_path):
     with locked_folder(folder):
         pass
     assert listed(folder) == {RECORD, "report.html"}  # the owner stays
+
+
+@pytest.mark.parametrize("inner", [True, False])
+def test_sessions_within_each_other(tmp_path, inner):
+    """They renew each other's files. Control: a file of nobody, of which an earlier version is
+    said to be a possible author, is refused until it is removed, as the sentence advises.
+    """
+    part = tmp_path / "objective"
+    first, second = (part, tmp_path) if inner else (tmp_path, part)
+    for number, folder in enumerate((first, second, first, second)):
+        with locked_folder(folder):
+            write_text(part / "response.h5", str(number))
+    assert (part / "response.h5").read_text() == "3"
+    (part / "mesh.msh").write_text("mine")
+    with pytest.raises(OutputError, match=r"mesh\.msh .* earlier version .* remove it"), (
+            locked_folder(second)):
+        write_text(part / "mesh.msh", "4")
+    assert (part / "mesh.msh").read_text() == "mine"
+    (part / "mesh.msh").unlink()
+    with locked_folder(second):
+        write_text(part / "mesh.msh", "4")
+    assert (part / "mesh.msh").read_text() == "4"
 
 
 def test_a_lock_that_is_removed_meanwhile(tmp_path, monkeypatch):

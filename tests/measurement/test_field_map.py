@@ -181,7 +181,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match="No space left"):
         write_map(field_map(np.eye(3), np.zeros((3, 3))), path)
     assert path.read_bytes() == before
-    assert {one.name for one in tmp_path.iterdir()} == {path.name, ".hf.write_map.json"}
+    assert {one.name for one in tmp_path.iterdir()} == {path.name, ".hf.write_map"}
 
 
 def test_single_rows_that_are_no_readings():
@@ -190,6 +190,9 @@ def test_single_rows_that_are_no_readings():
     field = 0.1 + points
     field[7, 1] = 9999.0
     with pytest.raises(MeasurementError, match=r"reading 8 .*1 of 40 rows"):
+        check_magnitudes(field_map(points, field))
+    field[3, 0] = 35.0  # the row is that of the number that is told
+    with pytest.raises(MeasurementError, match=r"reading 8 .* 9999, .*2 of 40 rows"):
         check_magnitudes(field_map(points, field))
     with pytest.raises(MeasurementError, match="Are they in gauss"):
         check_magnitudes(field_map(points, 1e4 * (0.1 + points)))

@@ -169,6 +169,8 @@ MEASURED = "serial,type,moment_x{0},moment_y{0},moment_z{0},sigma{0}{1}\n{2}a,1,
      "moment in line 2 .* below 10 T"),
     ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,0,0,0.1,0\n",
      "volume_m3 of block a .* must be positive"),
+    ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,2,3,0.1,0\n",
+     "volume_m3 of block a .* must be positive"),
     ("r[mm],phi[deg],z[mm],Br[T]\n9,0,0,1.3\n", r"x of each .*\(x = r cos\(phi\)"),
     ("x[m],y[m],z[m],shape,size_x[m],size_y[m],size_z[m],Br[T],angle[deg]\n"
      "0,0,0,cuboid,0.01,0.01,0.01,1.3,45\n", "direction of the magnetization as a rotation")])
@@ -185,6 +187,14 @@ def test_units_below_the_names(tmp_path):
         found = imported(tmp_path, MEASURED.format("", ",temp", units.format(unit), "25"))
         assert found.moment.tolist() == [[pytest.approx(moment), 0, 0]]
         assert found.temperature.tolist() == [25.0]
+        again = imported(tmp_path, MEASURED.format(f"[{unit}]", ",temp", units.format(unit), "25"))
+        assert again.moment.tolist() == found.moment.tolist()
+    for header, below, name in (
+            ("[mA m^2]", units.format("A m^2"), "moment_x"),
+            ("[A m^2]", units.format("mA m^2"), "moment_x"),
+            ("[A m^2]", units.format("A m^2").replace("C", "K"), "temperature")):
+        with pytest.raises(MeasurementError, match=rf"unit of {name} .* in the line of units"):
+            imported(tmp_path, MEASURED.format(header, ",temp[C]", below, "25"))
 
 
 def test_columns_that_are_not_read_are_named(tmp_path):

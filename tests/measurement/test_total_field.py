@@ -233,3 +233,10 @@ def test_infer_tells_the_other_gain(generator, tmp_path):
     with pytest.warns(HalbachWarning, match="throughout 5.0 % larger"):
         infer(magnet, with_total_field(field_map(points, field), 1.05 * size), session)
     infer(magnet, with_total_field(field_map(points, field), size), session)  # warns of nothing
+    # a gain that the study states is no contradiction, nor a |B| that the same probe has read
+    known = magnet.with_(instrument={"gain": (0.05, 0.05, 0.05)})
+    for total in (size, 1.05 * size):
+        infer(known, with_total_field(field_map(points, 1.05 * field), total), session)
+    with pytest.warns(HalbachWarning, match="throughout 3.0 % larger") as said:
+        infer(known, with_total_field(field_map(points, 1.05 * field), 1.03 * size), session)
+    assert len(said) == 1

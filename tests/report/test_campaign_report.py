@@ -20,8 +20,9 @@ from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import RECORD, result_folder
 from halbach_fe.report.answer import PAGE_RECORD, Answer, Picture
-from halbach_fe.report.campaign_folders import ORDER, TELLING, is_same_magnet
+from halbach_fe.report.campaign_folders import ORDER, TELLING, _short, is_same_magnet
 from halbach_fe.report.campaign_report import _parts, read_campaign
+from halbach_fe.report.words import within_a_sentence
 from tests.conftest import changed, parse_study
 from tests.support.pages import write_any_page
 from tests.support.results import STUDY, TINY, results
@@ -701,3 +702,19 @@ def test_page_records_are_of_what_is_on_the_page(tmp_path):
         "figures": [{"file": "a.png", "caption": "what is seen"}], "provenance": {"map": "m.csv"},
         "answer": {"question": "q", "said": "s", "trust": "t", "step": "n", "command": "",
                    "sound": True, "concern": "", "changes_study": True, "gist": "", "numbers": []}}
+
+
+def test_numbers_beside_infinite_ones():
+    """Control: what is nothing beside finite ones is 0."""
+    assert _short([1.0, float("inf"), 1e-12]) == "1, inf, 0"
+    assert _short([float("nan"), 2.0]) == "nan, 2"
+
+
+@pytest.mark.parametrize(("sentence", "within"), [
+    ("Bx and By of 3 readings disagree", "Bx and By of 3 readings disagree"),
+    ("Bz, which is small", "Bz, which is small"), ("|B| is known", "|B| is known"),
+    ("NMR readings", "NMR readings"), ("Maxwell's equations", "Maxwell's equations"),
+    ("It is noise", "it is noise"), ("A reading is wrong", "a reading is wrong"),
+    ("The readings, all", "the readings, all"), ("B is large", "B is large"), ("", "")])
+def test_names_keep_their_first_letter(sentence, within):
+    assert within_a_sentence(sentence) == within

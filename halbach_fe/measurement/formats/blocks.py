@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -97,6 +98,17 @@ class DeclaredBlocks(DeclaredFormat):
     axes: tuple[str, str, str] = ("x", "y", "z")
     along_block: bool = False
     fixed: Mapping[str, str] = field(default_factory=dict)
+    unused: ClassVar[tuple[str, ...]] = ("component", "at", "origin_m", "positions")
+
+    def _wrong(self) -> dict[str, str]:
+        """Return what each statement must be that has a value of no meaning."""
+        wrong = super()._wrong()
+        if sorted(one.removeprefix("-") for one in self.axes) != sorted(COMPONENTS):
+            wrong["axes"] = "x, y and z in some order, with a minus or without"
+        if not {*self.fixed} <= {*QUANTITIES} or not all(
+                isinstance(text, str) and text.strip() for text in self.fixed.values()):
+            wrong["fixed"] = f"a dict such as {{'volume': '12 cm^3'}} of {', '.join(QUANTITIES)}"
+        return wrong
 
 
 @dataclass(frozen=True)
@@ -207,11 +219,24 @@ def _header(
                    if text != "-" and not name]:
         raise MeasurementError(must_be("--columns", where, f"made of {', '.join(QUANTITIES)} and -",
                                        f"'{unknown[0]}'"))
+    for (name, unit), other in zip([quantity_of(text) for text in own], below, strict=False):
+        if unit and other and not _same_unit(name, unit, other):
+            raise MeasurementError(must_be(
+                f"unit of {name}", where, "the same in the header and in the line of units below",
+                f"'{unit[:20]}' and '{other[:20]}'", "Remove the wrong one."))
     for said in ([names.split_unit(text)[1].strip() for text in own], below):
         if len(said) == len(header):
             header = [(name, unit or other)
                       for (name, unit), other in zip(header, said, strict=True)]
     return header
+
+
+def _same_unit(name: str, one: str, other: str) -> bool:
+    """Tell whether two texts are one unit of a quantity."""
+    if name == "temperature":
+        return (one in KELVIN) == (other in KELVIN)
+    return name not in KIND or (units.unit_symbol(one) or one) == (
+        units.unit_symbol(other) or other)
 
 
 def _columns(
@@ -406,7 +431,8 @@ def _measured_blocks(
 def _check_strength(polarization: Floats, strength: str, table: _Table) -> None:
     """Raise MeasurementError for polarizations (n, 3) in T that no magnet has; NaN is unknown."""
     most_T = 10.0  # no material has a quarter of it, and mT or kG taken for T are beyond
-    size = np.nan_to_num(np.linalg.norm(polarization, axis=1))
+    size = np.linalg.norm(polarization, axis=1)
+    size[~np.isfinite(size)] = 0.0  # without a volume, which is refused later
     if (size > most_T).any():
         row = int(np.argmax(size > most_T))
         raise MeasurementError(must_be(
