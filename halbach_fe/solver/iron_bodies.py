@@ -64,7 +64,7 @@ ROUGH_RESIDUAL = 1e-3
 
 SOLUTION_TOLERANCE = 0.05
 """Largest residual of that solution with our right-hand side, by the largest values of both.
-Without preconditioning it is up to 50 times as large as GetDP's own: 1e-3 were measured by
+Without preconditioning it is 20 to 60 times as large as what GetDP stops at: 6e-4 were measured by
 `ROUGHLY` in twelve boxes, and 0.02 where GetDP stopped just below `ROUGH_RESIDUAL`. Another
 numbering of the unknowns makes 0.5 or more."""
 
