@@ -153,7 +153,7 @@ def test_a_report_replaces_no_other_result(dipole, tmp_path):
         hf.write_report(another, folder)
     assert (folder / "report.html").read_bytes() == page
     assert hf.write_report(result, folder) == folder / "report.html"
-    with pytest.raises(TypeError, match="has returned; instead received a NoneType"):
+    with pytest.raises(hf.HalbachError, match="has returned; instead received a NoneType"):
         hf.write_report(None, tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
@@ -186,7 +186,7 @@ SEEDS = "seed .* a whole number of at least 0; instead received -1"
     (lambda magnet, session: hf.tolerance(magnet, session, limit_units=-1), "from 1e-06 to 1e.06"),
     (lambda magnet, session: hf.shim(RESULT, session, swaps=-1), "swaps .* at least 0"),
     (lambda magnet, session: hf.shim(RESULT, session, swaps=1.5), "a whole number .* received 1.5"),
-    (lambda magnet, session: hf.shim(RESULT, session, turns=True), "turns .* a whole number"),
+    (lambda magnet, session: hf.shim(RESULT, session, turns=True), "turns .* a number; .* True"),
     (lambda magnet, session: hf.demagnetization(magnet, session, across=0), "from 2 to 100"),
     (lambda magnet, session: hf.simulate_measurement(magnet.study, seed=-1), SEEDS),
     (lambda magnet, session: hf.sort(magnet, TABLE, session, seed=-1), SEEDS),
