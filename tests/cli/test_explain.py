@@ -38,7 +38,8 @@ def test_a_map_that_the_update_explains_needs_nothing_else(study, generator, tmp
     out = tmp_path / "out"
     assert main(["explain", str(study), str(tmp_path / "mm.csv"), "--length-unit", "mm",
                  "--columns", "x,y,z,Bx[T],By[T],Bz[T]", "-o", str(out)]) == 0
-    assert {path.name for path in out.iterdir() if path.is_dir()} == {"check", "inferred"}
+    assert {path.name for path in out.iterdir() if path.is_dir()} == {
+        "check", "inferred", ".halbach-fe-report"}
     assert (out / "explanation.html").exists()
     assert said(out / "inferred").sound
     printed = capsys.readouterr()

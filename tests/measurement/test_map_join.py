@@ -15,6 +15,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.pace import Pace
 from halbach_fe.measurement import map_join
+from halbach_fe.measurement.campaign import refuse_shared
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
 from halbach_fe.measurement.harmonic_field import Charges
 from halbach_fe.measurement.joined_probe import TERMS, JoinedModel, Pose
@@ -203,6 +204,16 @@ def test_contradictions_are_refused_or_named(monkeypatch):
     monkeypatch.setattr(map_join, "DIFFERS", 1.0)
     with pytest.raises(MeasurementError, match="noise explains"):
         joined_of(maps | {"part1": torn})
+
+
+def test_a_map_under_two_names():
+    """Is refused as what it was given to. Control: in a study it is one of the campaign."""
+    part = campaign(0, maps=2)[0]["part0"]
+    with pytest.raises(MeasurementError, match="'one' and 'again' of join_maps must be different"):
+        join_maps({"one": part, "again": part})
+    rows = points_of(part), part["B_T"].values, 2e-5
+    with pytest.raises(MeasurementError, match="'one' and 'again' of the campaign"):
+        refuse_shared({"one": rows, "again": rows})
 
 
 def test_positions_that_lines_have_in_common_widen_the_bars(monkeypatch):
