@@ -222,7 +222,7 @@ def test_nothing_is_written_but_in_the_folder(campaign):
     above, _ = campaign
     assert [path.name for path in above.iterdir()] == ["home"]
     assert sorted(path.name for path in (above / "home").iterdir()) == [
-        ".hf.write_map.json", "blocks.csv", "infer", "map.csv", "prior", "solve", "sort",
+        ".hf.write_map", "blocks.csv", "infer", "map.csv", "prior", "solve", "sort",
         "study.toml"]
 
 
