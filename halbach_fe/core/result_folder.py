@@ -76,9 +76,6 @@ WRITES = {
 unless it is its own. A name that is missing here is refused only as it is written."""
 
 
-SESSION = "halbach-fe"
-"""Command in the records of sessions of Python, whose folders belong to no command."""
-
 RUNS = "getdp-"
 """Beginning of the names of run folders of GetDP."""
 
@@ -244,15 +241,11 @@ class _Writer:
         changed = set(names) <= self.record.files.keys()
         named = 5  # largest number of files that a refusal names
         others = f" and {len(names) - named} more" if len(names) > named else ""
-        # earlier versions kept no record of what sessions of Python wrote
-        of_session = self.record.command == SESSION and all(map(_is_kept, foreign))
         raise OutputError(
             f"File {', '.join(names[:named])}{others} in folder {self.base} "
             + (f"changed after `{self.record.command}` had written it" if changed else
                f"was not written by `{self.record.command}`")
-            + f", which would replace it. Name another {self.other}, or move this elsewhere."
-            + (" If an earlier version of halbach-fe wrote it, remove it: it is computed again."
-               if of_session else ""))
+            + f", which would replace it. Name another {self.other}, or move this elsewhere.")
 
     def _owns(self, path: Path) -> bool:
         """Tell whether runs have written what is at a path, and nobody has changed it since."""
@@ -507,7 +500,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         return
     with _locked(folder) as file:
         record = _read_or_refuse(file, folder / RECORD) or Record(
-            command=SESSION, study="", kept=[])
+            command="halbach-fe", study="", kept=[])
         writer = _Writer(folder.absolute(), record, "folder", file)
         writer.refuse(_writable_paths(writer.base, (), solving=True))
         with telling(writer):
@@ -619,13 +612,14 @@ def _read_or_refuse(file: BinaryIO, path: Path) -> Record | None:
 def _is_of_a_run(path: Path) -> bool:
     """Tell by its content whether a file without a record is one that a run keeps for later ones.
 
-    A function that is called without a command's folder leaves none, as earlier states did. Gmsh's
-    own mesh.msh of somebody else has no regions.json of these keys beside it.
+    Functions below the interface, such as `halbach_fe.response.matrix.response_matrix`, leave no
+    record in a session's folder, and earlier versions left none at all. Somebody's own mesh.msh has
+    no regions.json with these keys beside it.
     """
     if fnmatch(path.name, "response-*.npy"):  # a part of the response beside it
         path = path.with_name("response.h5")
     if path.name == "response.h5":
-        import h5py  # half the time of an import of this module
+        import h5py  # late, as few folders have such a file without a record
 
         try:
             with h5py.File(path) as file:

@@ -207,13 +207,22 @@ def forces(
 
 def _with_error_of_iron(loads: Loads, charges: Charges, blocks: Sequence[MagnetBlock],
                         iron: IronReaction | BodiesReaction) -> Loads:
-    """Add what a coarser mesh of the iron changes to the error bars of loads."""
+    """Add what a coarser mesh of the iron changes to the error bars of loads.
+
+    On a single block the change may vanish by chance. Therefore it counts as at least the share of
+    the iron's loads that it is of those on all blocks together.
+    """
     if iron.coarse is None:
         return loads
-    field = iron.field(charges.points) - iron.coarse.field(charges.points)
-    change = charges.loads(field, np.array([_middle(block) for block in blocks]), len(blocks))
-    force, torque = (np.linalg.norm(part, axis=1) for part in np.hsplit(change, 2))
-    return replace(loads, error_N=loads.error_N + force, error_Nm=loads.error_Nm + torque)
+    middles = np.array([_middle(block) for block in blocks])
+    whole, coarse = (charges.loads(each.field(charges.points), middles, len(blocks))
+                     for each in (iron, iron.coarse))
+    bars = []
+    for part, other in zip(np.hsplit(whole, 2), np.hsplit(coarse, 2), strict=True):
+        size, change = (np.linalg.norm(one, axis=1) for one in (part, part - other))
+        share = np.linalg.norm(change) / (np.linalg.norm(size) or 1.0)
+        bars.append(np.maximum(change, share * size))
+    return replace(loads, error_N=loads.error_N + bars[0], error_Nm=loads.error_Nm + bars[1])
 
 
 def _sequence(names: Sequence[str], order: Sequence[str] | None, study: str) -> Ints:

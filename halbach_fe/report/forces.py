@@ -66,11 +66,12 @@ def answer(found: Forces) -> Answer:
     error = float(found.in_place.error_N[worst])
     # error of a force, relative to it, above which the answer is not to be trusted
     rough = 0.1
+    integration = f"integration {'with the mesh of the iron' if found.magnet.iron else 'itself'}"
     return Answer(
         question, " ".join([*text, *_on_rings(found), _mass(found)]),
         "Yes, for the blocks of the study, at rest in their places: a block that is 1 % stronger "
         "feels 1 % more, and one that comes nearer to its neighbours than its place is may feel "
-        f"more. The integration itself is right to {_newton(error)}.", *plan,
+        f"more. The {integration} is right to {_newton(error)}.", *plan,
         sound=error <= rough * size, numbers=(("largest force in place", _newton(size)),))
 
 

@@ -9,8 +9,10 @@ import os
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from datetime import datetime
 
+import h5py
 import pytest
 
 from halbach_fe.core.errors import OutputError
@@ -372,8 +374,8 @@ def test_a_lock_without_a_record(tmp_path):
 
 @pytest.mark.parametrize("inner", [True, False])
 def test_sessions_within_each_other(tmp_path, inner):
-    """They renew each other's files. Control: a file of nobody, of which an earlier version is
-    said to be a possible author, is refused until it is removed, as the sentence advises.
+    """They renew each other's files. Control: a file of nobody is refused until it is moved, as the
+    sentence advises.
     """
     part = tmp_path / "objective"
     first, second = (part, tmp_path) if inner else (tmp_path, part)
@@ -382,14 +384,33 @@ def test_sessions_within_each_other(tmp_path, inner):
             write_text(part / "response.h5", str(number))
     assert (part / "response.h5").read_text() == "3"
     (part / "mesh.msh").write_text("mine")
-    with pytest.raises(OutputError, match=r"mesh\.msh .* earlier version .* remove it"), (
+    with pytest.raises(OutputError, match=r"mesh\.msh .* move this elsewhere"), (
             locked_folder(second)):
         write_text(part / "mesh.msh", "4")
     assert (part / "mesh.msh").read_text() == "mine"
-    (part / "mesh.msh").unlink()
+    (part / "mesh.msh").rename(tmp_path / "mine.msh")
     with locked_folder(second):
         write_text(part / "mesh.msh", "4")
     assert (part / "mesh.msh").read_text() == "4"
+
+
+def test_what_a_session_finds_without_a_record(tmp_path):
+    """A mesh with its regions and a response are known by their content. Controls: regions of
+    other keys, and a response without its hash.
+    """
+    files = tmp_path / "regions.json", tmp_path / "mesh.msh", tmp_path / "response.h5"
+    for regions, attributes, refused in (
+            ({"study": "a", "dimension": 3, "air": 1}, {"key": "k", "content_sha256": "s"}, ""),
+            ({"parts": []}, {"key": "k", "content_sha256": "s"}, r"mesh\.msh"),
+            ({"study": "a", "dimension": 3, "air": 1}, {"key": "k"}, r"response\.h5")):
+        files[0].write_text(json.dumps(regions))
+        files[1].write_text("$MeshFormat")
+        with h5py.File(files[2], "w") as file:
+            file.attrs.update(attributes)
+        with pytest.raises(OutputError, match=refused) if refused else nullcontext(), (
+                locked_folder(tmp_path)):
+            pass
+        (tmp_path / RECORD).unlink(missing_ok=True)
 
 
 def test_a_lock_that_is_removed_meanwhile(tmp_path, monkeypatch):

@@ -252,11 +252,24 @@ def test_a_perfect_instrument(generator):
     assert "obeys" in verdict(check)
 
 
-def drifting(magnets, axes, generator):
+def ring_of_cubes():
+    """Eight rings of 20 cubes, whose field is flat within a third of their radius."""
+    return [magpylib.magnet.Cuboid(
+        dimension=(0.015, 0.015, 0.015), polarization=(1.3 * np.cos(angle), 1.3 * np.sin(angle), 0),
+        position=(0.1 * np.cos(angle), 0.1 * np.sin(angle), z),
+        orientation=Rotation.from_rotvec([0, 0, angle]))
+        for angle in np.radians(18 * np.arange(20)) for z in 0.018 * np.arange(-3.5, 4)]
+
+
+FLAT = [np.linspace(-0.03, 0.03, 5)] * 2 + [np.linspace(-0.05, 0.05, 9)]
+"""Coordinates in m of a map in that field."""
+
+
+def drifting(magnets, axes, generator, course=lambda time: time):
     """A map (n, 3) that is read plane by plane along x, while the gain grows by 0.4 %."""
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     field = magpylib.getB(magnets, points, sumup=True)
-    gain = 1 + 0.004 * np.linspace(0, 1, len(points))
+    gain = 1 + 0.004 * course(np.linspace(0, 1, len(points)))
     return field_map(points, field * gain[:, None]
                      + 2e-5 * generator.standard_normal(points.shape))
 
@@ -266,14 +279,7 @@ def test_what_explains_a_map_as_well_is_told_beside_it(generator):
     like a sensor that is off along x in a field with a gradient: none is found, and none is
     corrected. Control: in the field of a solenoid the drift shows.
     """
-    angles = np.radians(18 * np.arange(20))
-    cubes = [magpylib.magnet.Cuboid(
-        dimension=(0.015, 0.015, 0.015), polarization=(1.3 * np.cos(angle), 1.3 * np.sin(angle), 0),
-        position=(0.1 * np.cos(angle), 0.1 * np.sin(angle), z),
-        orientation=Rotation.from_rotvec([0, 0, angle]))
-        for angle in angles for z in 0.018 * np.arange(-3.5, 4)]
-    data = drifting(cubes, [np.linspace(-0.03, 0.03, 5)] * 2 + [np.linspace(-0.05, 0.05, 9)],
-                    generator)
+    data = drifting(ring_of_cubes(), FLAT, generator)
     check = check_map(data)
     assert [term.name for term in check.terms if term.found] == []
     alike = {term.name for term in check.terms if term.rivals}
@@ -289,6 +295,23 @@ def test_what_explains_a_map_as_well_is_told_beside_it(generator):
     (drift,) = [term for term in control.terms if term.found]
     assert drift.name == "change of the gain from start to end"
     assert abs(drift.value - 0.4) < 4 * drift.sd
+
+
+def test_what_is_found_of_a_change_is_corrected_beside_rivals():
+    """Of a gain that settles the uneven part is found, the even part has rivals."""
+    cubes = ring_of_cubes()
+    data = drifting(cubes, FLAT, np.random.default_rng(1), lambda time: 1 - np.exp(-time / 0.08))
+    check = check_map(data)
+    assert [term.name for term in check.terms if term.found] == [
+        "change of the gain from the ends to the middle"]
+    assert any(term.rivals for term in check.terms)
+    field = magpylib.getB(cubes, points_of(data), sumup=True)
+
+    def uneven(values):
+        return np.std(np.sum(values * field, axis=1) / np.sum(field**2, axis=1))
+
+    # 0.80 was measured; 0.89 with some waves of what was found left out and some of a rival left
+    assert uneven(check.corrected_T) < 0.85 * uneven(data["B_T"].values)
 
 
 def test_an_imperfect_instrument(generator):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import magpylib
 import netgen.occ as occ
@@ -443,5 +444,12 @@ def test_points_on_faces_of_blocks_that_touch():
     with pytest.raises(StudyError, match=r"1 of 201 on faces .* touch.*--count 200") as refused:
         on(201)
     assert "out of the blocks" not in str(refused.value)
+    within = Lines(np.array([0.028, -0.005, 0.0]), np.array([0.028, 0.005, 0.0]), count=5)
+    with pytest.raises(StudyError, match=r"5 of 5 on faces .* 0\.1 mm across itself"):
+        field_on_lines(magnet, within, known, Session.temporary(), inside=True)
+    step = np.array([0.0, 0.0, 1e-4])
+    across = replace(within, start=within.start + step, end=within.end + step)
+    assert set(field_on_lines(magnet, across, known, Session.temporary(), inside=True).in_block[
+        0]) == {"high"}
     found = on(200)
     assert found.in_block[0, 99:101].tolist() == ["low", "high"]
