@@ -22,6 +22,7 @@ from halbach_fe.core.arguments import check_options, typed
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.files import as_path, write_text
 from halbach_fe.core.numbers import check_number
+from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -38,7 +39,6 @@ from halbach_fe.study.template import (
     parse_new_study,
     write_new_study,
 )
-from halbach_fe.synthetic.optional_packages import import_extra
 
 WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
 """First line of the studies that `write_study` writes."""

@@ -25,7 +25,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.core.errors import ExtraMissingError
+from halbach_fe.core.optional_packages import import_extra
 
 _OUTPUT_LOCK = threading.RLock()
 """Held while output and warnings are suppressed, because both are global to the process."""
@@ -66,12 +66,8 @@ def sheet_text(raw: bytes) -> tuple[bytes, str, list[str]]:
         If the file is damaged, or larger than 200 million cells or bytes.
     """
     max_sheet = 200_000_000  # size in bytes of the largest unpacked workbook that is read
-    try:
-        import openpyxl
-    except ImportError:
-        raise ExtraMissingError(
-            "A workbook needs the package openpyxl: pip install 'halbach-fe[spreadsheet]', or save "
-            "the sheet as CSV.") from None
+    openpyxl = import_extra("openpyxl", "spreadsheet",
+                            "A workbook that is not saved as CSV needs the package openpyxl")
     with _refusing():
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
             if sum(part.file_size for part in packed.infolist()) > max_sheet:

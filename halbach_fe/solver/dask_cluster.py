@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from halbach_fe.core.errors import ExtraMissingError, GetDPError, HalbachError, SchedulerError
+from halbach_fe.core.errors import GetDPError, HalbachError, SchedulerError
+from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Job
 
@@ -151,14 +152,11 @@ def connected(
     SchedulerError
         If no scheduler answers at the address, or if Dask fails within the context.
     """
-    try:
-        import dask
-        import distributed
-        from distributed.comm.addressing import parse_address, parse_host_port
-        from distributed.comm.registry import get_backend
-    except ImportError:
-        raise ExtraMissingError("--scheduler needs Dask, which is not installed: "
-                                "`pip install halbach-fe[cluster]`.") from None
+    distributed = import_extra("distributed", "cluster", "--scheduler needs Dask")
+    import dask
+    from distributed.comm.addressing import parse_address, parse_host_port
+    from distributed.comm.registry import get_backend
+
     # The files of a run are part of its task, so large tasks are intended: silence Dask's warning.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TiB"})
     try:  # a client that fails on such an address would print a traceback when it is deleted

@@ -29,6 +29,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import GetDPError, GetDPNotFoundError, HalbachError, OutputError
 from halbach_fe.core.files import is_full
+from halbach_fe.core.optional_packages import install_command
 
 ENVIRONMENT_VARIABLE = "HALBACH_FE_GETDP"
 LOG_NAME = "getdp.log"
@@ -95,8 +96,6 @@ _PACKAGE = "pyonelab"
 _PACKAGED_SHA256 = "ffc369cac19f88668d892cc07c8732c452b2a5331d99a623906e89d340a6b89a"
 """SHA-256 of ``bin/Linux/getdp`` in pyonelab 1.0.5: only the build that was tested is started."""
 
-_INSTALL = ("Install it (`pip install 'halbach-fe[getdp]'`; Debian, Ubuntu: `apt-get install getdp "
-            "libopenblas0-pthread`), or name it with --getdp or " f"{ENVIRONMENT_VARIABLE}.")
 _COLOURS = re.compile(r"\x1b\[\d*m")
 DISK_FULL = "the disk is full"
 _NAMED_FAILURES = (  # pattern in the log, and its meaning
@@ -220,6 +219,12 @@ def _packaged() -> Path | None:
     return None
 
 
+def _advice() -> str:
+    """Return what to do where no GetDP answers."""
+    return (f"Install it (`{install_command('getdp')}`; Debian, Ubuntu: `apt-get install getdp "
+            f"libopenblas0-pthread`), or name it with --getdp or {ENVIRONMENT_VARIABLE}.")
+
+
 def find_getdp(named: str | Path | None = None) -> GetDP:
     """Find the GetDP executable and read its version and build from ``getdp -info``.
 
@@ -231,13 +236,13 @@ def find_getdp(named: str | Path | None = None) -> GetDP:
     Raises
     ------
     GetDPNotFoundError
-        If no executable is path, or if it does not answer like GetDP.
+        If there is no executable, or if it does not answer like GetDP.
     """
     wanted = str(named) if named else os.environ.get(ENVIRONMENT_VARIABLE)
     path = shutil.which(wanted or "getdp") or (None if wanted else _packaged())
     if path is None:
         raise GetDPNotFoundError(
-            f"GetDP was not found: `{wanted or 'getdp'}` is no executable. {_INSTALL}")
+            f"GetDP was not found: `{wanted or 'getdp'}` is no executable. {_advice()}")
     executable = Path(path).resolve()
     status = executable.stat()
     return _asked(executable, status.st_size, status.st_mtime_ns)
@@ -251,10 +256,10 @@ def _asked(path: Path, _bytes: int, _changed_ns: int) -> GetDP:
                                 errors="replace", check=False, env=os.environ | _ALONE)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise GetDPNotFoundError(
-            f"GetDP at {path} does not answer ({error}). {_INSTALL}") from None
+            f"GetDP at {path} does not answer ({error}). {_advice()}") from None
     build = dict(re.findall(r"^(.+?)\s*:\s*(.*)$", answer.stdout + answer.stderr, re.MULTILINE))
     if answer.returncode != 0 or "Version" not in build:
-        raise GetDPNotFoundError(f"{path} does not answer like GetDP. {_INSTALL}")
+        raise GetDPNotFoundError(f"{path} does not answer like GetDP. {_advice()}")
     return GetDP(executable=path, version=build["Version"],
                  build_options=tuple(build.get("Build options", "").split()),
                  petsc=build.get("PETSc version", ""))
@@ -303,7 +308,8 @@ def run(
         If ``getdp`` is `NO_GETDP`.
     """
     if getdp == NO_GETDP:
-        raise GetDPNotFoundError(f"This needs finite elements, and GetDP was not found. {_INSTALL}")
+        raise GetDPNotFoundError("This needs finite elements, and GetDP was not found. "
+                                 + _advice())
     _check_before(job, folder)
     arguments = [
         str(getdp.executable), job.problem, "-msh", job.mesh, "-solve", job.resolution,

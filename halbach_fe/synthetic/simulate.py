@@ -23,6 +23,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.optional_packages import version_of
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map
@@ -52,7 +53,6 @@ from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.knee_losses import lost_field
 from halbach_fe.synthetic.magpylib_field import no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
-from halbach_fe.synthetic.optional_packages import version_of
 from halbach_fe.synthetic.reaction import by_elements, reaction_field
 from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, TrueMagnet, in_places
 

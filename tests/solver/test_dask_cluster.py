@@ -295,6 +295,6 @@ def test_an_address_of_no_scheduler(address, monkeypatch):
 
 def test_dask_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with (pytest.raises(ExtraMissingError, match=r"pip install halbach-fe\[cluster\]"),
+    with (pytest.raises(ExtraMissingError, match=r"pip install .*\[cluster\]"),
           connected("tcp://127.0.0.1:8786")):
         pass

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.errors import ExtraMissingError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import finite_element_part, solve_nominal
-from halbach_fe.synthetic import magpylib_field, optional_packages
+from halbach_fe.synthetic import magpylib_field
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
@@ -265,10 +264,3 @@ def test_field_of_dipoles(size, generator):
     expected = -np.column_stack([(potential(points + step * axis) - potential(points - step * axis))
                                  / (2 * step) for axis in np.eye(size)])
     np.testing.assert_allclose(moment_field(places, moments, points), expected, atol=1e-9)
-
-
-def test_programs_that_are_not_installed(monkeypatch):
-    """One sentence that says what to install."""
-    monkeypatch.setitem(__import__("sys").modules, "magpylib", None)
-    with pytest.raises(ExtraMissingError, match=r"pip install halbach-fe\[campaign\]"):
-        optional_packages.import_extra("magpylib")
