@@ -100,6 +100,14 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("x[mm],y[mm],z[mm],dB0[ppm]\n0,0,0,12\n", r"\(1 \+ ppm / 1e6\) times"),
     ("z,z,z,z,z,Bx\n" + "0,0,0,0,0,1\n" * 2, "'z' or 'z' or 'z' or 2 more"),
     (",-10,0,10\n-10,1,2,3\n0,1,2,3\n10,1,2,3\n", "matrix .* a row x, y, B"),
+    ("Y columns by X rows\n\nX Values:-1,0,1\n\n" + "1.5,2.5,1.5,2.5,1,3,2,2,1,1,2,3,9,\n" * 20,
+     "matrix over two axes"),
+    (",".join(f"log {n}" for n in range(40)) + "\n" + (",".join(["1"] * 40) + "\n") * 40,
+     "'log 11', and 28 more"),
+    ("1 0.5\n2 0.6\n", "--columns z,Bz and --at x=0,y=0; .* --columns Bx,By and --positions"),
+    ("Distance [mm],Bx[T],By[T],Bz[T]\n1,0,0,1\n", "nothing is known of 'Distance .mm.'"),
+    ("".join(f"run {n}\n1 2\n3 4\n5 6 7\n" for n in range(9)), "tables are below each other"),
+    (HEADER + "1,2,3,0,0,1\n,,,0,0,2\n", "If the row is no reading, remove it"),
     ('[{"x": 0, "y": 0, "z": 0, "Bx": 0.1}]', "x, y, z, Bx, By, Bz of numbers for each point"),
 ], ids=str)
 def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):

@@ -62,7 +62,7 @@ WORDS = {word: name for name, words in _WORDS.items() for word in words.split()}
         "at": ("{}", "x{}", "pos{}", "{}pos", "position{}", "center{}", "centre{}", "{}center",
                "{}centre", "{}c"),
         "size": ("size{}", "{}size", "d{}", "l{}", "dim{}", "length{}"),
-        "rotation": ("rotation{}", "rot{}", "r{}", "rotvec{}"),
+        "rotation": ("rotation{}", "rot{}", "{}rot", "r{}", "rotvec{}"),
         "moment": ("m{}", "moment{}"), "polarization": (
             "j{}", "br{}", "remanence{}", "polarization{}", "b{}"),
         "magnetization": ("magnetization{}", "mag{}")}.items() for spelling in spellings} | {
@@ -190,8 +190,10 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
     header = _header(own, below, declared, where)
     for number, cells in body:
         if len(cells) != len(header):
-            raise MeasurementError(must_be(f"line {number}", where, f"of {len(header)} cells, as "
-                                           "the header", str(len(cells))))
+            raise MeasurementError(must_be(
+                f"line {number}", where, f"of {len(header)} cells, as the header", str(len(cells)),
+                "Remove it, or begin it with #; if the table begins below it, name the columns by "
+                f"--columns, and add --skip-lines {number}."))
     if not body:
         raise MeasurementError(must_be("content", where, "at least one block", "none"))
     table, unit = _columns(header, [cells for _, cells in body], declared, where)
@@ -213,7 +215,8 @@ def _header(
     if not own and not declared.columns:
         raise MeasurementError(must_be("header", where, f"made of {', '.join(QUANTITIES)}",
                                        "no line that names two of them",
-                                       "State the columns by --columns."))
+                                       "State the columns by --columns; if it is no table, write "
+                                       "it as CSV with a header."))
     header = [quantity_of(text) if text != "-" else ("", "") for text in declared.columns or own]
     if unknown := [text for text, (name, _) in zip(declared.columns, header, strict=False)
                    if text != "-" and not name]:

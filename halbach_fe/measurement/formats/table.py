@@ -38,6 +38,8 @@ MAX_NUMBER = 1e30
 would overflow."""
 NMR = "1 MHz of protons in water is a field of 0.0234872 T: Babs[0.0234872 T]"
 PPM = "ppm of a mean field are no field: write a column of (1 + ppm / 1e6) times that mean"
+MOST_NAMES = 12
+"""Quantities of a reading that a table has at most; with more columns it is another one."""
 PLACEHOLDER = "Where nothing was read, write nan."
 MOST_RAD = 4 * np.pi
 """Largest angle of a position, two turns: larger ones are in degrees."""
@@ -407,13 +409,13 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
     own = names.with_polar([ColumnName("") if text == "-" else names.parse(text, stated=True)
                             for text in declared.columns], declared.at)
     for text, stated, column in zip(declared.columns, own, table.columns[:count], strict=False):
-        if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
+        if text != "-" and not stated.quantity:
             raise MeasurementError(must_be(
                 "--columns", table.where,
                 f"made of {', '.join((*names.KNOWN, *names.STATED))} and -", f"'{text}'"))
         found.append(ColumnName(column.text or stated.text, stated.quantity,
                                 stated.unit or column.unit))
-    return (*found, *table.columns[count:])
+    return _of_h((*found, *table.columns[count:]))
 
 
 def _overridden(
@@ -491,16 +493,21 @@ def _missing(
 ) -> list[str]:
     """Return descriptions of the information that file and user do not state, except units."""
     if not any(column.quantity for column in columns):
-        shown = ", ".join(f"'{column.text}'" for column in columns if column.text)
-        return [f"what its {len(columns)} columns {f'({shown}) ' if shown else ''}are "
+        shown = [f"'{column.text}'" for column in columns if column.text]
+        more = [f"and {len(shown) - MOST_NAMES} more"] if len(shown) > MOST_NAMES else []
+        names_shown = ", ".join(shown[:MOST_NAMES] + more)
+        few = len(columns) <= len(COMPONENTS)
+        return [f"what its {len(columns)} columns {f'({names_shown}) ' if shown else ''}are "
                 "(--columns x,y,z,Bx,By,Bz, - to ignore a column"
-                + ("; if there are no positions, --columns Bx,By,Bz and --positions TABLE"
-                   if len(columns) == len(COMPONENTS) else "")
-                + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
-                   if _is_matrix(table.values) else
-                   "; if every quantity has a row of its own, make it a column, in a spreadsheet "
+                + ("; of points on a line, as --columns z,Bz and --at x=0,y=0; if there are no "
+                   f"positions, --columns {','.join(names.FIELDS[:len(columns)])} and --positions "
+                   "TABLE" if few else "")
+                + ("; if every quantity has a row of its own, make it a column, in a spreadsheet "
                    "by Paste Special, Transpose, or by numpy.transpose"
-                   if _is_transposed(table) else "") + ")"] + [
+                   if _is_transposed(table) else "")
+                + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
+                   if _is_matrix(table.values) or (len(columns) > MOST_NAMES and not shown) else "")
+                + ")"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
@@ -521,7 +528,10 @@ def _missing(
         return [*missing, "phi (--columns); if the field has rotational symmetry, state its "
                 "half-plane: x for r and Bx for Br in --columns, and --at y=0"]
     if absent:
-        missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
+        other = [column.text for column in columns if column.text and not column.quantity]
+        missing.append(f"{', '.join(absent)} ({_by_option(absent)}" + (
+            f", as nothing is known of {_quoted(other[:MOST_NAMES])}"
+            if other and not declared.columns else "") + ")")
     if "B" in used:
         missing.append("which component B is (--component x, y or z), whether it is |B| "
                        "(--component abs), or that nobody knows (--component unknown: halbach-fe "
@@ -577,10 +587,9 @@ def _is_matrix(values: Floats) -> bool:
 
 def _is_transposed(table: ForeignTable) -> bool:
     """Return whether the rows may be quantities: they are few, or begin with the names of some."""
-    few = 12  # quantities of a reading
     named = [names.parse(cell).quantity for _, cell in table.texts.get(0, {}).values()]
     rows, columns = table.values.shape
-    return sum(map(bool, named)) > 1 or (rows <= few and columns > 2 * few)
+    return sum(map(bool, named)) > 1 or (rows <= MOST_NAMES and columns > 2 * MOST_NAMES)
 
 
 def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None:
@@ -697,7 +706,8 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise MeasurementError(must_be(f"reading {int(np.argmax(bad)) + 1}", where,
-                                       "at a finite position", "an empty or infinite coordinate"))
+                                       "at a finite position", "an empty or infinite coordinate",
+                                       "If the row is no reading, remove it."))
     empty = np.full(len(points), np.nan)
     if "Br" not in si:
         return points, np.column_stack([si.get(name, empty) for name in ("Bx", "By", "Bz")])
