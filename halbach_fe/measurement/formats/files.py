@@ -144,7 +144,8 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
             unit_symbol(found.columns[number].unit) for number in order):
         raise MeasurementError(must_be("header", where, "with x, y and z and their units, as in "
                                        "x[mm],y[mm],z[mm]", ",".join(
-                                           column.text for column in found.columns)[:60] or "none"))
+                                           column.text for column in found.columns
+                                           if column.text)[:60] or "none"))
     if len(found.values) != len(table.values):
         raise MeasurementError(must_be("content", where, f"{len(table.values)} rows, one for each "
                                        f"reading of {table.where}", str(len(found.values))))
