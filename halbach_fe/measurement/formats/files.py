@@ -22,15 +22,7 @@ from halbach_fe.measurement.field_map import (
     warn_of_left_out,
     warn_of_millimetres,
 )
-from halbach_fe.measurement.formats import (
-    bdsim,
-    columns,
-    comsol,
-    g4beamline,
-    geant4,
-    openpmd,
-    opera,
-)
+from halbach_fe.measurement.formats import bdsim, columns, comsol, g4beamline, openpmd, opera
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid, grid_of, implied_format, read_fluka, read_srw
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
@@ -45,7 +37,7 @@ READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(
 file's name for messages."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
     "openpmd": openpmd.content, "bdsim": lambda grid: _joined(bdsim.lines(grid)),
-    "geant4": lambda grid: _joined(geant4.lines(grid))}
+    "geant4": lambda grid: _joined(opera.lines(grid))}
 """Writers of the formats that need a regular grid."""
 SUFFIXES = {"csv": (".csv",), "vtu": (".vtu",), "openpmd": (".h5", ".hdf5")}
 """Suffixes of the formats that have a usual one."""

@@ -19,6 +19,7 @@ from halbach_fe.measurement.formats.units import (
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
+CARTESIAN = (*POSITIONS[:3], *FIELDS[:3])
 TOTAL = "Babs"
 """The magnitude |B|, as a quantity of its own."""
 KNOWN = (*POSITIONS, *FIELDS, "B", TOTAL)
@@ -102,6 +103,12 @@ class ColumnName:
     text: str
     quantity: str = ""
     unit: str = ""
+
+
+def in_units(quantities: Sequence[str], length: str, field: str = "T") -> tuple[ColumnName, ...]:
+    """Return columns that are named after their quantity: positions, and components of B."""
+    return tuple(ColumnName(name, name, field if name.startswith("B") else length)
+                 for name in quantities)
 
 
 @lru_cache(maxsize=1024)  # lines of many words are read as headers too
