@@ -153,12 +153,14 @@ MAX_LINE = 200
 """Number of characters of a line of the header that are searched."""
 
 
-def implied_format(lines: Sequence[Line]) -> str | None:
-    """Return which of both formats the first lines are of, or None."""
-    first = [line[:MAX_LINE] for _, line in lines[:20]]
-    if sum(bool(STATEMENT.match(line)) for line in first) >= len(KEYS):
-        return "srw"
-    return "fluka" if any(line.upper().startswith(CARD) for line in first) else None
+def is_srw(lines: Sequence[Line]) -> bool:
+    """Return whether the first lines describe a grid of SRW."""
+    return sum(bool(STATEMENT.match(line[:MAX_LINE])) for _, line in lines[:20]) >= len(KEYS)
+
+
+def is_fluka(lines: Sequence[Line]) -> bool:
+    """Return whether one of the first lines is a card of a grid of FLUKA."""
+    return any(line.upper().startswith(CARD) for _, line in lines[:20])
 
 
 def read_srw(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:

@@ -104,6 +104,8 @@ class ImportedMap:
         Whether the file has Br and Bphi, so that Bx and By are computed.
     remarks : tuple of str
         Sentences for the user about what the file says of its numbers, and what was done with it.
+    format : str
+        Name of the format of the file.
     """
 
     data: xr.Dataset
@@ -113,6 +115,7 @@ class ImportedMap:
     dropped: int
     cylindrical: bool
     remarks: tuple[str, ...] = ()
+    format: str = ""
 
 
 def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
@@ -492,12 +495,11 @@ def _missing(
     declared: DeclaredFormat
 ) -> list[str]:
     """Return descriptions of the information that file and user do not state, except units."""
+    unknown = [column.text for column in columns if column.text and not column.quantity]
     if not any(column.quantity for column in columns):
-        shown = [f"'{column.text}'" for column in columns if column.text]
-        more = [f"and {len(shown) - MOST_NAMES} more"] if len(shown) > MOST_NAMES else []
-        names_shown = ", ".join(shown[:MOST_NAMES] + more)
-        few = len(columns) <= len(COMPONENTS)
-        return [f"what its {len(columns)} columns {f'({names_shown}) ' if shown else ''}are "
+        few, many = len(columns) <= len(COMPONENTS), len(columns) > MOST_NAMES and not unknown
+        return [f"what its {len(columns)} columns "
+                f"{f'({_quoted(unknown)}) ' if unknown else ''}are "
                 "(--columns x,y,z,Bx,By,Bz, - to ignore a column"
                 + ("; of points on a line, as --columns z,Bz and --at x=0,y=0; if there are no "
                    f"positions, --columns {','.join(names.FIELDS[:len(columns)])} and --positions "
@@ -506,12 +508,11 @@ def _missing(
                    "by Paste Special, Transpose, or by numpy.transpose"
                    if _is_transposed(table) else "")
                 + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
-                   if _is_matrix(table.values) or (len(columns) > MOST_NAMES and not shown) else "")
+                   if many or _is_matrix(table.values) else "")
                 + ")"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
                 ("field", "B", declared.field_unit or table.field_unit)) if not said]
-    missing: list[str] = []
     if (hint := _of_field(used, columns)) is not None:
         return [hint]
     latitude = [column.text for column in columns if names.is_latitude(column)]
@@ -525,13 +526,13 @@ def _missing(
     absent = [name for name in wanted if name not in used and name not in declared.at
               and f"d{name}" not in used]
     if absent == ["phi"]:
-        return [*missing, "phi (--columns); if the field has rotational symmetry, state its "
+        return ["phi (--columns); if the field has rotational symmetry, state its "
                 "half-plane: x for r and Bx for Br in --columns, and --at y=0"]
+    missing: list[str] = []
     if absent:
-        other = [column.text for column in columns if column.text and not column.quantity]
         missing.append(f"{', '.join(absent)} ({_by_option(absent)}" + (
-            f", as nothing is known of {_quoted(other[:MOST_NAMES])}"
-            if other and not declared.columns else "") + ")")
+            f", as nothing is known of {_quoted(unknown)}"
+            if unknown and not declared.columns else "") + ")")
     if "B" in used:
         missing.append("which component B is (--component x, y or z), whether it is |B| "
                        "(--component abs), or that nobody knows (--component unknown: halbach-fe "
@@ -539,12 +540,10 @@ def _missing(
     elif (unread := _unread_components(used, columns, declared)):
         missing.append(unread)
     elif not {*names.FIELDS, names.TOTAL} & set(used):
-        others = [column.text for column in columns if column.text and not column.quantity]
         missing.append("which columns are Bx, By or Bz, Babs for |B|, or B for a component that "
                        "nobody knows, with --component unknown (--columns"
-                       + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
-                          if others else "")
-                       + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "")
+                       + (f", instead of {_quoted(unknown)}" if unknown else "")
+                       + (f"; {NMR}" if any("hz" in text.lower() for text in unknown) else "")
                        + (f"; {PPM}" if any("ppm" in column.text.lower() for column in columns)
                           else "")
                        + ")")
@@ -574,7 +573,9 @@ def _unread_components(
 
 
 def _quoted(texts: Sequence[str]) -> str:
-    return in_a_row([f"'{text}'" for text in texts])
+    """Return the first `MOST_NAMES` texts in quotes."""
+    more = [f"{len(texts) - MOST_NAMES} more"] if len(texts) > MOST_NAMES else []
+    return in_a_row([f"'{text}'" for text in texts[:MOST_NAMES]] + more)
 
 
 def _is_matrix(values: Floats) -> bool:
