@@ -56,6 +56,7 @@ RECOGNIZED = 2
 """Smallest number of recognized names in a header. Fewer may be words of a sentence."""
 OWN_COLUMNS = frozenset((*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS))
 ATTRIBUTE = re.compile(r"#\s*([^:\s][^:]{0,99}?)\s*:\s*(.*)")
+"""An attribute of a map in halbach-fe's own columns: # key: value."""
 MEANING = re.compile(
     r"(?i)\b(?:symmetr\w*|mirror\w*|flip\w*|extend[xyz]?|quadrant|octant|half|scal(?:e|ed|ing)|"
     r"factor|norm[be]?|normali[sz]\w*|offsets?|shift\w*|multipl\w*|cent(?:er|re)|origin)\b")
@@ -146,7 +147,8 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     return ForeignTable(
         columns, values, where, added=len(added), texts=texts,
         comments="" if own else comments_of(preface),
-        attributes=attributes_of(preface) if own else {},
+        attributes={part[1]: part[2].strip() for _, line in preface if (
+            part := ATTRIBUTE.fullmatch(line.strip())) and part[0].isprintable()} if own else {},
         remarks=remarks if own else remarks + unused_lines(preface, columns))
 
 
@@ -248,12 +250,6 @@ def _without_empty_end(
             for cells in _splits(line, delimiter)):
         return values
     return values[:, :last]
-
-
-def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
-    """Return the attributes ``# key: value`` of a map in halbach-fe's own columns."""
-    found = (ATTRIBUTE.fullmatch(line.strip()) for _, line in preface)
-    return {part[1]: part[2].strip() for part in found if part and part[0].isprintable()}
 
 
 def unused_lines(preface: Sequence[Line], columns: Sequence[ColumnName]) -> tuple[str, ...]:

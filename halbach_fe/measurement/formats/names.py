@@ -153,7 +153,7 @@ def _other_quantity(base: str, key: str, unit: str) -> str:
     if key == "hhmmss":
         return "t"
     of = noise_of(base, key)
-    if of in POSITIONS and kind_of(unit_symbol(unit)) == "field":
+    if of in POSITIONS and kind_of(unit) == "field":
         of = f"B{of}"  # as x in T is Bx
     return "" if of is None or of in POSITIONS else f"sigma_{of}".removesuffix("_B")
 
@@ -212,7 +212,7 @@ def with_axes(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
         for index, column in enumerate(columns):
             base, unit = split_unit(column.text)
             axes = AXIS.findall(base)
-            of_kind = not column.quantity and kind_of(unit_symbol(unit)) == kind
+            of_kind = not column.quantity and kind_of(unit) == kind
             if of_kind and len(axes) == 1 and not NO_AXIS & set(_words(base)):
                 found.append((axes[0].lower(), index, unit))
         if sorted(axis for axis, *_ in found) == ["x", "y", "z"] and not known & set(quantities):

@@ -57,8 +57,8 @@ class ForeignTable:
         In the file's units; NaN if a component was not measured, or a cell is no number.
     where : str
         Name of the file in error messages.
-    length_unit, field_unit : str
-        Units of columns that state no unit of their own; empty if the file does not state them.
+    length_unit : str
+        Unit of lengths that state no unit of their own; empty if the file does not state it.
     anchor : str
         The point from which the file measures positions; empty if it is the magnet's centre.
     comments : str
@@ -77,7 +77,6 @@ class ForeignTable:
     values: Floats
     where: str
     length_unit: str = ""
-    field_unit: str = ""
     anchor: str = ""
     comments: str = ""
     texts: dict[int, dict[int, Line]] = field(default_factory=dict)
@@ -480,8 +479,7 @@ def _used(
         if len(components) == 3:
             used.setdefault(names.TOTAL, magnitude)
     if components and names.TOTAL in used and not (
-            units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit
-            or table.field_unit):
+            units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit):
         del used[names.TOTAL]  # it is not needed
     for name in declared.at:
         if name in used:
@@ -512,7 +510,7 @@ def _missing(
                 + ")"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
-                ("field", "B", declared.field_unit or table.field_unit)) if not said]
+                ("field", "B", declared.field_unit)) if not said]
     if (hint := _of_field(used, columns)) is not None:
         return [hint]
     latitude = [column.text for column in columns if names.is_latitude(column)]
@@ -564,8 +562,8 @@ def _unread_components(
     known ones lack; empty if there are no such, or if the user names the columns.
     """
     lacking = [name for name in names.FIELDS[:3] if name not in used]
-    unknown = [column.text for column in columns if not column.quantity and units.kind_of(
-        units.unit_symbol(names.split_unit(column.text)[1])) == "field"]
+    unknown = [column.text for column in columns if not column.quantity
+               and units.kind_of(names.split_unit(column.text)[1]) == "field"]
     if declared.columns or not 0 < len(lacking) < len(COMPONENTS) or len(unknown) != len(lacking):
         return ""
     return (f"whether {_quoted(unknown)} {'is' if len(lacking) == 1 else 'are'} "
@@ -597,7 +595,7 @@ def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None
     """Return what to do with x, y and z beside no field: in logs of meters they are the field."""
     kinds = {_kind(name) for name in used}
     if not {"x", "y", "z"} <= set(used) or "field" in kinds or any(
-            units.kind_of(units.unit_symbol(columns[used[name]].unit)) for name in "xyz"):
+            units.kind_of(columns[used[name]].unit) for name in "xyz"):
         return None
     stated = ["-"] * len(columns)
     for name in "xyz":
@@ -631,9 +629,7 @@ def _units(
     found: dict[str, str] = {}
     unknown = []
     foreign: dict[str, list[str]] = {}
-    option = {"length": declared.length_unit, "field": declared.field_unit,
-              "angle": declared.angle_unit, "time": ""}[kind]
-    common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
+    option = declared.unit_of(kind)
     own = sorted((name for name in used if _kind(name) == kind),
                  key=lambda name: name in names.NOISE)
     if option and not own and not missing:
@@ -642,7 +638,7 @@ def _units(
     for name in own:
         text = columns[used[name]].unit
         if units.states_no_unit(text):
-            text = common
+            text = table.length_unit if kind == "length" else ""
         if kind == "time":
             written = used[name] in table.texts or units.CLOCK.fullmatch(text) or (
                 names.is_clock(columns[used[name]]))
@@ -693,8 +689,7 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     si = _cylindrical(si, where) if "theta" in si else si
     if "r" in si:
         if {"x", "y"} & set(si):
-            raise MeasurementError(must_be("positions", where, "either x, y, z or r, phi, z",
-                                           "both", "Leave some out with --columns and -."))
+            raise _both("positions", "x, y, z or r, phi, z", where)
         angle = si["phi"]
         if np.nanmax(np.abs(angle), initial=0.0) > MOST_RAD:
             raise MeasurementError(must_be(
@@ -713,8 +708,7 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     if "Br" not in si:
         return points, np.column_stack([si.get(name, empty) for name in ("Bx", "By", "Bz")])
     if {"Bx", "By"} & set(si):
-        raise MeasurementError(must_be("components", where, "either Bx, By or Br, Bphi", "both",
-                                       "Leave some out with --columns and -."))
+        raise _both("components", "Bx, By or Br, Bphi", where)
     if "r" not in si and not np.hypot(points[:, 0], points[:, 1]).all():
         raise MeasurementError(must_be(
             "Br and Bphi", where, "at points off the axis", "some on it, where they have no "
@@ -724,12 +718,17 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
                                     si["Br"] * sin + si["Bphi"] * cos, si.get("Bz", empty)])
 
 
+def _both(what: str, either: str, where: str) -> MeasurementError:
+    """Return the error of a file that has two of what excludes each other."""
+    return MeasurementError(must_be(what, where, f"either {either}", "both",
+                                    "Leave some out with --columns and -."))
+
+
 def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
     """Return columns of spherical coordinates as those of cylindrical ones."""
     angle = si["theta"]
     if {"x", "y", "z"} & set(si):
-        raise MeasurementError(must_be("positions", where, "either x, y, z or r, theta, phi",
-                                       "both", "Leave some out with --columns and -."))
+        raise _both("positions", "x, y, z or r, theta, phi", where)
     if not (np.nanmin(angle) >= 0 and np.nanmax(angle) <= np.pi * (1 + 1e-6)):
         raise MeasurementError(must_be(
             "theta", where, "from 0 to 180 degrees, the angle from the z axis",
@@ -741,9 +740,7 @@ def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
         "r": si["r"] * sin, "z": si["r"] * cos}
     if "Btheta" in si:
         if {"Bx", "By", "Bz"} & set(si):
-            raise MeasurementError(must_be(
-                "components", where, "either Bx, By, Bz or Br, Btheta, Bphi", "both",
-                "Leave some out with --columns and -."))
+            raise _both("components", "Bx, By, Bz or Br, Btheta, Bphi", where)
         turned |= {"Br": si["Br"] * sin + si["Btheta"] * cos,
                    "Bz": si["Br"] * cos - si["Btheta"] * sin}
     return turned

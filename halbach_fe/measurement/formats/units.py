@@ -93,9 +93,9 @@ def unit_symbol(text: str) -> str:
             "⁻¹", "-1"), "")
 
 
-def kind_of(unit: str) -> str:
-    """Return the kind of a symbol (length, field, angle, time); empty if it is none."""
-    unit = unit.rpartition(" ")[2]
+def kind_of(text: str) -> str:
+    """Return the kind of a unit, one of `KINDS`, in any spelling; empty if it is none."""
+    unit = (unit_symbol(text) or text).rpartition(" ")[2]
     return next((kind for kind, members in KINDS.items() if unit in members), "")
 
 
