@@ -336,10 +336,9 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
                 imported = import_map(path, DeclaredFormat())
             except MeasurementError:
                 raise refused from None
-        units = imported.imported
         say(f"Read {path.name} as {imported.format}, with positions in "
-            f"{', '.join(units.length_units)} and B in {', '.join(units.field_units)}.")
-    for remark in imported.imported.remarks:
+            f"{', '.join(imported.length_units)} and B in {', '.join(imported.field_units)}.")
+    for remark in imported.remarks:
         say(remark)
     data = imported.data
     data.encoding["source"] = str(path)

@@ -7,6 +7,7 @@ import os
 import shlex
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ from halbach_fe.core.errors import CommandLineError, MeasurementError, must_be
 
 if TYPE_CHECKING:
     from halbach_fe.core.arrays import Floats
-    from halbach_fe.measurement.formats.files import ImportedFile
+    from halbach_fe.measurement.formats.table import ImportedMap
 
 
 def _template(parser: argparse.ArgumentParser) -> None:
@@ -200,12 +201,12 @@ def import_map(arguments: argparse.Namespace) -> int:
     corrections = {}
     if arguments.calibration:
         refuse_total_field(imported.data, "--calibration")
-        if imported.imported.cylindrical:
+        if imported.cylindrical:
             raise MeasurementError(must_be(
                 "--calibration", arguments.file.name, "beside Bx, By and Bz as the sensors read "
                 "them", "beside Br and Bphi", "Import the readings of the three sensors."))
-        before, imported = imported.data["B_T"].values, imported.with_data(
-            read_calibration(arguments.calibration).corrected(
+        before, imported = imported.data["B_T"].values, replace(
+            imported, data=read_calibration(arguments.calibration).corrected(
                 imported.data, arguments.file.name))
         corrections["largest_correction_T"] = float(
             np.nanmax(np.abs(imported.data["B_T"].values - before)))
@@ -217,13 +218,13 @@ def import_map(arguments: argparse.Namespace) -> int:
         common.print_table([{"property": key, "value": _text(value)}
                             for key, value in properties.items() if key != "remarks"],
                            f"Read as {imported.format}")
-        for remark in imported.imported.remarks:
+        for remark in imported.remarks:
             common.say(remark)
         common.say(f"Map: {arguments.output}")
     return 0
 
 
-def _properties(file: ImportedFile) -> dict[str, object]:
+def _properties(file: ImportedMap) -> dict[str, object]:
     """Return the properties of the imported map as plain data, for the user to check."""
     import numpy as np
 
@@ -237,12 +238,12 @@ def _properties(file: ImportedFile) -> dict[str, object]:
     return {
         "format": file.format, "readings": len(points),
         "components": [UNDIRECTED] if is_undirected(file.data) else list(columns),
-        "length_units": list(file.imported.length_units),
-        "field_units": list(file.imported.field_units),
-        "ignored_columns": list(file.imported.ignored),
+        "length_units": list(file.length_units),
+        "field_units": list(file.field_units),
+        "ignored_columns": list(file.ignored),
         "also_read": [name for name in ("sigma_T", "time_s", "scan") if name in file.data],
-        "remarks": list(file.imported.remarks),
-        "points_without_reading": file.imported.dropped,
+        "remarks": list(file.remarks),
+        "points_without_reading": file.dropped,
         "from_m": points.min(axis=0).tolist(), "to_m": points.max(axis=0).tolist(),
         "min_B_T": [float(np.nanmin(values)) for values in columns.values()],
         "max_B_T": [float(np.nanmax(values)) for values in columns.values()]}

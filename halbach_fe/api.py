@@ -126,7 +126,7 @@ def import_map(path: str | Path, format: str = "", **declared: object) -> xr.Dat
         raise MeasurementError(must_be("format", "hf.import_map", f"one of {', '.join(FORMATS)}",
                                        f"'{format}'"))
     found = read_foreign_map(as_path(path), stated, format)
-    if remarks := found.imported.remarks:
+    if remarks := found.remarks:
         warnings.warn(f"Of {path}: {' '.join(remarks)}", HalbachWarning, stacklevel=3)
     return found.data
 

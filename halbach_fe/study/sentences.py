@@ -78,7 +78,7 @@ WRONG_UNITS = (
     *((f"remanence{axis}_T", "kilogauss", 0.1) for axis in ("", "_x", "_y", "_z")),  # data sheets
     ("coercivity_A_per_m", "kilooersted", KILOOERSTED),
     ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
-    ("_m", "kilometres", 1e3), ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
+    ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
     ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
     ("coefficient_per_K", "the other sign", -1.0),
     ("coefficient_per_K", "per cent per kelvin and with the other sign", -1e-2),

@@ -6,6 +6,7 @@ anyone's file. The maps hold B = (0.1 + 2 y, 2 x, 0) T on the grid `POINTS`.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import magpylib
@@ -16,6 +17,7 @@ import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.measurement.field_map import points_of
+from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.page import page_of
 from tests.cli.test_cli import refused
 
@@ -153,3 +155,18 @@ def test_options_keep_the_noise_of_a_map(tmp_path):
     assert moved.posterior.mean == pytest.approx(plain.posterior.mean, rel=1e-12)
     without = hf.infer(magnet, hf.read_map(folder / "sig10.csv").drop_vars("sigma_T"))
     assert without.posterior.sd.max() < 0.9 * plain.posterior.sd.max()  # control
+
+
+def test_the_field_where_the_gain_of_the_probe_is_not_known():
+    """A map times 1.02, with a gain that is known to 2 %: 381.5 ± 2.9 mT, of 378.6 mT. Negative
+    control: the reading, 386.1 mT, which was given as the field with a bar of 0.03 mT.
+    """
+    folder = CASES / "instrument_sd_headline"
+    data = hf.read_map(folder / "a_holes.csv")
+    true = 1e3 * float(data["B_T"].values.max())
+    result = hf.infer(hf.build_magnet(hf.read_study(folder / "single2.toml")),
+                      data.assign(B_T=1.02 * data["B_T"]))
+    value, bar = map(float, re.search(
+        r"Bx at \(33.33, 0, 0\) mm, is ([\d.]+)\s±\s([\d.]+) mT", answer(result).said).groups())
+    assert (value, bar) == pytest.approx((381.5, 2.9), abs=0.06)
+    assert abs(value - true) < bar < abs(1.02 * true - true)

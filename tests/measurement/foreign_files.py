@@ -372,7 +372,7 @@ FILES = [
             ("--skip-lines",)),
     Foreign("Poisson, T7 with the grid above", "2DMagnetoStatic ZX\n-2 2 4\n0.2 1.0 14\n" + table(
         " ", FIELD[:, [2, 0]].T), {"skip_lines": 3, "columns": ("Bz[T]", "Bx[T]"),
-                                  "positions": True}, ("with it, --skip-lines 3",),
+                                  "positions": True}, ("add --skip-lines 3",),
             field=FIELD * [1, np.nan, 1]),
     Foreign("OPAL", "3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + table(" ", FIELD.T), {
         "skip_lines": 4, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
@@ -424,4 +424,22 @@ FILES = [
     Foreign("the middle twice", "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T]\n" + table(",")
             + "0,0,0,0.1,1e-6,0.05\n", points=np.vstack([POINTS, [[0, 0, 0]]]),
             field=np.vstack([FIELD, [[0.1, 1e-6, 0.05]]])),
+    Foreign("a word before the names", "### Map 7\n### Coordinates: x (mm), y (mm), z (mm), "
+            "Bx (T), By (T), Bz (T)\n" + table(" ")),
+    Foreign("Mathematica, lists without blanks", "".join(
+        f"{{{{{x:g},{y:g},{z:g}}},{{{a:.12g},{b:.12g},{c:.12g}}}}}\n"
+        for x, y, z, a, b, c in np.column_stack(mm_T())), {**MM_T_OPTIONS, "columns": SIX}, BARE),
+    Foreign("counts and limits above the rows", "45\n3 3 5\n-0.01 0.01\n-0.01 0.01\n-0.02 0.02\n"
+            + table(" ", M_T), {"skip_lines": 5, "length_unit": "m", "field_unit": "T",
+                                "columns": SIX}, ("From line 6 on", "--skip-lines 5")),
+    Foreign("Ansys, complex H", 'X, Y, Z, Complex Vector data "<Hx,Hy,Hz>"\n' + table(" ", [
+        *M_T[:3], *(column for of_h in FIELD.T for column in (of_h / (4e-7 * np.pi), 0 * of_h))]), {
+            "columns": ("x[m]", "y[m]", "z[m]", "Hx[A/m]", "-", "Hy[A/m]", "-", "Hz[A/m]", "-")},
+        ("of 9 names", "--columns")),
+    Foreign("volts at a place above them", "X = 0.01 +/- 0.004 \t Y = 0.02 +/- 0.005\n\ntime [s]\t"
+            "Strip_V\tXfield_V\tYfield_V\tZfield_V\n" + table("\t", [
+                LINE[:, 2], LENGTH, *(10 * FIELD.T)]), {
+            "columns": ("t[s]", "-", "Bx[0.1 T]", "By[0.1 T]", "Bz[0.1 T]"),
+            "at": {"x": 0.01, "y": 0.02, "z": 0.0}}, ("nothing is known of 'Strip_V'", "Xfield_V"),
+            0 * POINTS + [0.01, 0.02, 0.0]),
 ]

@@ -169,7 +169,7 @@ def test_cylindrical_meshes(tmp_path, angles):
     found = import_map(path, DeclaredFormat())
     np.testing.assert_allclose(points_of(found.data), points, atol=1e-15)
     np.testing.assert_allclose(found.data["B_T"], field, atol=1e-15)
-    assert any("rotational symmetry" in said for said in found.imported.remarks) == (angles == 1)
+    assert any("rotational symmetry" in said for said in found.remarks) == (angles == 1)
 
 
 @pytest.mark.parametrize(("changes", "asked"), [

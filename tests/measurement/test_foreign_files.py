@@ -100,6 +100,14 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("x[mm],y[mm],z[mm],dB0[ppm]\n0,0,0,12\n", r"\(1 \+ ppm / 1e6\) times"),
     ("z,z,z,z,z,Bx\n" + "0,0,0,0,0,1\n" * 2, "'z' or 'z' or 'z' or 2 more"),
     (",-10,0,10\n-10,1,2,3\n0,1,2,3\n10,1,2,3\n", "matrix .* a row x, y, B"),
+    ("Y columns by X rows\n\nX Values:-1,0,1\n\n" + "1.5,2.5,1.5,2.5,1,3,2,2,1,1,2,3,9,\n" * 2,
+     "matrix over two axes"),
+    (",".join(f"log {n}" for n in range(40)) + "\n" + (",".join(["1"] * 40) + "\n") * 2,
+     "'log 11' and 28 more"),
+    ("1 0.5\n2 0.6\n", "--columns z,Bz and --at x=0,y=0; .* --columns Bx,By and --positions"),
+    ("Distance [mm],Bx[T],By[T],Bz[T]\n1,0,0,1\n", "nothing is known of 'Distance .mm.'"),
+    ("".join(f"run {n}\n1 2\n3 4\n5 6 7\n" for n in range(4)), "tables are below each other"),
+    (HEADER + "1,2,3,0,0,1\n,,,0,0,2\n", "If the row is no reading, remove it"),
     ('[{"x": 0, "y": 0, "z": 0, "Bx": 0.1}]', "x, y, z, Bx, By, Bz of numbers for each point"),
 ], ids=str)
 def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
@@ -204,7 +212,7 @@ def test_points_far_away_say_what_can_be_followed(tmp_path, unit, stated, advice
     path = tmp_path / "file.txt"
     path.write_text(f"x[{unit}],y[{unit}],z[{unit}],Bx[T],By[T],Bz[T]\n" + table(","))
     found = import_map(path, DeclaredFormat(**stated))
-    assert re.search(advice, found.imported.remarks[-1])
+    assert re.search(advice, found.remarks[-1])
     followed = {"columns": TRIPLE} if unit else {"length_unit": "mm"}
     assert same(import_map(path, DeclaredFormat(**followed)).data)
 
@@ -219,7 +227,7 @@ def test_what_states_no_length_is_not_sent_to_its_unit(tmp_path, name, stated, a
         write_map(field_map(1e3 * POINTS, FIELD), path)
     else:
         path.write_text("phi[deg],Br[T],Bphi[T]\n0,0.1,0.1\n90,0.2,0.1\n")
-    assert re.search(advice, import_map(path, DeclaredFormat(**stated)).imported.remarks[-1])
+    assert re.search(advice, import_map(path, DeclaredFormat(**stated)).remarks[-1])
     with pytest.raises(MeasurementError):
         import_map(path, DeclaredFormat(**stated, length_unit="mm"))
 
@@ -273,7 +281,7 @@ def test_a_centre_in_a_comment_says_how_to_use_it(tmp_path):
                     "# X[mm],Y[mm],Z[mm],B0_x[T],B0_y[T],B0_z[T]\n" + table(",", [
                         lab[0] + 100, lab[1] + 200, lab[2] - 50, *lab[3:]]))
     found = import_map(path, DeclaredFormat())
-    assert "--origin-m=-0.1,-0.2,0.05," in found.imported.remarks[0]
+    assert "--origin-m=-0.1,-0.2,0.05," in found.remarks[0]
     assert not same(found.data)
     assert same(import_map(path, DeclaredFormat(origin_m=(-0.1, -0.2, 0.05))).data)
 
@@ -284,7 +292,7 @@ def test_the_header_is_overridden_and_that_is_said(tmp_path):
     found = import_map(path, DeclaredFormat(columns=(
         "x[mm]", "y[mm]", "z[mm]", "Bx[T]", "By[T]", "Bz[T]")))
     assert same(found.data)
-    assert len(found.imported.remarks) == 6
+    assert len(found.remarks) == 6
     with pytest.raises(MeasurementError, match="cm in the file and --length-unit mm"):
         import_map(path, DeclaredFormat(length_unit="mm"))
 

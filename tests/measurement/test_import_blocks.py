@@ -74,14 +74,32 @@ def test_all_that_is_missing_in_one_message(tmp_path):
         imported(tmp_path, "ring;slot;Jx;Jy;Jz\n1;1;1;0;0\n")
     for asked in ("serial", "sigma", "the volume", "the unit of polarization_x"):
         assert asked in str(caught.value)
-    with pytest.raises(MeasurementError, match="names two of them"):
-        imported(tmp_path, "a;b;c\n1;2;3\n")
+    for text in ("a;b;c\n1;2;3\n", '{"magnets": [{"shape": "cube"}]}\n'):
+        with pytest.raises(MeasurementError, match=r"names two of them.*write it as CSV"):
+            imported(tmp_path, text)
     with pytest.raises(MeasurementError, match="a number"):
         imported(tmp_path, "id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;1;x;0;0\n",
                  fixed={"sigma": "0.1 %"})
     with pytest.raises(MeasurementError, match="add --decimal-comma"):
         imported(tmp_path, "id;ring;slot;mx [A m^2];my [A m^2];mz [A m^2]\nA;1;1;0,5;0;0\n",
                  fixed={"sigma": "0.1 %"})
+
+
+def test_a_table_below_its_counts_and_turns_named_after_their_axis(tmp_path):
+    """It is read as the refusal advises, and asks for the unit of the turns."""
+    text = "2 4\n# name, X-pos, Y-pos, Z-pos, X-rot, Y-rot, Z-rot, J\n" + "".join(
+        f"m{n},{n},0,0,0,0,{90 * n},1.3\n" for n in (1, 2))
+    declared = {"length_unit": "cm", "field_unit": "T", "fixed": {
+        "shape": "cuboid", "size_x": "3 mm", "size_y": "3 mm", "size_z": "3 mm"}}
+    with pytest.raises(MeasurementError, match="unit of rotation_x, rotation_y, rotation_z"):
+        imported(tmp_path, text, **declared)
+    assert imported(tmp_path, text, angle_unit="deg", **declared).rotation_z_deg == (90.0, 180.0)
+    columns = ("serial", "at_x", "at_y", "at_z", "-", "-", "-", "polarization")
+    bare = text.partition("# name")[0] + text.partition("J\n")[2]
+    with pytest.raises(MeasurementError, match=r"line 1 .* 8 cells.* add --skip-lines 1\."):
+        imported(tmp_path, bare, columns=columns, **declared)
+    found = imported(tmp_path, bare, columns=columns, skip_lines=1, **declared)
+    assert found.x_m == (0.01, 0.02)
 
 
 def test_what_is_missing_is_asked_for_in_one_option(tmp_path):

@@ -68,8 +68,8 @@ def said(tmp_path, text, **declared):
     (" ", "Hall map of magnet 3\n# probe: 7 cm, of x, y\nX Y Z Bx By Bz\n# mm mm mm mT mT mT")])
 def test_headers_say_columns_and_units(tmp_path, separator, header):
     found = imported(tmp_path, f"{header}\n{rows(separator)}")
-    assert (found.format, found.imported.ignored) == ("columns", ())
-    assert found.imported.length_units == ("mm",)
+    assert (found.format, found.ignored) == ("columns", ())
+    assert found.length_units == ("mm",)
     assert same(found)
     assert not same(found, POINTS[:, [1, 0, 2]])
     assert not same(found, field=FIELD[:, [1, 0, 2]])
@@ -82,7 +82,7 @@ def test_columns_in_another_order_and_others_beside_them(tmp_path):
                    for n, (p, b) in enumerate(zip(POINTS, FIELD, strict=True)))
     found = imported(tmp_path, header + body)
     assert same(found)
-    assert found.imported.ignored == ("n", "time", "|B|")
+    assert found.ignored == ("n", "time", "|B|")
 
 
 def test_columns_of_text(tmp_path):
@@ -91,7 +91,7 @@ def test_columns_of_text(tmp_path):
     body = [f"s{n};12:30:{n:02d};{line}" for n, line in enumerate(rows(";").splitlines())]
     found = imported(tmp_path, header + "\n".join(body))
     assert same(found)
-    assert found.imported.ignored == ()
+    assert found.ignored == ()
     assert found.data["scan"].values.tolist() == [f"s{n}" for n in range(24)]
     assert found.data["time_s"].values.tolist() == list(range(24))
     spoilt = [*body[:7], body[7].rpartition(";")[0] + ";OVERLOAD", *body[8:]]
@@ -231,7 +231,7 @@ def test_an_unknown_encoding(tmp_path):
 
 def test_points_without_a_reading_are_left_out(tmp_path):
     found = imported(tmp_path, "x[m],y[m],z[m],Bx[T],Bz[T]\n0,0,0,,\n0,0,1,1,\n0,0,2,nan,NaN\n")
-    assert (found.data.sizes["point"], found.imported.dropped) == (1, 2)
+    assert (found.data.sizes["point"], found.dropped) == (1, 2)
 
 
 def test_cylindrical_columns(tmp_path):

@@ -68,9 +68,9 @@ def test_columns_of_noise(tmp_path, header, expected):
     rows = "".join(f"0;0;{n};{';'.join(['100'] * len(components))};{factor}\n" for n in range(3))
     found = imported(tmp_path, ";".join(names) + "\n" + rows)
     np.testing.assert_allclose(found.data["sigma_T"], [factor * np.array(expected)] * 3)
-    assert found.imported.ignored == ()
+    assert found.ignored == ()
     assert any(f"'{header}'" in said and "standard deviation" in said
-               for said in found.imported.remarks)
+               for said in found.remarks)
     without = imported(tmp_path, ";".join(names) + "\n" + rows, columns=(
         "x", "y", "z", *components, "-"))
     assert "sigma_T" not in without.data
@@ -80,8 +80,8 @@ def test_columns_of_noise(tmp_path, header, expected):
 def test_other_columns_are_no_noise(tmp_path, name):
     found = imported(tmp_path, f"x[mm];y[mm];z[mm];Bx[mT];{name}\n0;0;1;100;1\n0;0;2;90;1\n")
     assert "sigma_T" not in found.data
-    assert found.imported.ignored == (name,)
-    assert any("noise.position_sd_m" in said for said in found.imported.remarks) == (
+    assert found.ignored == (name,)
+    assert any("noise.position_sd_m" in said for said in found.remarks) == (
         name == "x_err")
 
 
@@ -103,7 +103,7 @@ def test_noise_of_cylindrical_components(tmp_path):
     both = np.sqrt(0.5 * (0.1**2 + 0.2**2))
     np.testing.assert_allclose(found.data["sigma_T"][:, :2].values * 1e3, [
         [0.1, 0.2], [0.2, 0.1], [both, both]])
-    assert "were independent" in " ".join(found.imported.remarks)
+    assert "were independent" in " ".join(found.remarks)
 
 
 @pytest.mark.parametrize(("cells", "seconds"), [
@@ -134,7 +134,7 @@ def test_hhmmss(tmp_path):
     assert timed(tmp_path, "time", cells, columns=columns).data["time_s"].values.tolist() == right
     unstated = timed(tmp_path, "time", cells)
     assert "time_s" not in unstated.data
-    assert "they look like HHMMSS" in " ".join(unstated.imported.remarks)
+    assert "they look like HHMMSS" in " ".join(unstated.remarks)
     for header, declared in (("time [s]", {}), ("time", {"columns": ("t[s]", *columns[1:])})):
         with pytest.raises(MeasurementError, match=r"t\[hhmmss\]"):
             timed(tmp_path, header, cells, **declared)
@@ -176,15 +176,15 @@ def test_a_part_of_a_g4beamline_map_is_called_a_part(tmp_path):
     assert (found.format, len(points)) == ("g4beamline", 20)
     np.testing.assert_allclose(field[:, 0], 0.1 + 2 * points[:, 1], atol=1e-12)
     np.testing.assert_allclose(field[:, 1], 2 * points[:, 0], atol=1e-12)
-    said, = found.imported.remarks
+    said, = found.remarks
     assert "only a part, x from 0 to 10 mm" in said
     assert "By and Bz reversed" in said
     assert "no field without sources" not in said
-    assert imported(tmp_path, quadrant("")).imported.remarks == ()
-    impossible, = imported(tmp_path, quadrant("extendX flip=Bx,By\n")).imported.remarks
+    assert imported(tmp_path, quadrant("")).remarks == ()
+    impossible, = imported(tmp_path, quadrant("extendX flip=Bx,By\n")).remarks
     assert "no field without sources" in impossible
     assert len(imported(tmp_path, quadrant("extendX flip=Bx\nextendY flip=By\n"
-                                           "extendZ flip=Bz\n")).imported.remarks) == 3
+                                           "extendZ flip=Bz\n")).remarks) == 3
 
 
 def test_g4beamline_scale_and_current(tmp_path):
@@ -192,8 +192,8 @@ def test_g4beamline_scale_and_current(tmp_path):
     found = imported(tmp_path, quadrant("", head))
     plain = imported(tmp_path, quadrant(""))
     np.testing.assert_allclose(found.data["B_T"], 1e-4 * plain.data["B_T"], rtol=1e-12)
-    assert ["normB=0.0001" in found.imported.remarks[0],
-            "current 5" in found.imported.remarks[1]] == [True, True]
+    assert ["normB=0.0001" in found.remarks[0],
+            "current 5" in found.remarks[1]] == [True, True]
 
 
 @pytest.mark.parametrize(("old", "new", "asked"), [
@@ -213,8 +213,8 @@ def test_a_cylinder_of_g4beamline(tmp_path):
     found = imported(tmp_path, text)
     np.testing.assert_allclose(points_of(found.data)[1], [0.01, 0, 0])
     np.testing.assert_allclose(found.data["B_T"][1], [0.1, np.nan, 0.5])
-    assert "-z the field is the same with Br reversed" in found.imported.remarks[0]
-    assert "half-plane" in found.imported.remarks[1]
+    assert "-z the field is the same with Br reversed" in found.remarks[0]
+    assert "half-plane" in found.remarks[1]
 
 
 def test_bdsim_maps_are_read_as_they_are_written(tmp_path):
@@ -230,7 +230,7 @@ def test_bdsim_maps_are_read_as_they_are_written(tmp_path):
     np.testing.assert_allclose(points_of(found.data)[order], points, atol=1e-15)
     np.testing.assert_array_equal(found.data["B_T"].values[order], field)
     text = path.read_text()
-    assert not found.imported.remarks
+    assert not found.remarks
     for old, new, asked in (
             ("nx> 2", "nx> 3", "18 points"), ("Fz", "t", "does not change"),
             ("nx> 2\n", "nx> -2\nny> -3\n", "0 points"),
@@ -240,7 +240,7 @@ def test_bdsim_maps_are_read_as_they_are_written(tmp_path):
         with pytest.raises(MeasurementError, match=asked):
             import_map(path, DeclaredFormat())
     path.write_text(text.replace("xyzt", "tzyx"))  # BDSIM would give the readings to other points
-    assert "order" in import_map(path, DeclaredFormat()).imported.remarks[0]
+    assert "order" in import_map(path, DeclaredFormat()).remarks[0]
 
 
 @pytest.mark.parametrize(("line", "told"), [
@@ -248,7 +248,7 @@ def test_bdsim_maps_are_read_as_they_are_written(tmp_path):
     ("% MAGNET CENTER IN LAB: x 100.00 mm", True), ("# probe 3", False)])
 def test_lines_that_may_change_the_numbers_are_told(tmp_path, line, told):
     found = imported(tmp_path, f"{line}\nx[mm];y[mm];z[mm];Bx[mT]\n0;0;1;100\n")
-    assert any(line[:40] in said for said in found.imported.remarks) == told
+    assert any(line[:40] in said for said in found.remarks) == told
 
 
 def test_units_and_variables_of_own_hdf5_are_not_ignored(tmp_path):
@@ -272,15 +272,15 @@ def test_a_header_with_norm_is_used(tmp_path):
     head = ("% Model: a.mph\n% Dimension: 3\n% Length unit: mm\n"
             "% x  y  z  mf.Bx (mT)  mf.normB (mT)\n")
     rows = "0 0 -10 731 731.1\n0 0 0 730 730.1\n0 0 10 731 731.1\n"
-    assert not any("nothing" in said for said in imported(tmp_path, head + rows).imported.remarks)
-    said = imported(tmp_path, "% divided by a factor of 2\n" + head + rows).imported.remarks
+    assert not any("nothing" in said for said in imported(tmp_path, head + rows).remarks)
+    said = imported(tmp_path, "% divided by a factor of 2\n" + head + rows).remarks
     assert any("factor of 2" in each for each in said)
 
 
 @pytest.mark.parametrize("unit", ["C", "°C", "degC", "K"])
 def test_a_temperature_is_no_time(tmp_path, unit):
     table = "x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT],T[{}]\n0,0,0,7,1,1,20\n0,0,10,7,1,1,25\n"
-    stated, bare = (imported(tmp_path, text).imported.remarks
+    stated, bare = (imported(tmp_path, text).remarks
                     for text in (table.format(unit), table.replace("[{}]", "")))
     assert not any("times" in said for said in stated)
     assert any("times" in said for said in bare)

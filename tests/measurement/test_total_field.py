@@ -114,7 +114,7 @@ def test_a_magnitude_beside_all_components_is_kept(tmp_path):
     (tmp_path / "hall.txt").write_text("x [m],y [m],z [m],Bx [T],B [T]\n0,0,0,0.3,0.5\n")
     found = import_map(tmp_path / "hall.txt", DeclaredFormat())
     assert "Babs_T" not in found.data
-    assert found.imported.ignored == ("B [T]",)
+    assert found.ignored == ("B [T]",)
 
 
 def test_the_command_imports_the_magnitude(tmp_path, capsys):

@@ -15,6 +15,9 @@ from scipy.integrate import simpson
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.measurement.field_map import points_of
+from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.files import import_map
 from halbach_fe.response.field_on_lines import Lines, field_on_lines
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -413,6 +416,16 @@ def test_command(tmp_path, capsys):
     assert main(["export", str(tmp_path / "out/field_map.csv"), "--format", "bdsim", "-o",
                  str(tmp_path / "map.dat")]) == 0
     assert "nz> 51" in (tmp_path / "map.dat").read_text()
+    through = ["field", words[1], "--from-m", "0.04", "0", "-0.031", "--to-m", "0.04", "0", "0.031",
+               "--across-m", "0.003", "0.003", "--lines", "3", "--count", "21", "-o",
+               str(tmp_path / "through")]
+    assert main(through) == 3  # unless it is asked for
+    assert main([*through, "--inside"]) == 0
+    assert main(["export", str(tmp_path / "through/field_map.csv"), "--format", "bdsim", "-o",
+                 str(tmp_path / "through.dat")]) == 0
+    again = import_map(tmp_path / "through.dat", DeclaredFormat()).data
+    np.testing.assert_allclose(again["B_T"], source.getB(points_of(again)), atol=1e-9)
+    assert again["B_T"].values[:, 0].max() > 0.8  # inside, where mu_0 H points the other way
     assert main([*words, "--across-m", "0.001", "0", "--lines", "1"]) == 3
     assert "--lines of the command line must be at least 2" in capsys.readouterr().err
     assert main([*words, "--across-m", "0.001", "0", "--lines", "2", "--count", "11"]) == 0

@@ -125,8 +125,4 @@ def lines(grid: Grid) -> Iterator[str]:
         yield f"{name}max> {PER_M * float(axis[-1])!r}"
     yield "loopOrder> xyzt"
     yield "! X Y Z Fx Fy Fz"
-    xs, ys, zs = (axis.tolist() for axis in grid.axes)
-    for k, z in enumerate(zs):
-        for j, y in enumerate(ys):
-            for x, field in zip(xs, grid.field[:, j, k].tolist(), strict=True):
-                yield " ".join(repr(value) for value in (PER_M * x, PER_M * y, PER_M * z, *field))
+    yield from grid.rows(PER_M, x_fastest=True)

@@ -62,7 +62,7 @@ WORDS = {word: name for name, words in _WORDS.items() for word in words.split()}
         "at": ("{}", "x{}", "pos{}", "{}pos", "position{}", "center{}", "centre{}", "{}center",
                "{}centre", "{}c"),
         "size": ("size{}", "{}size", "d{}", "l{}", "dim{}", "length{}"),
-        "rotation": ("rotation{}", "rot{}", "r{}", "rotvec{}"),
+        "rotation": ("rotation{}", "rot{}", "{}rot", "r{}", "rotvec{}"),
         "moment": ("m{}", "moment{}"), "polarization": (
             "j{}", "br{}", "remanence{}", "polarization{}", "b{}"),
         "magnetization": ("magnetization{}", "mag{}")}.items() for spelling in spellings} | {
@@ -179,7 +179,8 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         one.count(mark) for mark in ",;\t")), declared)
     rows = [(number, cells_of(uncommented(line) if is_comment(line) else line, delimiter),
              is_comment(line)) for number, line in lines]
-    start = next((n for n, (_, cells, _) in enumerate(rows) if _names(cells)), -1)
+    start = next((n for n, (_, cells, _) in enumerate(rows)
+                  if sum(bool(quantity_of(cell)[0]) for cell in cells) > 1), -1)
     own = rows[start][1] if start >= 0 else []
     body = [(number, cells) for number, cells, comment in rows[start + 1:] if not comment]
     below = [cell.strip("[]() ") for cell in body[0][1]] if body else []
@@ -190,8 +191,10 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
     header = _header(own, below, declared, where)
     for number, cells in body:
         if len(cells) != len(header):
-            raise MeasurementError(must_be(f"line {number}", where, f"of {len(header)} cells, as "
-                                           "the header", str(len(cells))))
+            raise MeasurementError(must_be(
+                f"line {number}", where, f"of {len(header)} cells, as the header", str(len(cells)),
+                "Remove it, or begin it with #; if the table begins below it, name the columns by "
+                f"--columns, and add --skip-lines {number}."))
     if not body:
         raise MeasurementError(must_be("content", where, "at least one block", "none"))
     table, unit = _columns(header, [cells for _, cells in body], declared, where)
@@ -213,7 +216,8 @@ def _header(
     if not own and not declared.columns:
         raise MeasurementError(must_be("header", where, f"made of {', '.join(QUANTITIES)}",
                                        "no line that names two of them",
-                                       "State the columns by --columns."))
+                                       "State the columns by --columns; if it is no table, write "
+                                       "it as CSV with a header."))
     header = [quantity_of(text) if text != "-" else ("", "") for text in declared.columns or own]
     if unknown := [text for text, (name, _) in zip(declared.columns, header, strict=False)
                    if text != "-" and not name]:
@@ -235,8 +239,7 @@ def _same_unit(name: str, one: str, other: str) -> bool:
     """Tell whether two texts are one unit of a quantity."""
     if name == "temperature":
         return (one in KELVIN) == (other in KELVIN)
-    return name not in KIND or (units.unit_symbol(one) or one) == (
-        units.unit_symbol(other) or other)
+    return name not in KIND or _symbol(one) == _symbol(other)
 
 
 def _columns(
@@ -268,22 +271,20 @@ def _with_stated(
     unit: dict[str, str], declared: DeclaredBlocks, where: str
 ) -> dict[str, str]:
     """Return the units by their symbols, those that the user states of a kind where none is."""
-    stated = {"length": declared.length_unit, "field": declared.field_unit,
-              "angle": declared.angle_unit}
-    for kind, said in stated.items():
-        own = {units.unit_symbol(one) or one for name, one in unit.items()
-               if KIND.get(name) == kind}
-        if said and "" not in own and own != {units.unit_symbol(said) or said}:
+    for kind in ("length", "field", "angle"):
+        said = declared.unit_of(kind)
+        own = {_symbol(one) for name, one in unit.items() if KIND.get(name) == kind}
+        if said and "" not in own and own != {_symbol(said)}:
             raise MeasurementError(must_be(
                 f"--{kind}-unit", where, "of a column that does not state its unit itself",
                 f"'{said}', which no column needs", "Leave it out."))
-    return {name: units.unit_symbol(said) or said or stated.get(KIND.get(name, ""), "")
+    return {name: _symbol(said) or declared.unit_of(KIND.get(name, ""))
             for name, said in unit.items()}
 
 
-def _names(cells: Sequence[str]) -> bool:
-    """Return whether cells are a header: two of them name quantities."""
-    return sum(bool(quantity_of(cell)[0]) for cell in cells) > 1
+def _symbol(text: str) -> str:
+    """Return the symbol of a unit, or the text if it is none."""
+    return units.unit_symbol(text) or text
 
 
 def quantity_of(text: str) -> tuple[str, str]:
@@ -298,7 +299,7 @@ def quantity_of(text: str) -> tuple[str, str]:
                 break
     key = re.sub(r"[\s_.|-]", "", base.lower())
     name = base if base in QUANTITIES else WORDS.get(key, "")
-    if name.startswith("moment") and units.kind_of(units.unit_symbol(unit)) == "field":
+    if name.startswith("moment") and units.kind_of(unit) == "field":
         name = name.replace("moment", "magnetization")  # Mx in A/m
     return name, unit.strip()
 

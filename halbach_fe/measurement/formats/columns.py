@@ -48,15 +48,18 @@ from halbach_fe.measurement.formats.units import in_si, kind_of, unit_symbol
 
 MARKED = re.compile(r"(?i)^(variables\s*=|[;*$]\s)\s*|\s\*$")
 """What stands before a header: of Tecplot, of MAD-X, and of comments in other programs."""
+LEAD = re.compile(r"[^\W\d_]{3,20}:\s+(?=\S)")
+"""A word before a header: Coordinates: x (mm), y (mm)."""
 VECTOR = re.compile(r"(?i)vector data\W*b(_vector|x)?\b")
 SCALAR = re.compile(r"(?i)scalar data\b.*\bMag_?B\b.*")
 RECOGNIZED = 2
 """Smallest number of recognized names in a header. Fewer may be words of a sentence."""
 OWN_COLUMNS = frozenset((*POSITION_COLUMNS, *FIELD_COLUMNS, *SIGMA_COLUMNS, *OTHER_COLUMNS))
 ATTRIBUTE = re.compile(r"#\s*([^:\s][^:]{0,99}?)\s*:\s*(.*)")
+"""An attribute of a map in halbach-fe's own columns: # key: value."""
 MEANING = re.compile(
     r"(?i)\b(?:symmetr\w*|mirror\w*|flip\w*|extend[xyz]?|quadrant|octant|half|scal(?:e|ed|ing)|"
-    r"factor|norm[be]?|normali[sz]\w*|offsets?|multipl\w*|cent(?:er|re)|origin)\b")
+    r"factor|norm[be]?|normali[sz]\w*|offsets?|shift\w*|multipl\w*|cent(?:er|re)|origin)\b")
 """Words of a line above the table that may change the meaning of its numbers."""
 CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+"
                     r"y[\s=:]{0,3}([-+\d.e]+)\s*(\w+)?\W+z[\s=:]{0,3}([-+\d.e]+)\s*(\w+)")
@@ -144,7 +147,8 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
     return ForeignTable(
         columns, values, where, added=len(added), texts=texts,
         comments="" if own else comments_of(preface),
-        attributes=attributes_of(preface) if own else {},
+        attributes={part[1]: part[2].strip() for _, line in preface if (
+            part := ATTRIBUTE.fullmatch(line.strip())) and part[0].isprintable()} if own else {},
         remarks=remarks if own else remarks + unused_lines(preface, columns))
 
 
@@ -246,12 +250,6 @@ def _without_empty_end(
             for cells in _splits(line, delimiter)):
         return values
     return values[:, :last]
-
-
-def attributes_of(preface: Sequence[Line]) -> dict[str, str]:
-    """Return the attributes ``# key: value`` of a map in halbach-fe's own columns."""
-    found = (ATTRIBUTE.fullmatch(line.strip()) for _, line in preface)
-    return {part[1]: part[2].strip() for part in found if part and part[0].isprintable()}
 
 
 def unused_lines(preface: Sequence[Line], columns: Sequence[ColumnName]) -> tuple[str, ...]:
@@ -363,7 +361,8 @@ def _splits(line: str, delimiter: str | None) -> list[list[str]]:
     marks = [mark for mark in (delimiter, ",", ";", "\t", " |", " * ") if mark and mark in text]
     split = [[cell.strip() for cell in text.split(mark)] if mark[0] == " " else cells_of(text, mark)
              for mark in dict.fromkeys(marks)]
-    return [_spaced(text), *split] if delimiter is None else [*split, _spaced(text)]
+    split = [_spaced(text), *split] if delimiter is None else [*split, _spaced(text)]
+    return [*(_splits(text[lead.end():], delimiter) if (lead := LEAD.match(text)) else ()), *split]
 
 
 def _with_vector(cells: list[str]) -> list[str]:
@@ -392,10 +391,16 @@ def _spaced(text: str) -> list[str]:
 def _refuse_other_length(
     line: str, number: int, count: int, delimiter: str | None, where: str
 ) -> None:
-    """Raise MeasurementError for a header with another number of names than there are columns."""
-    for cells in map(_with_vector, _splits(line, delimiter)):
+    """Raise MeasurementError for a header with another number of names than there are columns.
+
+    No header is what has numbers, far fewer words, or as many names if it is split otherwise.
+    """
+    splits = [_with_vector(cells) for cells in _splits(line, delimiter)]
+    if is_comment(line) or any(len(cells) == count or numbers_among(cells) for cells in splits):
+        return
+    for cells in splits:
         known = [names.parse(cell).quantity for cell in cells]
-        if not is_comment(line) and sum(map(bool, known)) > RECOGNIZED and len(cells) != count:
+        if sum(map(bool, known)) > RECOGNIZED and 2 * len(cells) >= count:
             raise MeasurementError(must_be(
                 f"header in line {number}", where, f"of {count} names, as there are columns",
                 str(len(cells)), "State what separates them by --delimiter, correct the header, or "

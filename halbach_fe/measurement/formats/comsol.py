@@ -22,6 +22,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats import columns, names
 from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.grid import points_on
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import (
@@ -117,8 +118,7 @@ def _grid_points(
         raise MeasurementError(must_be("content", where, " x ".join(str(len(a)) for a in axes)
                                        + " points, as its grid says", "fewer",
                                        "Is the file cut short?"))
-    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    return points_on(axes)
 
 
 def _listed_points(

@@ -71,6 +71,10 @@ class DeclaredFormat:
     delimiter: str = ""
     positions: Path | None = None
 
+    def unit_of(self, kind: str) -> str:
+        """Return the unit of all columns of a kind, of `units.KINDS`; empty if none is stated."""
+        return str(getattr(self, f"{kind}_unit", ""))
+
     @classmethod
     def of(cls, given: Mapping[str, object], where: str) -> Self:
         """Return the statements of a user of the Python interface.
@@ -96,7 +100,7 @@ class DeclaredFormat:
         """Return what each statement must be that has a value of no meaning."""
         wrong = {f"{kind}_unit": f"one of {', '.join(KINDS[kind])}, or a factor and one of them"
                  for kind, unit in (("length", self.length_unit), ("field", self.field_unit))
-                 if unit and kind_of(unit_symbol(unit)) != kind}
+                 if unit and kind_of(unit) != kind}
         for name, value, known in (
                 ("angle_unit", self.angle_unit, ANGLES), ("delimiter", self.delimiter, DELIMITERS),
                 ("component", self.component, (*"xyz", "abs", UNKNOWN))):

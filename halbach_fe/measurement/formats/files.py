@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,19 +22,18 @@ from halbach_fe.measurement.field_map import (
     warn_of_left_out,
     warn_of_millimetres,
 )
-from halbach_fe.measurement.formats import (
-    bdsim,
-    columns,
-    comsol,
-    g4beamline,
-    geant4,
-    openpmd,
-    opera,
-)
+from halbach_fe.measurement.formats import bdsim, columns, comsol, g4beamline, openpmd, opera
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
-from halbach_fe.measurement.formats.grid import Grid, grid_of, implied_format, read_fluka, read_srw
+from halbach_fe.measurement.formats.grid import (
+    Grid,
+    grid_of,
+    is_fluka,
+    is_srw,
+    read_fluka,
+    read_srw,
+)
 from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
-from halbach_fe.measurement.formats.text import lines_of, text_of_table
+from halbach_fe.measurement.formats.text import Line, lines_of, text_of_table
 from halbach_fe.measurement.formats.units import unit_symbol
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
@@ -43,9 +42,13 @@ READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(
               read_srw, read_fluka), strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
+RECOGNIZED: dict[str, Callable[[Sequence[Line]], bool]] = {
+    "comsol": comsol.is_comsol, "g4beamline": g4beamline.is_g4beamline, "bdsim": bdsim.is_bdsim,
+    "srw": is_srw, "fluka": is_fluka, "opera": opera.is_opera}
+"""Whether the first lines of a file are of a format."""
 GRIDS: dict[str, Callable[[Grid], bytes]] = {
     "openpmd": openpmd.content, "bdsim": lambda grid: _joined(bdsim.lines(grid)),
-    "geant4": lambda grid: _joined(geant4.lines(grid))}
+    "geant4": lambda grid: _joined(opera.lines(grid))}
 """Writers of the formats that need a regular grid."""
 SUFFIXES = {"csv": (".csv",), "vtu": (".vtu",), "openpmd": (".h5", ".hdf5")}
 """Suffixes of the formats that have a usual one."""
@@ -55,24 +58,7 @@ MAX_NAME = 255
 """Largest number of characters of a file name in the attributes of an imported map."""
 
 
-@dataclass(frozen=True)
-class ImportedFile:
-    """An imported map and the name of the format of its file."""
-
-    imported: ImportedMap
-    format: str
-
-    @property
-    def data(self) -> xr.Dataset:
-        """The map, in m and T along the magnet's axes."""
-        return self.imported.data
-
-    def with_data(self, data: xr.Dataset) -> ImportedFile:
-        """Return the same file with another map."""
-        return replace(self, imported=replace(self.imported, data=data))
-
-
-def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> ImportedFile:
+def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> ImportedMap:
     """Read a map in a foreign format.
 
     Parameters
@@ -105,12 +91,12 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     check_readings(data, path)
     data.attrs |= {"imported_from": printable(path.name, MAX_NAME), "imported_as": name,
                    "imported_sha256": hashlib.sha256(raw).hexdigest()}
-    return _with_doubt(ImportedFile(found, name), declared)
+    return _with_doubt(replace(found, format=name), declared)
 
 
-def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
+def _with_doubt(file: ImportedMap, declared: DeclaredFormat) -> ImportedMap:
     """Return the file, with a remark if its points lie where few magnets have a field."""
-    units, is_own = file.imported.length_units, file.format not in READERS
+    units, is_own = file.length_units, file.format not in READERS
     by_option = np.array([declared.at.get(axis, 0.0) for axis in COMPONENTS])
     by_option[0] += declared.at.get("r", 0.0)
     by_option += 0.0 if declared.origin_m is None else np.array(declared.origin_m)
@@ -124,8 +110,7 @@ def _with_doubt(file: ImportedFile, declared: DeclaredFormat) -> ImportedFile:
     advice += (["--origin-m is in m"] if declared.origin_m is not None else
                ["--at is in m"] if declared.at else [])
     remark = f"{doubt} {'; and '.join(advice)}."
-    return replace(file, imported=replace(
-        file.imported, remarks=(*file.imported.remarks, remark)))
+    return replace(file, remarks=(*file.remarks, remark))
 
 
 def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
@@ -144,7 +129,8 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
             unit_symbol(found.columns[number].unit) for number in order):
         raise MeasurementError(must_be("header", where, "with x, y and z and their units, as in "
                                        "x[mm],y[mm],z[mm]", ",".join(
-                                           column.text for column in found.columns)[:60] or "none"))
+                                           column.text for column in found.columns
+                                           if column.text)[:60] or "none"))
     if len(found.values) != len(table.values):
         raise MeasurementError(must_be("content", where, f"{len(table.values)} rows, one for each "
                                        f"reading of {table.where}", str(len(found.values))))
@@ -153,7 +139,7 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
                    added=table.added + len(order))
 
 
-def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedFile | None:
+def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedMap | None:
     """Return a map in halbach-fe's own HDF5 or VTU, moved to the stated origin; None for others.
 
     Raises
@@ -175,7 +161,7 @@ def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedFile | Non
         data = data.assign_coords({
             name: data[name] + shift for name, shift in zip(POSITION_COLUMNS, declared.origin_m,
                                                             strict=True)})
-    return ImportedFile(ImportedMap(data, ("m",), ("T",), (), 0, False), "halbach-fe")
+    return ImportedMap(data, ("m",), ("T",), (), 0, False, format="halbach-fe")
 
 
 def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
@@ -183,15 +169,7 @@ def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
     if raw.startswith(openpmd.SIGNATURE):
         return "openpmd"
     lines = lines_of(raw, declared, where)
-    if comsol.is_comsol(lines):
-        return "comsol"
-    if g4beamline.is_g4beamline(lines):
-        return "g4beamline"
-    if bdsim.is_bdsim(lines):
-        return "bdsim"
-    if (implied := implied_format(lines)) is not None:
-        return implied
-    return "opera" if opera.is_opera(lines) else "columns"
+    return next((name for name, of in RECOGNIZED.items() if of(lines)), "columns")
 
 
 def export_map(data: xr.Dataset, name: str, path: Path) -> None:

@@ -19,13 +19,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.names import ColumnName
+from halbach_fe.measurement.formats.names import CARTESIAN, ColumnName, in_units
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import (
     Line,
@@ -33,9 +34,9 @@ from halbach_fe.measurement.formats.text import (
     delimiter_of,
     is_comment,
     lines_of,
-    number_in_cell,
     rows_of,
 )
+from halbach_fe.measurement.tables import finite
 
 COMMAND = re.compile(r"\s*(param|grid|cylinder|time|extend[XYZ]|data)\b(.*)")
 ARGUMENT = re.compile(r"(\w{1,20})\s*=\s*([^\s=]{1,60})")
@@ -44,9 +45,9 @@ CYLINDER = ("R0", "Z0", "nR", "nZ", "dR", "dZ", "tolerance")
 KNOWN = {"param": ("maxline", "current", "gradient", "normE", "normB"), "grid": GRID,
          "cylinder": CYLINDER, "data": (), **{f"extend{axis}": ("flip",) for axis in "XYZ"}}
 """The arguments of each command."""
-COLUMNS = {"grid": ("x", "y", "z", "Bx", "By", "Bz"), "cylinder": ("r", "z", "Br", "Bz")}
+COLUMNS = {"grid": CARTESIAN, "cylinder": ("r", "z", "Br", "Bz")}
 ELECTRIC = {"grid": ("Ex", "Ey", "Ez"), "cylinder": ("Er", "Ez")}
-LENGTH_UNIT, FIELD_UNIT = "mm", "T"
+LENGTH_UNIT = "mm"
 
 MAX_LINE = 300
 """Number of characters of a line of the header that are searched."""
@@ -86,21 +87,19 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         raise MeasurementError(must_be(f"line {rows[0][0]}", where,
                                        f"{', '.join(wanted)}", f"{count} values"))
     values, texts = rows_of(rows, count, delimiter, declared, where)
-    scale = _number(commands.get("param", {}).get("normB", "1"), "normB", where)
-    columns = [ColumnName(name, name, FIELD_UNIT if name.startswith("B") else LENGTH_UNIT)
-               for name in wanted]
+    scale = finite(commands.get("param", {}).get("normB", "1"), "normB", where)
+    columns = in_units(wanted, LENGTH_UNIT)
     fields = [index for index, name in enumerate(wanted) if name.startswith("B")]
     values[:, fields] *= scale
     _check_grid(commands[kind], values, kind, where)
     remarks = _remarks(commands, values, kind, scale)
     if kind == "cylinder":  # the half-plane y = 0
-        columns = [ColumnName("r", "x", LENGTH_UNIT), columns[1],
-                   ColumnName("Br", "Bx", FIELD_UNIT), columns[3],
-                   ColumnName("y", "y", LENGTH_UNIT)]
+        columns = tuple(replace(column, quantity={"r": "x", "Br": "Bx"}.get(
+            column.text, column.text)) for column in (*columns, *in_units("y", LENGTH_UNIT)))
         values = np.column_stack([values[:, :4], np.zeros(len(values))])
     elif count > len(wanted):
-        columns += [ColumnName(name) for name in ELECTRIC[kind]]
-    return ForeignTable(tuple(columns), values, where, comments=comments_of(lines[:start]),
+        columns += tuple(map(ColumnName, ELECTRIC[kind]))
+    return ForeignTable(columns, values, where, comments=comments_of(lines[:start]),
                         texts=texts, remarks=tuple(remarks))
 
 
@@ -138,22 +137,14 @@ def _commands(
                                    ", ".join(found) or "none"))
 
 
-def _number(text: str, name: str, where: str) -> float:
-    """Return the number of an argument; raise MeasurementError if it is none."""
-    try:
-        return number_in_cell(text)
-    except ValueError:
-        raise MeasurementError(must_be(name, where, "a number", f"'{text[:40]}'")) from None
-
-
 def _check_grid(given: dict[str, str], values: Floats, kind: str, where: str) -> None:
     """Raise MeasurementError if a point is not of the grid, of which G4beamline ignores it."""
     tolerance_mm = 0.01  # distance of a point from the grid up to which G4beamline uses it
-    tolerance = _number(given.get("tolerance", str(tolerance_mm)), "tolerance", where)
+    tolerance = finite(given.get("tolerance", str(tolerance_mm)), "tolerance", where)
     for column, axis in enumerate("XYZ" if kind == "grid" else "RZ"):
-        start = _number(given.get(f"{axis}0", "0"), f"{axis}0", where)
-        step = _number(given.get(f"d{axis}", "1"), f"d{axis}", where)
-        count = _number(given.get(f"n{axis}", "1"), f"n{axis}", where)
+        start = finite(given.get(f"{axis}0", "0"), f"{axis}0", where)
+        step = finite(given.get(f"d{axis}", "1"), f"d{axis}", where)
+        count = finite(given.get(f"n{axis}", "1"), f"n{axis}", where)
         index = np.rint((values[:, column] - start) / step) if step else np.zeros(len(values))
         off = np.abs(start + step * index - values[:, column]) > max(tolerance, 1e-9)
         bad = off | (index < 0) | (index > count - 1) | np.isnan(values[:, column])

@@ -24,7 +24,7 @@ NA60+ reads them.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of, refuse_total_field
 from halbach_fe.measurement.formats.declared import DeclaredFormat
-from halbach_fe.measurement.formats.names import ColumnName
+from halbach_fe.measurement.formats.names import CARTESIAN, in_units
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import (
     Line,
@@ -43,9 +43,9 @@ from halbach_fe.measurement.formats.text import (
     delimiter_of,
     is_comment,
     lines_of,
-    number_in_cell,
     rows_of,
 )
+from halbach_fe.measurement.tables import finite
 from halbach_fe.study.types import COMPONENTS
 
 TOLERANCE = 1e-3
@@ -81,6 +81,13 @@ class Grid:
     def spacing(self) -> Floats:
         """Grid steps (3,) in m along x, y and z."""
         return np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in self.axes])
+
+    def rows(self, per_m: float = 1.0, x_fastest: bool = False) -> Iterator[str]:
+        """Yield x, y, z, in a unit of which a metre has ``per_m``, and B of each point as text."""
+        points = np.stack(np.meshgrid(*(per_m * axis for axis in self.axes), indexing="ij"), -1)
+        table = np.concatenate([points, self.field], axis=-1)
+        for row in (table.swapaxes(0, 2) if x_fastest else table).reshape(-1, 6).tolist():
+            yield " ".join(map(repr, row))
 
 
 def grid_of(data: xr.Dataset, where: str) -> Grid:
@@ -146,12 +153,14 @@ MAX_LINE = 200
 """Number of characters of a line of the header that are searched."""
 
 
-def implied_format(lines: Sequence[Line]) -> str | None:
-    """Return which of both formats the first lines are of, or None."""
-    first = [line[:MAX_LINE] for _, line in lines[:20]]
-    if sum(bool(STATEMENT.match(line)) for line in first) >= len(KEYS):
-        return "srw"
-    return "fluka" if any(line.upper().startswith(CARD) for line in first) else None
+def is_srw(lines: Sequence[Line]) -> bool:
+    """Return whether the first lines describe a grid of SRW."""
+    return sum(bool(STATEMENT.match(line[:MAX_LINE])) for _, line in lines[:20]) >= len(KEYS)
+
+
+def is_fluka(lines: Sequence[Line]) -> bool:
+    """Return whether one of the first lines is a card of a grid of FLUKA."""
+    return any(line.upper().startswith(CARD) for _, line in lines[:20])
 
 
 def read_srw(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
@@ -170,14 +179,14 @@ def read_srw(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         raise MeasurementError(must_be("header", where, f"complete with '#value #{lost[0]} ...'",
                                        "a header without it"))
     start, step, count = (
-        np.array([_number(found[key, axis], f"{key} {axis}", where) for axis in "XYZ"])
+        np.array([finite(found[key, axis], f"{key} {axis}", where) for axis in "XYZ"])
         for key in KEYS)
     rows = [line for line in lines if not is_comment(line[1])]
     if not rows:
         raise MeasurementError(must_be("content", where, "rows of Bx, By and Bz", "none"))
     values, texts = rows_of(rows, 3, delimiter_of(rows[0][1], declared), declared, where)
     points = _points(start, start + (count - 1) * step, count, len(values), where)
-    return ForeignTable(_columns("m"), np.hstack([points, values]), where, texts={
+    return ForeignTable(in_units(CARTESIAN, "m"), np.hstack([points, values]), where, texts={
         column + 3: cells for column, cells in texts.items()}, comments=comments_of(lines))
 
 
@@ -210,26 +219,15 @@ def read_fluka(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable
     values = numbers.reshape(-1, 3)[:total] if 0 <= len(numbers) - 3 * total <= 3 else (
         numbers.reshape(-1, 3))
     points = _points(made[2][:3], made[2][3:], count, len(values), where)
-    return ForeignTable(_columns("cm"), np.hstack([points, values]), where)
+    return ForeignTable(in_units(CARTESIAN, "cm"), np.hstack([points, values]), where)
 
 
 def _what(line: str, free: bool, number: int, where: str) -> Floats:
     """Return the six numbers of a card; empty ones are 0."""
     cells = line.split(",")[1:7] if free or "," in line else [
         line[WIDTH * n:WIDTH * (n + 1)] for n in range(1, 7)]
-    return np.array([_number(cell.strip(), f"line {number}", where) if cell.strip() else 0.0
+    return np.array([finite(cell.strip(), f"line {number}", where) if cell.strip() else 0.0
                      for cell in [*cells, *[""] * (6 - len(cells))]])
-
-
-def _number(text: str, what: str, where: str) -> float:
-    """Return a finite number; raise MeasurementError if a text is none."""
-    try:
-        value = number_in_cell(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise MeasurementError(must_be(what, where, "a number", f"'{text[:40]}'"))
-    return value
 
 
 def _points(first: Floats, last: Floats, count: Floats, rows: int, where: str) -> Floats:
@@ -238,12 +236,10 @@ def _points(first: Floats, last: Floats, count: Floats, rows: int, where: str) -
         raise MeasurementError(must_be(
             "content", where, " x ".join(f"{n:g}" for n in count) + " points, as its header says",
             str(rows), "Is the file cut short?"))
-    axes = [np.linspace(a, b, int(n)) for a, b, n in zip(first, last, count, strict=True)]
-    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    return points_on([np.linspace(*ends) for ends in zip(first, last, count.astype(int),
+                                                         strict=True)])
 
 
-def _columns(length_unit: str) -> tuple[ColumnName, ...]:
-    """Return the columns of points and their field in T."""
-    return tuple([ColumnName(name, name, length_unit) for name in COMPONENTS]
-                 + [ColumnName(f"B{name}", f"B{name}", "T") for name in COMPONENTS])
+def points_on(axes: Sequence[Floats]) -> Floats:
+    """Return the points (n, 3) of a grid from its coordinates along x, y, z; x changes fastest."""
+    return np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1).reshape(-1, 3)

@@ -19,6 +19,7 @@ from halbach_fe.measurement.formats.units import (
 
 POSITIONS = ("x", "y", "z", "r", "phi")
 FIELDS = ("Bx", "By", "Bz", "Br", "Bphi")
+CARTESIAN = (*POSITIONS[:3], *FIELDS[:3])
 TOTAL = "Babs"
 """The magnitude |B|, as a quantity of its own."""
 KNOWN = (*POSITIONS, *FIELDS, "B", TOTAL)
@@ -104,6 +105,12 @@ class ColumnName:
     unit: str = ""
 
 
+def in_units(quantities: Sequence[str], length: str, field: str = "T") -> tuple[ColumnName, ...]:
+    """Return columns that are named after their quantity: positions, and components of B."""
+    return tuple(ColumnName(name, name, field if name.startswith("B") else length)
+                 for name in quantities)
+
+
 @lru_cache(maxsize=1024)  # lines of many words are read as headers too
 def parse(text: str, stated: bool = False) -> ColumnName:
     """Return quantity and unit of the name of a column, which the user may have ``stated``."""
@@ -146,7 +153,7 @@ def _other_quantity(base: str, key: str, unit: str) -> str:
     if key == "hhmmss":
         return "t"
     of = noise_of(base, key)
-    if of in POSITIONS and kind_of(unit_symbol(unit)) == "field":
+    if of in POSITIONS and kind_of(unit) == "field":
         of = f"B{of}"  # as x in T is Bx
     return "" if of is None or of in POSITIONS else f"sigma_{of}".removesuffix("_B")
 
@@ -205,7 +212,7 @@ def with_axes(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
         for index, column in enumerate(columns):
             base, unit = split_unit(column.text)
             axes = AXIS.findall(base)
-            of_kind = not column.quantity and kind_of(unit_symbol(unit)) == kind
+            of_kind = not column.quantity and kind_of(unit) == kind
             if of_kind and len(axes) == 1 and not NO_AXIS & set(_words(base)):
                 found.append((axes[0].lower(), index, unit))
         if sorted(axis for axis, *_ in found) == ["x", "y", "z"] and not known & set(quantities):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import h5py
@@ -22,7 +23,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
-from halbach_fe.measurement.formats.names import ColumnName
+from halbach_fe.measurement.formats.names import in_units
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.study.types import COMPONENTS
 
@@ -128,11 +129,11 @@ def _table(mesh: Any, where: str) -> ForeignTable:
         for name in names])
     anchor = str(attributes["eleAnchorPt"])
     own = [{"theta": "phi"}.get(name, name) for name in names]
-    columns = [ColumnName(name, name, "rad" if name == "phi" else "m") for name in own] + [
-        ColumnName(f"B{name}", f"B{name}", "T") for name in own]
+    columns = tuple(replace(column, unit="rad") if column.text == "phi" else column
+                    for column in in_units((*own, *(f"B{name}" for name in own)), "m"))
     symmetric = names != COMPONENTS and size[1] == 1
     return ForeignTable(
-        tuple(columns), np.hstack([points, field]), where,
+        columns, np.hstack([points, field]), where,
         anchor="" if anchor == "center"
         else f"the '{anchor[:20]}' of the element, from which it counts,",
         remarks=("The file is of a field with rotational symmetry about z: the map has its points "

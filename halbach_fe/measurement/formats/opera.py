@@ -1,4 +1,4 @@
-"""Import of field tables of Opera, as its TABLE command writes them.
+"""Import of field tables of Opera, as its TABLE command writes them, and export for Geant4.
 
 ::
 
@@ -13,23 +13,33 @@ The first line may be blank. A list of points has its length three times in plac
 Units may be missing, or LENGU and FLUXU, which state no unit. Sources of the layout: the table of
 Geant4's example purging_magnet, and the tables that OPAL (tests of SBend3D) and musrSim (its
 manual) read.
+
+Exports are for Geant4's PurgMagTabulatedField3D (.cc file of this class, and PurgMag3D.TABLE): in
+metres and tesla, with z that changes fastest. Its reader ends the header at the first line whose
+second character is 0, and reads lines into a buffer of 256 characters. It expects a seventh column,
+the permeability, but ignores it; the export writes that of vacuum. The units in the header are for
+other readers.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats import names
 from halbach_fe.measurement.formats.declared import DeclaredFormat
+from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
 from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import Line, lines_of, rows_of
+from halbach_fe.study.materials import MU_0
 
 COUNTS = re.compile(r"\s*(\d{1,9})\s+(\d{1,9})\s+(\d{1,9})(\s+\d{1,9})?\s*")
 COLUMN = re.compile(r"\s*([1-9]\d?)\s+([A-Za-z][^\s\[]*)\s*(?:\[([^\[\]]*)\])?\s*")
 END = re.compile(r"\s*0\s*(?:\[([^\[\]]*)\])?\s*")
+EXPORTED = (" 1 X [METRE]", " 2 Y [METRE]", " 3 Z [METRE]", " 4 BX [TESLA]", " 5 BY [TESLA]",
+            " 6 BZ [TESLA]", " 7 BMOD/HMOD", " 0 [METRE]")
 MAX_HEADER = 200
 """Largest number of characters of a line of the header."""
 
@@ -82,3 +92,13 @@ def _columns(lines: Sequence[Line], where: str) -> tuple[tuple[ColumnName, ...],
         columns.append(ColumnName(name.text, name.quantity, (column[3] or "").strip()))
     raise MeasurementError(must_be("header", where, "columns and a line 0 after them",
                                    "a header without them"))
+
+
+def lines(grid: Grid) -> Iterator[str]:
+    """Yield the lines of a file for Geant4."""
+    yield ""
+    nx, ny, nz = grid.shape
+    yield f" {nx} {ny} {nz} "  # without the last space the reader would parse the previous line
+    yield from EXPORTED
+    for row in grid.rows():
+        yield f"{row} {MU_0!r}"

@@ -38,6 +38,8 @@ MAX_NUMBER = 1e30
 would overflow."""
 NMR = "1 MHz of protons in water is a field of 0.0234872 T: Babs[0.0234872 T]"
 PPM = "ppm of a mean field are no field: write a column of (1 + ppm / 1e6) times that mean"
+MOST_NAMES = 12
+"""Quantities of a reading that a table has at most; with more columns it is another one."""
 PLACEHOLDER = "Where nothing was read, write nan."
 MOST_RAD = 4 * np.pi
 """Largest angle of a position, two turns: larger ones are in degrees."""
@@ -55,8 +57,8 @@ class ForeignTable:
         In the file's units; NaN if a component was not measured, or a cell is no number.
     where : str
         Name of the file in error messages.
-    length_unit, field_unit : str
-        Units of columns that state no unit of their own; empty if the file does not state them.
+    length_unit : str
+        Unit of lengths that state no unit of their own; empty if the file does not state it.
     anchor : str
         The point from which the file measures positions; empty if it is the magnet's centre.
     comments : str
@@ -75,7 +77,6 @@ class ForeignTable:
     values: Floats
     where: str
     length_unit: str = ""
-    field_unit: str = ""
     anchor: str = ""
     comments: str = ""
     texts: dict[int, dict[int, Line]] = field(default_factory=dict)
@@ -102,6 +103,8 @@ class ImportedMap:
         Whether the file has Br and Bphi, so that Bx and By are computed.
     remarks : tuple of str
         Sentences for the user about what the file says of its numbers, and what was done with it.
+    format : str
+        Name of the format of the file.
     """
 
     data: xr.Dataset
@@ -111,6 +114,7 @@ class ImportedMap:
     dropped: int
     cylindrical: bool
     remarks: tuple[str, ...] = ()
+    format: str = ""
 
 
 def to_map(table: ForeignTable, declared: DeclaredFormat) -> ImportedMap:
@@ -407,13 +411,13 @@ def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName,
     own = names.with_polar([ColumnName("") if text == "-" else names.parse(text, stated=True)
                             for text in declared.columns], declared.at)
     for text, stated, column in zip(declared.columns, own, table.columns[:count], strict=False):
-        if text != "-" and (not stated.quantity or stated.quantity.startswith("H")):
+        if text != "-" and not stated.quantity:
             raise MeasurementError(must_be(
                 "--columns", table.where,
                 f"made of {', '.join((*names.KNOWN, *names.STATED))} and -", f"'{text}'"))
         found.append(ColumnName(column.text or stated.text, stated.quantity,
                                 stated.unit or column.unit))
-    return (*found, *table.columns[count:])
+    return _of_h((*found, *table.columns[count:]))
 
 
 def _overridden(
@@ -475,8 +479,7 @@ def _used(
         if len(components) == 3:
             used.setdefault(names.TOTAL, magnitude)
     if components and names.TOTAL in used and not (
-            units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit
-            or table.field_unit):
+            units.unit_symbol(columns[used[names.TOTAL]].unit) or declared.field_unit):
         del used[names.TOTAL]  # it is not needed
     for name in declared.at:
         if name in used:
@@ -490,21 +493,24 @@ def _missing(
     declared: DeclaredFormat
 ) -> list[str]:
     """Return descriptions of the information that file and user do not state, except units."""
+    unknown = [column.text for column in columns if column.text and not column.quantity]
     if not any(column.quantity for column in columns):
-        shown = ", ".join(f"'{column.text}'" for column in columns if column.text)
-        return [f"what its {len(columns)} columns {f'({shown}) ' if shown else ''}are "
+        few, many = len(columns) <= len(COMPONENTS), len(columns) > MOST_NAMES and not unknown
+        return [f"what its {len(columns)} columns "
+                f"{f'({_quoted(unknown)}) ' if unknown else ''}are "
                 "(--columns x,y,z,Bx,By,Bz, - to ignore a column"
-                + ("; if there are no positions, --columns Bx,By,Bz and --positions TABLE"
-                   if len(columns) == len(COMPONENTS) else "")
-                + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
-                   if _is_matrix(table.values) else
-                   "; if every quantity has a row of its own, make it a column, in a spreadsheet "
+                + ("; of points on a line, as --columns z,Bz and --at x=0,y=0; if there are no "
+                   f"positions, --columns {','.join(names.FIELDS[:len(columns)])} and --positions "
+                   "TABLE" if few else "")
+                + ("; if every quantity has a row of its own, make it a column, in a spreadsheet "
                    "by Paste Special, Transpose, or by numpy.transpose"
-                   if _is_transposed(table) else "") + ")"] + [
+                   if _is_transposed(table) else "")
+                + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
+                   if many or _is_matrix(table.values) else "")
+                + ")"] + [
             f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
                 ("length", "positions", declared.length_unit or table.length_unit),
-                ("field", "B", declared.field_unit or table.field_unit)) if not said]
-    missing: list[str] = []
+                ("field", "B", declared.field_unit)) if not said]
     if (hint := _of_field(used, columns)) is not None:
         return [hint]
     latitude = [column.text for column in columns if names.is_latitude(column)]
@@ -518,10 +524,13 @@ def _missing(
     absent = [name for name in wanted if name not in used and name not in declared.at
               and f"d{name}" not in used]
     if absent == ["phi"]:
-        return [*missing, "phi (--columns); if the field has rotational symmetry, state its "
+        return ["phi (--columns); if the field has rotational symmetry, state its "
                 "half-plane: x for r and Bx for Br in --columns, and --at y=0"]
+    missing: list[str] = []
     if absent:
-        missing.append(f"{', '.join(absent)} ({_by_option(absent)})")
+        missing.append(f"{', '.join(absent)} ({_by_option(absent)}" + (
+            f", as nothing is known of {_quoted(unknown)}"
+            if unknown and not declared.columns else "") + ")")
     if "B" in used:
         missing.append("which component B is (--component x, y or z), whether it is |B| "
                        "(--component abs), or that nobody knows (--component unknown: halbach-fe "
@@ -529,12 +538,10 @@ def _missing(
     elif (unread := _unread_components(used, columns, declared)):
         missing.append(unread)
     elif not {*names.FIELDS, names.TOTAL} & set(used):
-        others = [column.text for column in columns if column.text and not column.quantity]
         missing.append("which columns are Bx, By or Bz, Babs for |B|, or B for a component that "
                        "nobody knows, with --component unknown (--columns"
-                       + (", instead of " + ", ".join(f"'{text}'" for text in others[:6])
-                          if others else "")
-                       + (f"; {NMR}" if any("hz" in text.lower() for text in others) else "")
+                       + (f", instead of {_quoted(unknown)}" if unknown else "")
+                       + (f"; {NMR}" if any("hz" in text.lower() for text in unknown) else "")
                        + (f"; {PPM}" if any("ppm" in column.text.lower() for column in columns)
                           else "")
                        + ")")
@@ -555,8 +562,8 @@ def _unread_components(
     known ones lack; empty if there are no such, or if the user names the columns.
     """
     lacking = [name for name in names.FIELDS[:3] if name not in used]
-    unknown = [column.text for column in columns if not column.quantity and units.kind_of(
-        units.unit_symbol(names.split_unit(column.text)[1])) == "field"]
+    unknown = [column.text for column in columns if not column.quantity
+               and units.kind_of(names.split_unit(column.text)[1]) == "field"]
     if declared.columns or not 0 < len(lacking) < len(COMPONENTS) or len(unknown) != len(lacking):
         return ""
     return (f"whether {_quoted(unknown)} {'is' if len(lacking) == 1 else 'are'} "
@@ -564,7 +571,9 @@ def _unread_components(
 
 
 def _quoted(texts: Sequence[str]) -> str:
-    return in_a_row([f"'{text}'" for text in texts])
+    """Return the first `MOST_NAMES` texts in quotes."""
+    more = [f"{len(texts) - MOST_NAMES} more"] if len(texts) > MOST_NAMES else []
+    return in_a_row([f"'{text}'" for text in texts[:MOST_NAMES]] + more)
 
 
 def _is_matrix(values: Floats) -> bool:
@@ -577,17 +586,16 @@ def _is_matrix(values: Floats) -> bool:
 
 def _is_transposed(table: ForeignTable) -> bool:
     """Return whether the rows may be quantities: they are few, or begin with the names of some."""
-    few = 12  # quantities of a reading
     named = [names.parse(cell).quantity for _, cell in table.texts.get(0, {}).values()]
     rows, columns = table.values.shape
-    return sum(map(bool, named)) > 1 or (rows <= few and columns > 2 * few)
+    return sum(map(bool, named)) > 1 or (rows <= MOST_NAMES and columns > 2 * MOST_NAMES)
 
 
 def _of_field(used: dict[str, int], columns: Sequence[ColumnName]) -> str | None:
     """Return what to do with x, y and z beside no field: in logs of meters they are the field."""
     kinds = {_kind(name) for name in used}
     if not {"x", "y", "z"} <= set(used) or "field" in kinds or any(
-            units.kind_of(units.unit_symbol(columns[used[name]].unit)) for name in "xyz"):
+            units.kind_of(columns[used[name]].unit) for name in "xyz"):
         return None
     stated = ["-"] * len(columns)
     for name in "xyz":
@@ -621,9 +629,7 @@ def _units(
     found: dict[str, str] = {}
     unknown = []
     foreign: dict[str, list[str]] = {}
-    option = {"length": declared.length_unit, "field": declared.field_unit,
-              "angle": declared.angle_unit, "time": ""}[kind]
-    common = {"length": table.length_unit, "field": table.field_unit}.get(kind, "")
+    option = declared.unit_of(kind)
     own = sorted((name for name in used if _kind(name) == kind),
                  key=lambda name: name in names.NOISE)
     if option and not own and not missing:
@@ -632,7 +638,7 @@ def _units(
     for name in own:
         text = columns[used[name]].unit
         if units.states_no_unit(text):
-            text = common
+            text = table.length_unit if kind == "length" else ""
         if kind == "time":
             written = used[name] in table.texts or units.CLOCK.fullmatch(text) or (
                 names.is_clock(columns[used[name]]))
@@ -683,8 +689,7 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     si = _cylindrical(si, where) if "theta" in si else si
     if "r" in si:
         if {"x", "y"} & set(si):
-            raise MeasurementError(must_be("positions", where, "either x, y, z or r, phi, z",
-                                           "both", "Leave some out with --columns and -."))
+            raise _both("positions", "x, y, z or r, phi, z", where)
         angle = si["phi"]
         if np.nanmax(np.abs(angle), initial=0.0) > MOST_RAD:
             raise MeasurementError(must_be(
@@ -697,13 +702,13 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise MeasurementError(must_be(f"reading {int(np.argmax(bad)) + 1}", where,
-                                       "at a finite position", "an empty or infinite coordinate"))
+                                       "at a finite position", "an empty or infinite coordinate",
+                                       "If the row is no reading, remove it."))
     empty = np.full(len(points), np.nan)
     if "Br" not in si:
         return points, np.column_stack([si.get(name, empty) for name in ("Bx", "By", "Bz")])
     if {"Bx", "By"} & set(si):
-        raise MeasurementError(must_be("components", where, "either Bx, By or Br, Bphi", "both",
-                                       "Leave some out with --columns and -."))
+        raise _both("components", "Bx, By or Br, Bphi", where)
     if "r" not in si and not np.hypot(points[:, 0], points[:, 1]).all():
         raise MeasurementError(must_be(
             "Br and Bphi", where, "at points off the axis", "some on it, where they have no "
@@ -713,12 +718,17 @@ def _cartesian(si: dict[str, Floats], where: str) -> tuple[Floats, Floats]:
                                     si["Br"] * sin + si["Bphi"] * cos, si.get("Bz", empty)])
 
 
+def _both(what: str, either: str, where: str) -> MeasurementError:
+    """Return the error of a file that has two of what excludes each other."""
+    return MeasurementError(must_be(what, where, f"either {either}", "both",
+                                    "Leave some out with --columns and -."))
+
+
 def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
     """Return columns of spherical coordinates as those of cylindrical ones."""
     angle = si["theta"]
     if {"x", "y", "z"} & set(si):
-        raise MeasurementError(must_be("positions", where, "either x, y, z or r, theta, phi",
-                                       "both", "Leave some out with --columns and -."))
+        raise _both("positions", "x, y, z or r, theta, phi", where)
     if not (np.nanmin(angle) >= 0 and np.nanmax(angle) <= np.pi * (1 + 1e-6)):
         raise MeasurementError(must_be(
             "theta", where, "from 0 to 180 degrees, the angle from the z axis",
@@ -730,9 +740,7 @@ def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
         "r": si["r"] * sin, "z": si["r"] * cos}
     if "Btheta" in si:
         if {"Bx", "By", "Bz"} & set(si):
-            raise MeasurementError(must_be(
-                "components", where, "either Bx, By, Bz or Br, Btheta, Bphi", "both",
-                "Leave some out with --columns and -."))
+            raise _both("components", "Bx, By, Bz or Br, Btheta, Bphi", where)
         turned |= {"Br": si["Br"] * sin + si["Btheta"] * cos,
                    "Bz": si["Br"] * cos - si["Btheta"] * sin}
     return turned

@@ -7,6 +7,7 @@ import csv
 import re
 import warnings
 from collections.abc import Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def _refuse_binary(raw: bytes, where: str) -> None:
         return
     raise MeasurementError(must_be(
         "content", where, "text", f"a binary file{f' ({kind})' if kind else ''}",
-        "Unpack it, or write it as CSV with a row x, y, z, Bx, By, Bz for each point; in Python: "
+        "Unpack it, or write it as CSV with a header of names and units; in Python, for a map: "
         "numpy.savetxt('map.csv', table, delimiter=',', comments='', "
         "header='x[m],y[m],z[m],Bx[T],By[T],Bz[T]')."))
 
@@ -103,6 +104,8 @@ def undecorated(line: str) -> str:
     listed = any(mark in line for mark in "|[]{}") and IN_LISTS.issuperset(line)
     if len(line) > MAX_COMMENTS or not (starred or listed):
         return line
+    mark = "," if re.search(r"\d,[-+.\d]", line) else " "
+    line = re.sub(r"[\])}]\s*[,;]?\s*[\[({]", mark, line)  # between two lists
     numbers = re.sub(r"[\[\](){}|]|(?<!\S)\*(?!\S)", " ", line)
     return " ".join(re.sub(r"[,;]\s", " ", f"{numbers} ").split())
 
@@ -250,7 +253,8 @@ def rows_of(
             joined = _joined(lines, delimiter) if len(rows) == 1 else ""
             raise MeasurementError(must_be(
                 f"line {position}", where, f"{columns} values", str(len(cells)),
-                joined or "Is the file cut short? Else remove the line, or begin it with #"
+                joined or _below(lines, declared)
+                or "Is the file cut short? Else remove the line, or begin it with #"
                 + ("." if position == lines[-1][0] else
                    f"; if the table begins below it, add --skip-lines {position}, if with it, "
                    f"--skip-lines {position - 1}; if cells are separated otherwise, "
@@ -273,6 +277,24 @@ def _joined(lines: Sequence[Line], delimiter: str | None) -> str:
                    if len(lengths) >= 2 * n and lengths == (lengths[:n] * len(lengths))[
                        :len(lengths)]), 0)
     return joining(period, lines[0][0], delimiter) if period else ""
+
+
+def _below(lines: Sequence[Line], declared: DeclaredFormat) -> str:
+    """Return what to do if most rows are equally long, from a line on and not above it, or if
+    tables follow each other; else an empty string.
+    """
+    most_runs = 6  # of equally long rows, above a table or where it is damaged
+    rows = [(number, len(cells_of(line, delimiter_of(line, declared))))
+            for number, line in lines if not is_comment(line)]
+    runs = [list(run) for _, run in groupby(rows, lambda row: row[1])]
+    number, count = runs[-1][0]
+    if 2 * len(runs[-1]) > len(rows) and all(run[0][1] != count for run in runs[:-1]):
+        return (f"From line {number} on all rows have {count} {'value' if count == 1 else 'values'}"
+                f": if they are the table, add --skip-lines {number - 1}, and state what is above "
+                "them by --columns, --at or --positions.")
+    return "" if len(runs) <= most_runs else (
+        "If several tables are below each other, write them as one, as CSV with a header as "
+        "x[mm],y[mm],z[mm],Bx[T],By[T],Bz[T] and a row for each reading.")
 
 
 def joining(lines: int, first: int, delimiter: str | None) -> str:

@@ -47,7 +47,8 @@ WORDS = {
     "um": "um", "µm": "um", "μm": "um", "micron": "um", "microns": "um",
     "in": "inch", "inch": "inch", "inches": "inch",
     "tesla": "T", "millitesla": "mT", "microtesla": "uT", "gauss": "G", "kilogauss": "kG",
-    "kgauss": "kG", "milligauss": "mG", "mgauss": "mG", "nanotesla": "nT", "teslas": "T",
+    "kgauss": "kG", "kgs": "kG", "milligauss": "mG", "mgauss": "mG", "nanotesla": "nT",
+    "teslas": "T",
     "microteslas": "uT", "utesla": "uT", "mtesla": "mT", "gs": "G", "oersted": "Oe", "oe": "Oe",
     "koe": "kOe", "a/m": "A/m", "ka/m": "kA/m", "am-1": "A/m", "wb/m2": "T", "vs/m2": "T",
     "n/am": "T", "n/(am)": "T", "m3": "m^3", "cm3": "cm^3", "cc": "cm^3", "ml": "cm^3",
@@ -92,9 +93,9 @@ def unit_symbol(text: str) -> str:
             "⁻¹", "-1"), "")
 
 
-def kind_of(unit: str) -> str:
-    """Return the kind of a symbol (length, field, angle, time); empty if it is none."""
-    unit = unit.rpartition(" ")[2]
+def kind_of(text: str) -> str:
+    """Return the kind of a unit, one of `KINDS`, in any spelling; empty if it is none."""
+    unit = (unit_symbol(text) or text).rpartition(" ")[2]
     return next((kind for kind, members in KINDS.items() if unit in members), "")
 
 
