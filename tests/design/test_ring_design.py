@@ -93,6 +93,32 @@ def test_deviations_are_those_of_the_magnitude(designed):
     assert designed.best.rms_ppm != pytest.approx(of_component, rel=3e-6)
 
 
+def test_extremes_between_points_beside_blocks_are_found(session):
+    """The region ends 4 mm from cubes: points 7.5 degrees apart, the control, miss its extremes."""
+    region = Region.sphere(0.047)
+    found = design_rings(study(rings=2, layer=[{"radii_m": [0.058]}]), session, region)
+    source = cubes(build_magnet(found.study).blocks)
+    angle, z = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), np.linspace(-0.4, 0.4, 81))
+    unit = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], -1)
+    size = np.linalg.norm(source.getB(0.047 * unit.reshape(-1, 3)), axis=1)
+    low, high = (find(size) for find in (np.min, np.max))
+    sample = Catalogue.of(study(rings=2, layer=[{"radii_m": [0.058]}]), region, DENSITY).sample
+    coarse = np.linalg.norm(source.getB(sample.points), axis=1)
+    low = min(low, coarse.min())  # of the poles, which the band about the equator leaves out
+    true = PPM * (high - low) / found.best.mean_T
+    # points half a degree apart miss 1e-3 of what those 15 times as far apart miss
+    assert found.best.peak_to_peak_ppm == pytest.approx(true, rel=2e-3)
+    assert PPM * np.ptp(coarse) / found.best.mean_T < 0.99 * true
+
+
+def test_the_best_design_is_marked_on_the_front(session):
+    """Also if radii between those of the list are no better than the radii listed."""
+    found = design_rings(study(between_radii=True, rings=2, layer=[{"radii_m": [0.063]}]), session,
+                         REGION)
+    assert any(one is found.best for one in found.front)
+    assert "best: smallest peak to peak" in html_of(found)
+
+
 def test_the_search_finds_the_best_of_all_choices():
     catalogue = Catalogue.of(study(), REGION, DENSITY)
     task = task_of(catalogue, np.zeros(len(catalogue.sample.points)))
