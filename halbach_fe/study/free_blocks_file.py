@@ -21,8 +21,8 @@ from pydantic import ValidationError
 from halbach_fe.core import untrusted
 from halbach_fe.core.errors import OutputError, StudyError, must_be
 from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
-from halbach_fe.core.hdf5 import write_hdf5
 from halbach_fe.core.numbers import MAX_CELL, WITH_COMMAS, csv_text, other_separator, parse_number
+from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import COLUMNS, MAX_BLOCKS, FreeBlocks, RowError
 
