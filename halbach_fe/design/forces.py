@@ -547,7 +547,7 @@ class Gap:
     """A plane through ``origin`` (3,) in m between two bodies, with ``normal`` (3,) to the second.
 
     ``width`` in m is the distance of the bodies across it; ``low`` and ``high`` (2,) in m are how
-    far both reach along it, on the axes of `tangents`.
+    far both reach along it, on the axes of `_tangents`.
     """
 
     origin: Floats
@@ -555,11 +555,6 @@ class Gap:
     width: float
     low: Floats
     high: Floats
-
-    @property
-    def tangents(self) -> Floats:
-        """Two unit vectors (2, 3) along the plane."""
-        return _tangents(self.normal)
 
     def points(self, panels: int) -> tuple[Floats, Floats]:
         """Return points (n, 3) in m of the plane and their areas (n,), to infinity.
@@ -569,12 +564,14 @@ class Gap:
         rules = [_line(low, high, max(1, min(panels, int(np.ceil((high - low) / self.width)))))
                  for low, high in zip(self.low, self.high, strict=True)]
         (u, of_u), (v, of_v) = rules
-        places = (u[:, None, None] * self.tangents[0] + v[:, None] * self.tangents[1]
+        first, second = _tangents(self.normal)
+        places = (u[:, None, None] * first + v[:, None] * second
                   + (self.origin @ self.normal) * self.normal)
         return places.reshape(-1, 3), np.outer(of_u, of_v).ravel()
 
 
 def _tangents(normal: Floats) -> Floats:
+    """Return two unit vectors (2, 3) along a plane."""
     seed = np.eye(3)[np.abs(normal).argmin()]
     first = np.cross(normal, seed)
     first /= np.linalg.norm(first)
