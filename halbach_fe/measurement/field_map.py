@@ -340,7 +340,7 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
 
 def save_map(data: xr.Dataset, path: Path) -> None:
     """Write a map as `write_map` does, whatever was in the file before."""
-    writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
+    writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
         ".h5": lambda d, p: p.write_bytes(hdf5_bytes(d)), ".csv": _write_csv, ".vtu": _write_vtu}
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
