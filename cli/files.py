@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 def _template(parser: argparse.ArgumentParser) -> None:
     """Add the options of a new study."""
-    from halbach_fe.study.template import MagnetTemplate
+    from halbach_fe.study.study_file import MagnetTemplate
 
     template = MagnetTemplate()
     parser.add_argument("study", type=path, metavar="STUDY", help="file to write (TOML)")
@@ -93,7 +93,7 @@ def new(arguments: argparse.Namespace) -> int:
     The file is a valid study, and a comment explains every key.
     """
     from halbach_fe.magnets import new_magnet
-    from halbach_fe.study.template import OUTER_RADIUS, MagnetTemplate, write_new_study
+    from halbach_fe.study.study_file import OUTER_RADIUS, MagnetTemplate, write_new_study
 
     given = {name: value for name, value in vars(arguments).items()
              if name in MagnetTemplate.__dataclass_fields__ and value}

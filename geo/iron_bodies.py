@@ -19,7 +19,7 @@ from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.study.solver import MeshSettings
+from halbach_fe.study.model import MeshSettings
 
 
 @dataclass(frozen=True)

@@ -28,15 +28,15 @@ from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table, free_ou
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
-from halbach_fe.study.edit_file import study_text
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
 from halbach_fe.study.free_blocks_file import outline_of, validated_blocks, write_free_blocks
 from halbach_fe.study.model import Study
-from halbach_fe.study.template import (
+from halbach_fe.study.study_file import (
     OUTER_RADIUS,
     MagnetTemplate,
     new_study,
     parse_new_study,
+    study_text,
     write_new_study,
 )
 

@@ -23,7 +23,7 @@ MOST_ROOMS = 12
 
 # What a library may be imported by: a room, or a module of it.
 ONLY_IN = {"gmsh": "geo", "subprocess": "solver.getdp", "matplotlib": "report",
-           "numba": "core.compiled",
+           "numba": "core.threads",
            # extras, which only `synthetic.extras.import_extra` imports, when they are needed
            "magpylib": "", "ngsolve": "", "netgen": ""}
 

@@ -233,10 +233,6 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _write_bytes(content: bytes, path: Path) -> None:
-    path.write_bytes(content)
-
-
 def make_folder(folder: Path) -> Path:
     """Create a folder and its parents where they do not exist; raise OutputError on failure."""
     try:

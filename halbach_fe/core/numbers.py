@@ -148,6 +148,12 @@ def csv_text(columns: Mapping[str, NDArray[Any] | Sequence[object]]) -> str:
     return text.getvalue()
 
 
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return lines with their numbers; those that are empty or begin with # are left out."""
+    return [(number, line) for number, line in enumerate(text.splitlines(), start=1)
+            if line.strip() and not line.lstrip().startswith("#")]
+
+
 def other_separator(header: str) -> str | None:
     """Return what separates the names in a header that has no commas; None if nothing does."""
     for character, name in ((";", "semicolons"), ("\t", "tabs")):

@@ -308,7 +308,9 @@ def result_folder(
                     f"Input {path} is a result of an earlier run in folder {folder}, which this "
                     "run would replace. Name another folder, or copy the input to another place.")
         writer = _Writer(base, before.model_copy(deep=True), "folder", file)
-        writer.refuse(_writable_paths(base, _results_of(command), solving))
+        every = tuple(name for names in WRITES.values() for name in names)
+        results = WRITES.get(command.removeprefix("halbach-fe "), every)  # a study's own writes any
+        writer.refuse(_writable_paths(base, (*results, "page.json"), solving))
         writer.record.inputs, writer.record.ended = _inputs(inputs), ""
         writer.record.named = {
             word: printable(path, MAX_QUOTED) for word, path in named.items()}
@@ -320,12 +322,6 @@ def result_folder(
                 writer.remove_stale()
                 raise
         writer.remove_stale()
-
-
-def _results_of(command: str) -> tuple[str, ...]:
-    """Return the names of the results of a command; a study's own may write any result."""
-    every = tuple(name for names in WRITES.values() for name in names)
-    return (*WRITES.get(command.removeprefix("halbach-fe "), every), "page.json")
 
 
 def _writable_paths(base: Path, results: Sequence[str], solving: bool) -> Iterator[Path]:

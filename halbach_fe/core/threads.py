@@ -1,14 +1,32 @@
-"""Threads for compiled work that releases Python's lock, and the memory that is left."""
+"""Functions that numba compiles, threads for them, and the memory that is left."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+
+def compiled(function: Callable[..., Any], fastmath: bool = False) -> Any:
+    """Decorate a function that numba compiles; to import numba takes a second.
+
+    Threads run it side by side, since it releases the GIL; numba's own threads must not be entered
+    from several Python threads.
+    """
+    import numba
+
+    return numba.njit(cache=True, nogil=True, error_model="numpy",
+                      fastmath=fastmath or {"contract"})(function)
+
+
+reordered = partial(compiled, fastmath=True)
+"""The same for sums whose terms may be added in any order, several at a time."""
 
 
 def in_threads(work: Callable[[int, int], object], shares: list[tuple[int, int]]) -> None:

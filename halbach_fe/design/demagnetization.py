@@ -257,18 +257,26 @@ def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
     """Divide the blocks with the given numbers into cells, ``across`` the radial thickness."""
     parts = [_cut_block(blocks[number], across) for number in numbers]
-    starts = np.cumsum([0, *(len(vertices) for vertices, _, _, _ in parts)])
-    return Cells(
-        np.vstack([vertices for vertices, _, _, _ in parts]),
-        np.vstack([corners + start for (_, corners, _, _), start in zip(
-            parts, starts[:-1], strict=True)]),
-        np.repeat(numbers, [len(volumes) for _, _, _, volumes in parts]),
-        np.vstack([middles for _, _, middles, _ in parts]),
-        np.concatenate([volumes for _, _, _, volumes in parts]))
+    vertices, corners, middles, volumes = _joined(parts)
+    return Cells(vertices, corners, np.repeat(numbers, [len(part[3]) for part in parts]),
+                 middles, volumes)
 
 
-def _cut_block(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, Floats]:
-    """Return vertices, corners, centres and volumes of the cells of a block, as in `Cells`.
+Cut = tuple[Floats, Ints, Floats, Floats]
+"""Vertices, corners, centres and volumes of cells, as in `Cells`."""
+
+
+def _joined(parts: Sequence[Cut]) -> Cut:
+    """Return the cells of several parts together."""
+    vertices, corners, middles, volumes = zip(*parts, strict=True)
+    starts = np.cumsum([0, *map(len, vertices[:-1])])
+    return (np.vstack(vertices),
+            np.vstack([own + start for own, start in zip(corners, starts, strict=True)]),
+            np.vstack(middles), np.concatenate(volumes))
+
+
+def _cut_block(block: MagnetBlock, across: int) -> Cut:
+    """Return the cells of a block.
 
     A block of four edges with straight sides is cut along its thickness and width, any other shape
     first into a part about each corner.
@@ -276,12 +284,7 @@ def _cut_block(block: MagnetBlock, across: int) -> tuple[Floats, Ints, Floats, F
     outline = block.outline
     if len(outline) == 4 and not (outline[0].arc or outline[2].arc):
         return _cut_part(block, partial(places_in, outline), across)
-    parts = [_cut_part(block, place, max(1, across // 2)) for place in corner_parts(block)]
-    starts = np.cumsum([0, *(len(vertices) for vertices, _, _, _ in parts)])
-    vertices, corners, middles, volumes = zip(*parts, strict=True)
-    return (np.vstack(vertices),
-            np.vstack([own + start for own, start in zip(corners, starts[:-1], strict=True)]),
-            np.vstack(middles), np.concatenate(volumes))
+    return _joined([_cut_part(block, place, max(1, across // 2)) for place in corner_parts(block)])
 
 
 def corner_parts(block: MagnetBlock) -> list[Callable[[Floats, Floats], Floats]]:
@@ -324,7 +327,7 @@ def corner_parts(block: MagnetBlock) -> list[Callable[[Floats, Floats], Floats]]
 
 def _cut_part(
     block: MagnetBlock, place: Callable[[Floats, Floats], Floats], across: int
-) -> tuple[Floats, Ints, Floats, Floats]:
+) -> Cut:
     """Return the cells of a part of a block, as `_cut_block`; ``place`` is like `places_in`."""
     half = np.array([0.5])
     (inner,), (outer,) = place(np.array([0.0, 1.0]), half)
@@ -364,12 +367,11 @@ def _field_strength(
     """Return H (cells, 3) in A/m at the centres of the cells."""
     points = cells.middles
     field = field_of(blocks, points)  # mu_0 H in vacuum
-    if not magnet.is_vacuum and _by_moments(magnet):
-        reacting = magnet.with_(solver__method="reaction")
+    reacting = magnet.with_(solver__method="reaction")
+    if not magnet.is_vacuum and _by_moments(reacting):
         field += solve_separate(reacting, session, estimate=False).field(points)
     elif not magnet.is_vacuum:
         _check_equal_rings(magnet)
-        reacting = magnet.with_(solver__method="reaction")
         formulation = CROSS_SECTION if magnet.dimension == 2 else SCALAR_POTENTIAL
         if magnet.is_nonlinear:
             field += solve_tangent(reacting, points, (), session, formulation, anywhere=True)[0]
@@ -385,11 +387,11 @@ def _field_strength(
 
 
 def _by_moments(magnet: Magnet) -> bool:
-    """Tell whether the reaction comes from the method of moments, for separate blocks in 3D."""
+    """Tell whether a reaction comes from the method of moments, for separate blocks in 3D."""
     route = magnet.study.solver.route
     asked = route == "moments" or not magnet.array.is_uniform or (
         route == "auto" and not is_axisymmetric(magnet))
-    return asked and applies(magnet.with_(solver__method="reaction"))
+    return asked and applies(magnet)
 
 
 def _check_equal_rings(magnet: Magnet) -> None:

@@ -38,7 +38,6 @@ from halbach_fe.solver.formulation_choice import check_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import posterior
-from halbach_fe.stats.noise import NoiseCovariance
 
 
 @dataclass(frozen=True)
@@ -178,7 +177,9 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
 
     def sd_after(positions: Ints) -> Floats:
         index = rows[positions].ravel()
-        return _posterior(model.matrix[index], errors.subset(index), prior).sd
+        # for readings as the prior expects: the model is linear, so that others change no sd
+        matrix = model.matrix[index]
+        return posterior(matrix, matrix @ prior.mean, errors.subset(index), prior).sd
 
     deviation = None
     if values is not None:
@@ -239,14 +240,6 @@ def _values(magnet: Magnet, prior: Gaussian, session: Session) -> Deviations | N
 def spread(total: int, count: int) -> Ints:
     """Return ``count`` evenly spread indices out of ``total``."""
     return np.floor(np.arange(count) * total / count).astype(int)
-
-
-def _posterior(matrix: Floats, noise: NoiseCovariance, prior: Gaussian) -> Gaussian:
-    """Return the posterior for readings equal to their prior mean.
-
-    Its covariance is that for any readings, because the model is linear.
-    """
-    return posterior(matrix, matrix @ prior.mean, noise, prior)
 
 
 def information(design: Floats) -> float:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from halbach_fe.response.homogeneity import (
 from halbach_fe.response.multipoles import (
     MultipoleModel,
     MultipoleReference,
+    Multipoles,
     multipole_model,
     unwanted_orders,
 )
@@ -184,63 +184,15 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
         np.append(np.linalg.norm(error), np.sqrt((kept**2).T @ error**2)), response.nominal)
 
 
-class Known(Protocol):
-    """The values of a magnet with their uncertainty, see `Multipoles` and `Deviations`."""
+Known = Multipoles | Deviations
+"""The values of a magnet with their uncertainty."""
 
-    @property
-    def mean(self) -> Floats:
-        """Means of the values (k,)."""
+Objective = MultipoleModel | DeviationModel
+"""A linear map from magnetizations to values.
 
-    @property
-    def root(self) -> Floats:
-        """Root (k, q) of their covariance."""
-
-    @property
-    def expected_square(self) -> float:
-        """Expectation of their sum of squares."""
-
-    @property
-    def rms(self) -> float:
-        """Its root, per multipole; or the rms deviation of |B|."""
-
-    @property
-    def rms_of_mean(self) -> float:
-        """The same for the means of the values."""
-
-    def share_within(self, limit: float, normals: Floats) -> float:
-        """Return the probability of meeting a limit, estimated from normal numbers (count, k)."""
-
-
-class Objective(Protocol):
-    """A linear map from magnetizations, see `MultipoleModel` and `DeviationModel`.
-
-    The values are ratios: row 0 of ``matrix`` (1 + k, parameters) is that of the main multipole or
-    of the mean field, to which the others are relative.
-    """
-
-    @property
-    def matrix(self) -> Any:
-        """Matrix (1 + k, parameters), of real or complex numbers."""
-
-    @property
-    def offset(self) -> Any:
-        """What external fields add, (1 + k,)."""
-
-    @property
-    def nominal_main(self) -> float:
-        """Main multipole or mean field of the nominal magnet."""
-
-    def scaled(self, main: float) -> Floats:
-        """Return the real matrix to the values for a given main multipole or mean field."""
-
-    def units(self, values: Any) -> Floats:
-        """Return the values of products with the matrix."""
-
-    def of(self, parameters: Gaussian) -> Any:
-        """Return the values for normally distributed magnetizations."""
-
-    def known(self, mean: Any, root: Any) -> Any:
-        """Return the values for mean and root of products with the matrix."""
+The values are ratios: row 0 of ``matrix`` (1 + k, parameters) is that of the main multipole or of
+the mean field, to which the others are relative.
+"""
 
 
 def check_objective(
@@ -279,7 +231,7 @@ def check_objective(
 def objective_of(
     magnet: Magnet, reference: MultipoleReference | None, session: Session,
     about: Floats | None = None,
-) -> MultipoleModel | DeviationModel:
+) -> Objective:
     """Return what the study asks for as a function of the magnetizations.
 
     Parameters

@@ -84,13 +84,10 @@ class Mounts:
             & (self.designed @ turn @ directions.T > np.cos(LARGEST_ANGLE))
             for turn, allowed in zip(self.turns, self.allowed, strict=True)])
 
-    def carried(self, to: Ints, turn: Ints) -> Floats:
-        """Return rotations (n, 3, 3) from the own axes of moved blocks to the axes of the magnet.
+    def carried(self, to: int, turn: int) -> Floats:
+        """Return the rotation (3, 3) from the own axes of a moved block to those of the magnet.
 
-        Parameters
-        ----------
-        to, turn : ndarray of int, shape (n,)
-            Numbers of the slots, and of the turns (see `turns`).
+        ``to`` is the number of the slot, ``turn`` that of the turn (see `turns`).
         """
         return np.asarray(self.frames[to] @ self.turns[turn])
 

@@ -126,7 +126,7 @@ class Catalogue:
     @classmethod
     def of(cls, study: Study, region: Region, density_kg_per_m3: float) -> Catalogue:
         """Compute the fields of all rings that the study's design may choose."""
-        design, array = design_of(study), study.array.of_ring(1)
+        design = design_of(study)
         steps = np.arange(design.rings) - (design.rings - 1) / 2
         z: Floats = np.array(design.spacing_m * steps[steps >= 0], float)
         options = tuple(_options(study, design))
@@ -138,7 +138,7 @@ class Catalogue:
         mass: dict[RingOfBlocks | None, Floats] = {None: np.zeros(len(z))}
         for ring in rings:
             field[ring] = fields_with_images(study, ring, z, sample.points) @ sample.direction
-            volume = sum(block.volume for block in blocks_of(study, [ring.table(array, 0.0)]))
+            volume = sum(block.volume for block in ring_of(study, ring))
             mass[ring] = np.where(z > ROUNDING_M, 2, 1) * density_kg_per_m3 * volume
 
         def table(of_ring: dict[RingOfBlocks | None, Floats]) -> Floats:
@@ -168,10 +168,9 @@ class Catalogue:
 
     def mass_of(self, rings: Sequence[Option]) -> float:
         """Return the mass of a design in kg."""
-        array = self.study.array.of_ring(1)
         return self.density_kg_per_m3 * sum(
             copies * block.volume for copies, ring in self._every(rings)
-            for block in blocks_of(self.study, [ring.table(array, 0.0)]))
+            for block in ring_of(self.study, ring))
 
     def _every(self, rings: Sequence[Option]) -> Iterator[tuple[int, RingOfBlocks]]:
         """Yield the number of copies of each ring, and the ring."""
@@ -241,9 +240,10 @@ def designed(study: Study, rings: Sequence[Ring]) -> Study:
     return study.with_(array=array.with_(ring=tuple(rings), rings=len(rings)), prior__types=types)
 
 
-def blocks_of(study: Study, rings: Sequence[Ring]) -> tuple[MagnetBlock, ...]:
-    """Return the blocks of some rings."""
-    return nominal_blocks(designed(study, rings).array, study.dimension)
+def ring_of(study: Study, ring: RingOfBlocks) -> tuple[MagnetBlock, ...]:
+    """Return the blocks of a ring at z = 0."""
+    table = ring.table(study.array.of_ring(1), 0.0)
+    return nominal_blocks(designed(study, [table]).array, study.dimension)
 
 
 def largest_number(array: Array, radius: float, size: float, gap: float) -> int:
@@ -300,7 +300,7 @@ def reach(study: Study, ring: RingOfBlocks) -> tuple[float, float]:
     half = ring.size_m / 2
     if array.block.shape == "cuboid" and array.block.orientation == "magnetization":
         half *= sqrt(2)
-    corners = [float(np.hypot(*edge.start)) for block in blocks_of(study, [ring.table(array, 0.0)])
+    corners = [float(np.hypot(*edge.start)) for block in ring_of(study, ring)
                for edge in block.outline]
     return ring.radius_m - half, max(corners)
 
@@ -324,8 +324,7 @@ def _rings(study: Study, layer: DesignLayer) -> Iterator[RingOfBlocks]:
                     f"{radius:g} with blocks of {1e3 * size:g} mm"
                     + f", {1e3 * layer.gap_m:g} mm apart" * bool(layer.gap_m)))
             ring = RingOfBlocks(radius, size, blocks)
-            if blocks > most and (layer.gap_m or overlapping_blocks(
-                    blocks_of(study, [ring.table(array, 0.0)]))):
+            if blocks > most and (layer.gap_m or overlapping_blocks(ring_of(study, ring))):
                 raise StudyError(must_be(
                     "`design.layer.blocks_per_ring`", f"study {study.name}",
                     f"so small that blocks of {1e3 * size:g} mm fit at the radius {radius:g} m"
@@ -341,8 +340,7 @@ def fields_with_images(study: Study, ring: RingOfBlocks, z: Floats, points: Floa
     """
     heights = np.append(z, -z[z > ROUNDING_M])
     moved = points - np.outer(heights, [0.0, 0.0, 1.0])[:, None]  # (places and images, n, 3)
-    blocks = blocks_of(study, [ring.table(study.array.of_ring(1), 0.0)])
-    found = field_of(blocks, moved.reshape(-1, 3)).reshape(moved.shape)
+    found = field_of(ring_of(study, ring), moved.reshape(-1, 3)).reshape(moved.shape)
     found[:len(z)][z > ROUNDING_M] += found[len(z):]
     return found[:len(z)]
 

@@ -21,14 +21,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import check_number
 from halbach_fe.design.forces import DENSITY_KG_PER_M3
-from halbach_fe.design.ring_catalogue import (
-    Catalogue,
-    Option,
-    design_of,
-    designed,
-    fields_with_images,
-    tables_of,
-)
+from halbach_fe.design.ring_catalogue import Catalogue, Option, design_of, designed, tables_of
 from halbach_fe.design.ring_search import MISSES, Found, Task, moved_radii, search
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.response.homogeneity import (
@@ -36,9 +29,12 @@ from halbach_fe.response.homogeneity import (
     Region,
     Slice,
     default_region,
+    extremes,
+    region_points,
     slice_points,
     slices_of,
 )
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
@@ -58,8 +54,8 @@ class RingDesign:
     mean_T : float
         Mean of |B| over the region's volume.
     rms_ppm, peak_to_peak_ppm : float
-        Deviations of |B| from it, over the volume and over all points of surface and volume, as
-        those of `halbach_fe.response.homogeneity`.
+        Deviations of |B| from it, over the volume and between its extremes, as those of
+        `halbach_fe.response.homogeneity`.
     mass_kg : float
     blocks : int
     """
@@ -170,22 +166,30 @@ def design_rings(
         found = search(task, chosen, restarts, generator)
         if np.array_equal(chosen, found.chosen):
             break
-    every = [found, *_front(task, found, generator)]
+    every = list({tuple(one.chosen): one
+                  for one in (found, *_front(task, found, generator))}.values())
     # the search for more field may find a better design
     number = int(np.argmin([one.ppm for one in every]))
     found = every[number]
     if number:
         reaction = _reaction(catalogue, found.chosen, session)
-    others = [_judged(catalogue, catalogue.rings(one.chosen), reaction) for one in every]
-    # the search worked for the component along the main field
-    best = min((one for one, at in zip(others, every, strict=True) if at.ppm < MISSES),
-               key=lambda one: one.deviation_ppm(design.objective), default=others[number])
+    reached = found.ppm < MISSES
+    # the search worked for the component along the main field, at points
+    judged = [_judged(catalogue, region, catalogue.rings(one.chosen), reaction)
+              for one in every if not reached or one.ppm < MISSES]
+    best = judged[number] if not reached else _least(judged, design.objective)
     if design.between_radii:
-        best = _judged(catalogue, moved_radii(catalogue, best.rings, reaction @ direction, task),
-                       reaction)
+        moved = _judged(catalogue, region, moved_radii(
+            catalogue, best.rings, reaction @ direction, task), reaction)
+        best = moved if not reached else _least([moved, best], design.objective)
     result = designed(study, tables_of(study, catalogue.z_m, best.rings))
-    return Designed(result, region, best, _not_beaten([*others, best], design.objective),
-                    found.ppm < MISSES, _slices(result, region, session))
+    return Designed(result, region, best, _not_beaten([best, *judged], design.objective),
+                    reached, _slices(result, region, session))
+
+
+def _least(designs: Sequence[RingDesign], objective: str) -> RingDesign:
+    """Return the design of the least deviation, of equal ones the strongest."""
+    return min(designs, key=lambda one: (one.deviation_ppm(objective), -one.mean_T))
 
 
 def task_of(catalogue: Catalogue, reaction: Floats) -> Task:
@@ -240,18 +244,28 @@ def _front(task: Task, best: Found, generator: np.random.Generator) -> list[Foun
     return found
 
 
-def _judged(catalogue: Catalogue, rings: tuple[Option, ...], reaction: Floats) -> RingDesign:
-    """Return a design with its field, to which permeability adds ``reaction`` (k, 3) in T."""
+def _judged(
+    catalogue: Catalogue, region: Region, rings: tuple[Option, ...], reaction: Floats
+) -> RingDesign:
+    """Return a design with its field, to which permeability adds ``reaction`` (k, 3) in T.
+
+    By how much the extremes exceed those at the points of the catalogue's sample is found from the
+    field in vacuum.
+    """
     sample = catalogue.sample
-    size = np.linalg.norm(reaction + np.sum([
-        fields_with_images(catalogue.study, ring, catalogue.z_m[place:place + 1], sample.points)[0]
-        for place, option in enumerate(rings) for ring in option if ring], axis=0), axis=1)
+    magnet = build_magnet(designed(catalogue.study, tables_of(
+        catalogue.study, catalogue.z_m, rings)))
+    vacuum = field_of(magnet.blocks, sample.points)
+    bare, size = (np.linalg.norm(field, axis=1) for field in (vacuum, vacuum + reaction))
+    near = region_points(magnet, region)
+    low, high = extremes(region, near.points, near.steps,
+                         field_of(magnet.blocks, near.points)[..., None])
+    whole = np.ptp(size) + max(high[0] - bare.max(), 0.0) + max(bare.min() - low[0], 0.0)
     mean = float(sample.weights @ size)
     deviation = PPM * (size / mean - 1)
     return RingDesign(
         catalogue.z_m, rings, mean, float(np.sqrt(sample.weights @ deviation**2)),
-        float(np.ptp(deviation)), catalogue.mass_of(rings),
-        catalogue.blocks_of(rings))
+        float(PPM * whole / mean), catalogue.mass_of(rings), catalogue.blocks_of(rings))
 
 
 def _not_beaten(designs: Sequence[RingDesign], objective: str) -> tuple[RingDesign, ...]:

@@ -16,6 +16,7 @@ are refused.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,10 +173,10 @@ def shim_tray(
     shimmed, known = _with_shims(model, posterior, choices.fields(model.points, chosen), tray)
     filled = []
     for place in np.flatnonzero(chosen != EMPTY).tolist():
-        number, angle = choices.magnet_and_angle(int(chosen[place]))
+        angle = float(choices.angle[chosen[place]])
         azimuth = float(np.degrees(choices.azimuth[place]))
-        filled.append(Filled(place + 1, vector(choices.places[place]), tray.magnets[number], angle,
-                             round(azimuth + angle, 6) % 360))
+        filled.append(Filled(place + 1, vector(choices.places[place]), tray.magnets[
+            choices.kind[chosen[place]]], angle, round(azimuth + angle, 6) % 360))
     left = {each.name: each.count for each in tray.magnets}
     for one in filled:
         left[one.magnet.name] -= 1
@@ -194,8 +195,6 @@ class _Choices:
     azimuth : ndarray, shape (p,), in rad
     kind, angle : ndarray, shape (o,)
         Number of the magnet and angle in degrees from the radius of each choice for a place.
-    blocks : tuple of tuple of MagnetBlock
-        For each kind of magnet the blocks that it is in all places.
     """
 
     tray: ShimTray
@@ -203,7 +202,6 @@ class _Choices:
     azimuth: Floats
     kind: Ints
     angle: Floats
-    blocks: tuple[tuple[MagnetBlock, ...], ...]
 
     @classmethod
     def of(cls, tray: ShimTray, study: str) -> _Choices:
@@ -224,11 +222,13 @@ class _Choices:
                 f"{len(every)} places times {len(options)} magnets and angles",
                 "Leave out places, kinds of magnets or angles."))
         azimuth = np.arctan2(every[:, 1], every[:, 0])
-        blocks = tuple(tuple(_block(each, place, float(phi), number + 1) for number, (place, phi)
-                             in enumerate(zip(every, azimuth, strict=True)))
-                       for each in tray.magnets)
         return cls(tray, every, azimuth, np.array([number for number, _ in options]),
-                   np.array([angle for _, angle in options]), blocks)
+                   np.array([angle for _, angle in options]))
+
+    @cached_property
+    def blocks(self) -> list[list[MagnetBlock]]:
+        """For each kind of magnet the blocks that it is in all places."""
+        return [self._in_all_places(each) for each in self.tray.magnets]
 
     def all_fields(self, points: Floats) -> Floats:
         """Return B (p, o, n, 3) in T at points (n, 3) in m of every choice for every place."""
@@ -246,9 +246,11 @@ class _Choices:
         """A block in every place that is as large as the largest magnet in each direction."""
         sizes = np.array([each.size_m for each in self.tray.magnets]).max(axis=0).tolist()
         largest = self.tray.magnets[0].with_(size_m=tuple(sizes))
-        return [_block(largest, place, float(phi), number)
-                for number, place, phi in zip(range(1, len(self.places) + 1), self.places,
-                                              self.azimuth, strict=True)]
+        return self._in_all_places(largest)
+
+    def _in_all_places(self, magnet: ShimMagnet) -> list[MagnetBlock]:
+        return [_block(magnet, place, float(phi), number) for number, (place, phi) in enumerate(
+            zip(self.places, self.azimuth, strict=True), start=1)]
 
     def magnets(self, chosen: Ints) -> list[MagnetBlock]:
         """Return the magnets that were chosen, in the order of their places."""
@@ -263,10 +265,6 @@ class _Choices:
         """Return B (shims, n, 3) in T at points (n, 3) in m of the magnets that were chosen."""
         return np.array([block.remanence * unit_field(block, points) @ block.easy_axis
                          for block in self.magnets(chosen)]).reshape(-1, len(points), 3)
-
-    def magnet_and_angle(self, option: int) -> tuple[int, float]:
-        """Return the number of the magnet of a choice, and its angle from the radius in degrees."""
-        return int(self.kind[option]), float(self.angle[option])
 
     def _direction(self, place: int, option: int) -> Floats:
         """Return the direction (3,) of a polarization."""

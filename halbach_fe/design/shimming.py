@@ -179,8 +179,8 @@ class Shim(ShownInNotebook):
 
     def matrix(self, placement: Placement) -> Floats:
         """Return the rotation (3, 3) of a block's magnetization from its old to its new slot."""
-        carried = self.mounts.carried(np.array([placement.to]), np.array([placement.turn]))[0]
-        return carried @ self.mounts.frames[placement.block].T
+        return (self.mounts.carried(placement.to, placement.turn)
+                @ self.mounts.frames[placement.block].T)
 
 
 @dataclass(frozen=True)
@@ -310,9 +310,9 @@ class _MoveModel:
         mean, _ = self.products(chosen)
         return self.model.units(np.concatenate([[self.main], mean[1:]]))
 
-    def carried(self, to: Ints, turn: Ints) -> Floats:
-        """Return `Mounts.carried` reduced to the dimension of the magnet, (n, D, D)."""
-        return self.mounts.carried(to, turn)[:, :self.size, :self.size]
+    def carried(self, placement: Placement) -> Floats:
+        """Return `Mounts.carried` reduced to the dimension of the magnet, (D, D)."""
+        return self.mounts.carried(placement.to, placement.turn)[:self.size, :self.size]
 
     def products(self, moves: Sequence[Move]) -> tuple[Any, Any]:
         """Return mean and root of the products with the matrix after moves, which are exact."""
@@ -329,7 +329,7 @@ class _MoveModel:
         for placement in move.placements:
             to, block = placement.to, placement.block
             columns = self.columns[:, to]
-            carried = columns @ self.carried(np.array([to]), np.array([placement.turn]))[0]
+            carried = columns @ self.carried(placement)
             mean = mean + carried @ self.loose_mean[block] - columns @ self.mean[to]
             root = root + carried @ self.loose[block] - columns @ self.placed[to]
             fresh.append(carried @ self.own[block])
@@ -345,7 +345,7 @@ class _MoveModel:
         fresh = []
         for placement in (placement for move in moves for placement in move.placements):
             to, block = placement.to, placement.block
-            carried = self.carried(np.array([to]), np.array([placement.turn]))[0]
+            carried = self.carried(placement)
             mean[to], root[to] = carried @ self.loose_mean[block], carried @ self.loose[block]
             fresh.append(np.zeros((*mean.shape, self.size)))
             fresh[-1][to] = carried @ self.own[block]

@@ -93,7 +93,7 @@ class SortedBlocks(ShownInNotebook):
     """
 
     study: Study
-    model: MultipoleModel | DeviationModel
+    model: Objective
     table: BlockTable
     turn_deg: Floats
     best: Any
@@ -151,7 +151,7 @@ class _Blocks:
 
 
 def sort_blocks(
-    magnet: Magnet, table: BlockTable, model: MultipoleModel | DeviationModel,
+    magnet: Magnet, table: BlockTable, model: Objective,
     generator: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None, turns: bool = False,
 ) -> SortedBlocks:
@@ -286,18 +286,13 @@ def _blocks(
     spread = np.zeros((len(table), size, size))  # no order changes what mounting adds
     return _Blocks(
         Slots(np.einsum("qsi,sij->qsj", effect, frames), vectors, spread,
-              mounts.turns[:, :size, :size], _same(classes), class_of.ravel()[slot_types],
-              class_of.ravel()[types]),
+              mounts.turns[:, :size, :size],
+              classes[:, :, None] & np.eye(classes.shape[1], dtype=bool),  # others fit no slot
+              class_of.ravel()[slot_types], class_of.ravel()[types]),
         model.units(np.append(main, model.offset[1:])), types, slot_types)
 
 
-def _same(classes: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return turns (n, A, A) of blocks in slots of their own class (n, A); none in others."""
-    return np.asarray(classes[:, :, None] & np.eye(classes.shape[1], dtype=bool))
-
-
-def _assembled(magnet: Magnet, placed: BlockTable, model: MultipoleModel | DeviationModel
-               ) -> Gaussian:
+def _assembled(magnet: Magnet, placed: BlockTable, model: Objective) -> Gaussian:
     """Return the distribution of the magnetizations, and variations inside, of an assembled magnet.
 
     It has the uncertainty of the measured moments, of the coil's calibration and of the mounting.

@@ -45,7 +45,7 @@ from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
-from halbach_fe.study.maps import PROBE_KEYS
+from halbach_fe.study.inference import PROBE_KEYS
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study

@@ -18,7 +18,7 @@ from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import axes_of_map, odds, register
 from halbach_fe.measurement.campaign import Data, maps_of
 from halbach_fe.solver.session import Session
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 

@@ -34,7 +34,7 @@ from halbach_fe.measurement.instrument import (
     sensor_matrix,
 )
 from halbach_fe.measurement.scan_lines import follows_times
-from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS
+from halbach_fe.study.inference import POSE_KEYS, PROBE_KEYS
 from halbach_fe.study.model import Study
 
 FieldAt = Callable[[Study, Floats], Floats]

@@ -25,7 +25,7 @@ from halbach_fe.measurement.instrument import turn_of
 from halbach_fe.measurement.map_join import MapPose
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.maps import POSE_KEYS, PROBE_KEYS, InstrumentSd
+from halbach_fe.study.inference import POSE_KEYS, PROBE_KEYS, InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 

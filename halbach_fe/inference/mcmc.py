@@ -28,7 +28,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import code_digest
 from halbach_fe.core.errors import HalbachWarning, SamplingError, StudyError
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.core.hdf5 import read_hdf5, with_checksum
+from halbach_fe.core.untrusted import read_hdf5, with_checksum
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model

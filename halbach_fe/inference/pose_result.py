@@ -14,7 +14,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 

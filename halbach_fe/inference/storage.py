@@ -16,8 +16,8 @@ from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, OutputError, must_be, printable
 from halbach_fe.core.files import write_text
-from halbach_fe.core.hdf5 import ChangedContentError, read_hdf5, with_checksum, write_hdf5
 from halbach_fe.core.numbers import csv_text
+from halbach_fe.core.untrusted import ChangedContentError, read_hdf5, with_checksum, write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Reservation
 from halbach_fe.measurement.instrument import row_order_note

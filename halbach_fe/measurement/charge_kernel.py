@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import sqrt
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.compiled import reordered
+from halbach_fe.core.threads import reordered
 
 
 @reordered

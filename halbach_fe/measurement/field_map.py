@@ -42,10 +42,10 @@ from halbach_fe.core.errors import (
     OutputError,
     must_be,
 )
-from halbach_fe.core.files import _write_bytes, as_path, atomic, file_bytes
-from halbach_fe.core.hdf5 import _hdf5
+from halbach_fe.core.files import as_path, atomic, file_bytes
 from halbach_fe.core.numbers import decimals
 from halbach_fe.core.result_folder import single_file
+from halbach_fe.core.untrusted import hdf5_bytes
 from halbach_fe.measurement.tables import (
     _check_printable,
     check_columns,
@@ -340,8 +340,8 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
 
 def save_map(data: xr.Dataset, path: Path) -> None:
     """Write a map as `write_map` does, whatever was in the file before."""
-    writers: dict[str, Callable[[xr.Dataset, Path], None]] = {
-        ".h5": lambda d, p: _write_bytes(_hdf5(d), p), ".csv": _write_csv, ".vtu": _write_vtu}
+    writers: dict[str, Callable[[xr.Dataset, Path], object]] = {
+        ".h5": lambda d, p: p.write_bytes(hdf5_bytes(d)), ".csv": _write_csv, ".vtu": _write_vtu}
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.measurement.instrument import sensor_matrix, sensor_positions
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.types import COMPONENTS
 

@@ -302,19 +302,21 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
     axis.add_collection(PolyCollection(
         corners, array=size[chosen], cmap="Blues", norm=colours, edgecolor="#777777", lw=0.6))
     middles = np.array([corner.mean(axis=0) for corner in corners])
+    extent, largest = float(np.abs(np.vstack(corners)).max()), float(size[chosen].max())
     flat = found.in_place.force_N[chosen, :2]
-    longest = float(np.linalg.norm(flat, axis=1).max())
-    if longest > NEGLIGIBLE:
-        arrows = 0.35 * float(np.abs(middles).max() or 1.0) * flat / longest
-        drawn = axis.quiver(*middles.T, *arrows.T, angles="xy", scale_units="xy", scale=1,
-                            color=PRIOR, width=0.005, edgecolor=MEASURED, lw=0.3)
-        shown = round_below(longest)
-        axis.quiverkey(drawn, 0.2, 0.04, shown / longest * float(
-            np.linalg.norm(arrows, axis=1).max()), _newton(shown), labelpos="E", coordinates="axes",
-                       fontproperties={"size": SMALL})
+    # part of the largest force from which its part in the plane is drawn: less cannot be seen
+    seen = 0.02
+    if np.linalg.norm(flat, axis=1).max() > max(NEGLIGIBLE, seen * largest):
+        # as long as the whole force: where forces are along z, arrows are short
+        per_newton = 0.3 * extent / largest
+        drawn = axis.quiver(*middles.T, *(per_newton * flat.T), angles="xy", scale_units="xy",
+                            scale=1, color=PRIOR, width=0.005, edgecolor=MEASURED, lw=0.3)
+        shown = round_below(largest)
+        axis.quiverkey(drawn, 0.2, 0.04, per_newton * shown, _newton(shown), labelpos="E",
+                       coordinates="axes", fontproperties={"size": SMALL})
     axis.figure.colorbar(ScalarMappable(colours, "Blues"), ax=axis, label="force in N",
                          location="bottom", shrink=0.6)
-    reach = 1.3 * float(np.abs(np.vstack(corners)).max())
+    reach = 1.3 * extent
     axis.set(aspect="equal", xlabel="x in mm", ylabel="y in mm", xlim=(-reach, reach),
              ylim=(-reach, reach), title=f"ring {found.blocks[chosen[0]].ring}")
 

@@ -45,9 +45,9 @@ from halbach_fe.report.answer import (
     write_record,
 )
 from halbach_fe.report.words import faults_in_words
-from halbach_fe.study.edit_file import study_text, write_edited
 from halbach_fe.study.model import Study, is_nonlinear
 from halbach_fe.study.reader import read_study
+from halbach_fe.study.study_file import study_text, write_edited
 
 # M. Okabe and K. Ito's palette, whose colours differ for every kind of colour vision
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"

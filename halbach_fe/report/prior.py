@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scipy import special
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer

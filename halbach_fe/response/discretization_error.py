@@ -31,7 +31,7 @@ from halbach_fe.solver.formulation_choice import (
 from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.measurement import FourierCoefficients
-from halbach_fe.study.solver import CELLS_PER_SIDE
+from halbach_fe.study.model import CELLS_PER_SIDE
 
 REFINEMENT = 1.5
 """Factor between the element sizes, and between the distances of the boundary, of two solves."""

@@ -28,7 +28,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import code_digest, version
 from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
 from halbach_fe.core.files import atomic
-from halbach_fe.core.hdf5 import read_hdf5, with_checksum, write_hdf5
+from halbach_fe.core.untrusted import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import (

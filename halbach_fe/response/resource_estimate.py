@@ -49,7 +49,7 @@ from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
-from halbach_fe.study.solver import CELLS_PER_SIDE
+from halbach_fe.study.model import CELLS_PER_SIDE
 from halbach_fe.study.types import COMPONENTS
 
 GIB = 2.0**30

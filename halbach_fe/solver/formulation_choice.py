@@ -51,7 +51,7 @@ from halbach_fe.solver.separate_blocks import (
 from halbach_fe.solver.session import NOT_KEPT, Session
 from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.solver import CELLS_PER_SIDE
+from halbach_fe.study.model import CELLS_PER_SIDE
 
 SUPERPOSITION_TOLERANCE = 1e-8
 """Relative tolerance of the check that single blocks add up to the nominal array, if a direct

@@ -28,7 +28,7 @@ from math import atan2, cos, inf, log, pi, sin, sqrt
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.compiled import compiled
+from halbach_fe.core.threads import compiled
 
 _TINY = 1e-26
 """Added to squared distances relative to the square of a prism's size, where a logarithm would be

@@ -7,7 +7,7 @@ from math import pi, sqrt
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.compiled import compiled
+from halbach_fe.core.threads import compiled
 
 
 @compiled

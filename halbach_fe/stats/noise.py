@@ -124,12 +124,11 @@ class NoiseCovariance:
         """
         return float(1 / abs(self._factors[1]).sum(axis=1).max())
 
-    def whiten(self, values: Floats, rows: Rows = slice(None)) -> Floats:
-        """Return W times values (n,) or (n, k), or only the given rows of this product."""
+    def whiten(self, values: Floats) -> Floats:
+        """Return W times values (n,) or (n, k)."""
         if not self.independent:
-            return np.asarray(self._factors[1][rows] @ values)
-        sd = self.sd[rows]
-        return np.asarray(values[rows] / (sd if values.ndim == 1 else sd[:, None]))
+            return np.asarray(self.whitening @ values)
+        return np.asarray(values / (self.sd if values.ndim == 1 else self.sd[:, None]))
 
     def sample(self, generator: np.random.Generator) -> Floats:
         """Draw one sample of the noise of all readings, (n,) in T."""

@@ -21,8 +21,15 @@ from pydantic import ValidationError
 from halbach_fe.core import untrusted
 from halbach_fe.core.errors import OutputError, StudyError, must_be
 from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
-from halbach_fe.core.hdf5 import write_hdf5
-from halbach_fe.core.numbers import MAX_CELL, WITH_COMMAS, csv_text, other_separator, parse_number
+from halbach_fe.core.numbers import (
+    MAX_CELL,
+    WITH_COMMAS,
+    csv_text,
+    numbered_lines,
+    other_separator,
+    parse_number,
+)
+from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import COLUMNS, MAX_BLOCKS, FreeBlocks, RowError
 
@@ -179,8 +186,7 @@ def _csv(raw: bytes, where: str) -> _Content:
         raise StudyError(must_be("encoding", where, "UTF-8",
                                  f"byte 0x{raw[error.start]:02x} at {error.start}",
                                  "Save it as UTF-8 text.")) from None
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)
-             if line.strip() and not line.lstrip().startswith("#")]
+    lines = numbered_lines(text)
     _check_count(len(lines) - 1, where)
     if (separator := other_separator(lines[0][1])) is not None:
         raise StudyError(must_be("header", where, "names that commas separate",

@@ -23,7 +23,7 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.files import workbook_in
 from halbach_fe.core.numbers import MU_0 as MU_0
-from halbach_fe.core.numbers import parse_number as number_in
+from halbach_fe.core.numbers import numbered_lines, parse_number
 
 COLUMNS = ("H_A_per_m", "B_T")
 MIN_POINTS = 4
@@ -350,8 +350,7 @@ def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]
         text = raw.decode("utf-8-sig")  # spreadsheets write a byte order mark
     except UnicodeDecodeError:
         raise ValueError("it must be UTF-8 text; save it as such") from None
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)
-             if line.strip() and not line.lstrip().startswith("#")]
+    lines = numbered_lines(text)
     if not lines:
         raise ValueError(f"it is empty; give the line {','.join(COLUMNS)}, and a line a point")
     header = [name.strip() for name in lines[0][1].split(",")]
@@ -361,7 +360,7 @@ def read_table(path: Traversable) -> tuple[tuple[float, ...], tuple[float, ...]]
     for number, line in lines[1:]:
         try:
             for name, value in zip(header, line.split(","), strict=True):
-                columns[name].append(number_in(value.strip()))
+                columns[name].append(parse_number(value.strip()))
         except ValueError:
             raise ValueError(f"line {number} must hold two numbers and a comma between") from None
     return tuple(columns[COLUMNS[0]]), tuple(columns[COLUMNS[1]])

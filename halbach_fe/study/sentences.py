@@ -202,7 +202,7 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
     # An unknown key is the likeliest cause of the others: a misspelt key is also a missing key.
     errors.sort(key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
-    key, model = _locate(first["loc"], root)
+    key, model, inside = _locate(first["loc"], root)
     value, kind = first.get("input"), first["type"]
     wanted, found, advice = expected(first), received(value), ""
     if (ours := contradiction(first)) is not None:
@@ -226,7 +226,7 @@ def sentence(error: ValidationError, where: str, root: type[BaseModel]) -> str:
     elif kind.startswith("union_tag"):  # pydantic locates the table, of which one key says its kind
         name = first["ctx"]["discriminator"].strip("'")
         key, found = f"{key}.{name}", received(value.get(name))
-        tags = _tags_at(first["loc"], name, root)
+        tags = [str(tag) for one in inside for tag in get_args(one.model_fields[name].annotation)]
         near = difflib.get_close_matches(str(value.get(name)), tags, 1, 0.5)
         advice = f"Did you mean '{near[0]}'?" if near else ""
         if kind == "union_tag_not_found":
@@ -253,8 +253,9 @@ def _more(errors: list[Any]) -> str:
 
 def _locate(
     location: tuple[int | str, ...], root: type[BaseModel]
-) -> tuple[str, type[BaseModel] | None]:
-    """Return the dotted key of a pydantic location, and the model that holds its last part.
+) -> tuple[str, type[BaseModel] | None, list[type[BaseModel]]]:
+    """Return the dotted key of a pydantic location, the model that holds its last part, and those
+    that may stand there.
 
     pydantic puts the tag of a discriminated union into the location. It is left out here, because
     it is no key of the file.
@@ -270,29 +271,13 @@ def _locate(
             continue
         tagged = [m for m in models if len(models) > 1 and part in _tags(m)]
         if tagged:
-            models = owner_models = tagged
-            owner = owner_models[0]
+            models, owner = tagged, tagged[0]
             continue
         owner = models[0] if models else None
         parts.append(part)
         field = owner.model_fields.get(part) if owner else None
         models = _models_in(field.annotation) if field else []
-    return ".".join(parts), owner
-
-
-def _tags_at(
-    location: tuple[int | str, ...], name: str, root: type[BaseModel]
-) -> list[str]:
-    """Return the possible values of the key ``name``, the kind of table, at a pydantic location."""
-    models: list[type[BaseModel]] = [root]
-    for part in location:
-        tagged = [model for model in models if len(models) > 1 and part in _tags(model)]
-        if tagged or isinstance(part, int):
-            models = tagged or models
-            continue
-        field = models[0].model_fields.get(part) if models else None
-        models = _models_in(field.annotation) if field else []
-    return [str(tag) for model in models for tag in get_args(model.model_fields[name].annotation)]
+    return ".".join(parts), owner, models
 
 
 def _tags(model: type[BaseModel]) -> set[str]:

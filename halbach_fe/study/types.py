@@ -153,7 +153,7 @@ class StudyModel(BaseModel):
 
     Examples
     --------
-    >>> from halbach_fe.study.solver import MeshSettings
+    >>> from halbach_fe.study.model import MeshSettings
     >>> MeshSettings(block_size_m=0.01).with_(growth=1.6).growth
     1.6
     """

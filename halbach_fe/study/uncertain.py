@@ -69,7 +69,9 @@ def _check_number(study: Study, name: str) -> None:
     hint = ""
     for step in _steps(name):
         known = dict(_parts(value))
-        hint = _nearest(step, known)
+        near = [] if step in known else difflib.get_close_matches(
+            str(step), [key for key in known if isinstance(key, str)], 1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
         value = known.get(step)
         if value is None:
             break
@@ -78,13 +80,6 @@ def _check_number(study: Study, name: str) -> None:
     if not isinstance(value, float):
         raise ValueError(f"uncertain.change names '{name}', which must be a number with a "
                          f"fraction that the study states{hint}")
-
-
-def _nearest(step: str | int, known: Mapping[str | int, Any]) -> str:
-    """Return a question about the key of ``known`` that is most like one that is not among them."""
-    keys = [key for key in known if isinstance(key, str)]
-    near = difflib.get_close_matches(str(step), keys, 1) if step not in known else []
-    return f"; did you mean '{near[0]}'?" if near else ""
 
 
 def shifted(study: Study, uncertain: Uncertain, amount: float) -> Study:

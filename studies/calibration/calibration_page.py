@@ -14,7 +14,7 @@ from halbach_fe.core.arrays import Ints
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import POSTERIOR, PUBLISHED, Page, Section, Table, Text, figure_of
 from halbach_fe.report.words import counted, fraction, p_value
-from halbach_fe.stats.calibration import BINS
+from halbach_fe.stats.small_samples import BINS
 
 CONTROL = "control: "
 """Beginning of the name of a posterior that is wrong on purpose."""

@@ -49,7 +49,7 @@ from halbach_fe.response.magnetic_axis import HEIGHTS, LENGTH, RADIUS, magnetic_
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.session import Session
-from halbach_fe.stats.calibration import (
+from halbach_fe.stats.small_samples import (
     error_if_calibrated,
     expected_calibration_error,
     frequencies,

@@ -198,8 +198,11 @@ COMMANDS: dict[str, tuple[str, list[str]]] = {
 """Folder and options of every command but `solve`, which makes the map for the others."""
 
 WHOLE = ("missing", "displaced", "missing-permeable", "layers-missing", "free-turned",
-         "free-missing", "free-types", "flat-missing", "flat-layers", "losses", "varying")
+         "free-missing", "flat-missing", "flat-layers", "losses", "varying")
 """Studies for every command, which among them have every kind of magnet."""
+
+OF_TYPES = ("shim", "sort", "prior")
+"""Commands to which the types of free blocks matter, besides those of `BRIEF`."""
 
 BRIEF = ("infer-blocks", "diagnose", "multipoles", "demagnetization", "export")
 """Commands for every study: each has a way of its own from the keys to a field."""
@@ -214,6 +217,7 @@ diagnosis, of many fields, takes minutes with iron of any kind."""
 PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
          if (name in WHOLE and (name, command) != ("flat-layers", "simulate-measurement"))
          or command == SLOW.get(name)
+         or (name == "free-types" and command in OF_TYPES)
          or (command in BRIEF and name not in SLOW
              and not (command == "diagnose" and name.startswith("iron")))]
 

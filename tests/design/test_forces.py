@@ -8,6 +8,7 @@ import magpylib
 import numpy as np
 import pytest
 import tomlkit
+from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
@@ -15,7 +16,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
 from halbach_fe.design.forces import Charges, forces
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.forces import page, round_below
+from halbach_fe.report.forces import forces_figure, page, round_below
 from halbach_fe.report.result_files import write_report
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
@@ -405,6 +406,21 @@ def test_uncertain_forces_are_said_to_be(tmp_path, monkeypatch):
     (1.22, 1.0), (2.0, 2.0), (4.99, 2.0), (0.0071, 0.005), (12345.0, 10000.0)])
 def test_the_arrow_of_the_key_has_a_round_size(size, shown):
     assert round_below(size) == pytest.approx(shown)
+
+
+@pytest.mark.parametrize(("offset", "seen"), [(0.0, False), (1e-4, False), (0.006, True)])
+def test_arrows_in_the_plane_are_as_long_as_the_forces_there(tmp_path, offset, seen):
+    """Cubes above each other pull along z: what is left in the plane is no arrow of full length."""
+    found = found_of(free_blocks([[0, 0, 0, 0, 0, 1.0], [offset, 0, 1.2 * SIDE_M, 0, 0, 1.0]]),
+                     tmp_path)
+    arrows = [each for each in forces_figure(found).axes[0].collections
+              if isinstance(each, Quiver)]
+    assert len(arrows) == seen
+    if seen:
+        lengths = np.hypot(arrows[0].U, arrows[0].V)
+        flat = np.linalg.norm(found.in_place.force_N[:, :2], axis=1)
+        reach = 1e3 * (offset + SIDE_M / 2)
+        assert lengths == pytest.approx(0.3 * reach * flat / found.in_place.magnitude.max())
 
 
 def test_command(tmp_path, capsys):

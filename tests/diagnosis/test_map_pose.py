@@ -20,7 +20,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.map_pose import FoundPose, find_poses, with_poses
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.solver.session import Session
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study
 from tests.support.short_dipole import GRID, NOISE_T, TEXT, measured, truth

@@ -56,7 +56,6 @@ from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
 from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
 from halbach_fe.solver.session import Session, newton_residuals
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
-from halbach_fe.study.edit_file import edited_text
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.free_blocks_file import (
@@ -66,6 +65,7 @@ from halbach_fe.study.free_blocks_file import (
 )
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import _with_table, parse_study, read_study
+from halbach_fe.study.study_file import edited_text
 from tests.conftest import DIPOLE, ROOT, changed, circle
 from tests.fuzz.contract import Reader
 from tests.fuzz.documents import FREE, RICH, document

@@ -68,7 +68,7 @@ from halbach_fe.report.registration import (
     rivals,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study
 from tests.support import cube_dipole

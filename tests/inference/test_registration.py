@@ -43,7 +43,7 @@ from halbach_fe.report.registration import (
     stated_odds,
 )
 from halbach_fe.solver.session import Session
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.reader import parse_study, read_study

@@ -20,7 +20,7 @@ import xarray as xr
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import ExtraMissingError, GetDPError, SchedulerError
-from halbach_fe.core.hdf5 import write_hdf5
+from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.dask_cluster import Cluster, connected
 from halbach_fe.solver.formulation_choice import solve_nominal

@@ -31,8 +31,8 @@ from halbach_fe.solver.formulation_choice import (
 from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import RunSize
+from halbach_fe.study.model import MeshSettings
 from halbach_fe.study.reader import parse_study
-from halbach_fe.study.solver import MeshSettings
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
 from tests.geometry.test_iron import triangles_of_box

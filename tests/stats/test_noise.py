@@ -43,7 +43,6 @@ def test_whitening_against_the_dense_matrix(noise, dense, generator):
     values = generator.standard_normal((len(dense), 4))
     np.testing.assert_allclose(noise.whiten(values), white @ values)
     np.testing.assert_allclose(noise.whiten(values[:, 0]), white @ values[:, 0])
-    np.testing.assert_allclose(noise.whiten(values, slice(3, 8)), (white @ values)[3:8])
     assert noise.log_sqrt_determinant == pytest.approx(np.linalg.slogdet(dense)[1] / 2)
     np.testing.assert_allclose(noise.sd, np.sqrt(np.diag(dense)))
     # the control: without the correlations it is no whitening
@@ -56,7 +55,7 @@ def test_independent_noise(generator):
     noise, values = independent_noise(sd), generator.standard_normal((6, 3))
     assert noise.independent
     np.testing.assert_allclose(noise.whiten(values), values / sd[:, None])
-    np.testing.assert_allclose(noise.whiten(values[:, 1], slice(2, 4)), (values[:, 1] / sd)[2:4])
+    np.testing.assert_allclose(noise.whiten(values[:, 1]), values[:, 1] / sd)
     assert noise.log_sqrt_determinant == pytest.approx(np.log(sd).sum())
     assert noise.uniform_error_scale == pytest.approx(sd.min())
 

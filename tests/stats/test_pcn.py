@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import SamplingError
-from halbach_fe.stats.calibration import ranks, uniformity
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import update
 from halbach_fe.stats.noise import independent_noise
@@ -19,6 +18,7 @@ from halbach_fe.stats.pcn import (
     require_convergence,
     sample,
 )
+from halbach_fe.stats.small_samples import ranks, uniformity
 
 SIZE = 3
 

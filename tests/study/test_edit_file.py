@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.study import edit_file
-from halbach_fe.study.edit_file import REWRITTEN_NOTE, edited_text, study_text
+from halbach_fe.study import study_file
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.reader import parse_study, read_study
+from halbach_fe.study.study_file import REWRITTEN_NOTE, edited_text, study_text
 from tests.conftest import ROOT
 
 EFFECTS = {effect.name: effect for effect in catalogue()}
@@ -163,7 +163,7 @@ def test_a_file_that_cannot_be_changed_is_written_anew(monkeypatch):
     study = parse_study(tomllib.loads(PLAIN))
     (step,) = with_effects(study, ["gain_x"], np.random.default_rng(1))
     assert REWRITTEN_NOTE not in edited_text(PLAIN, [step])
-    monkeypatch.setattr(edit_file, "_set", lambda *_: None)
+    monkeypatch.setattr(study_file, "_set", lambda *_: None)
     changed = edited_text(PLAIN, [step])
     assert changed.startswith(f"# {REWRITTEN_NOTE}\n# {step[1]}\n")
     assert parse_study(tomllib.loads(changed)) == step[0]

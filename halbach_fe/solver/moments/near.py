@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.compiled import compiled
+from halbach_fe.core.threads import compiled
 from halbach_fe.solver.prism_kernel import Six, prism_field
 
 Flags = NDArray[np.bool_]

@@ -43,7 +43,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.solver.exact_block_field import unit_fields
 from halbach_fe.solver.moments.cells import Cells, cells_of
 from halbach_fe.solver.moments.interaction import Interaction, Neighbours
-from halbach_fe.study.solver import CELLS_PER_SIDE
+from halbach_fe.study.model import CELLS_PER_SIDE
 
 MAX_STEPS = 100
 """Largest number of steps. Each reduces the error by chi/(2 + chi) or more, a third for chi = 1."""

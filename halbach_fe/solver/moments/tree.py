@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.compiled import compiled, reordered
+from halbach_fe.core.threads import compiled, reordered
 
 Harmonics = NDArray[np.complex128]
 
