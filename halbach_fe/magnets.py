@@ -38,7 +38,7 @@ from halbach_fe.study.template import (
     parse_new_study,
     write_new_study,
 )
-from halbach_fe.synthetic.optional_packages import import_extra
+from halbach_fe.synthetic import import_extra
 
 WRITTEN = "# Written by halbach_fe.write_study, which replaces no other file.\n"
 """First line of the studies that `write_study` writes."""

@@ -21,7 +21,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.pace import Progress
 from halbach_fe.study.materials import MU_0
-from halbach_fe.synthetic.optional_packages import import_extra
+from halbach_fe.synthetic import import_extra
 from halbach_fe.synthetic.shapes import (
     CylinderBody,
     Fractions,

@@ -25,8 +25,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.study.materials import MU_0
+from halbach_fe.synthetic import import_extra
 from halbach_fe.synthetic.iron import Ball, FroehlichLaw, IronLaw, Pole, TableLaw, Tube
-from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.shapes import CylinderBody, PolygonBody, SectorBody, Shape
 from halbach_fe.synthetic.true_magnet import Body, TrueMagnet
 

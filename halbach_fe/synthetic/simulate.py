@@ -13,6 +13,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version as version_of
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,6 @@ from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.knee_losses import lost_field
 from halbach_fe.synthetic.magpylib_field import no_progress, vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field
-from halbach_fe.synthetic.optional_packages import version_of
 from halbach_fe.synthetic.reaction import by_elements, reaction_field
 from halbach_fe.synthetic.true_magnet import ZERO_VECTOR, TrueMagnet, in_places
 

@@ -57,9 +57,9 @@ from halbach_fe.stats.calibration import (
 from halbach_fe.study.inference import HeldOut
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
+from halbach_fe.synthetic import import_extra
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
-from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 

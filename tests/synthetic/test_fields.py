@@ -12,7 +12,7 @@ from halbach_fe.core.errors import ExtraMissingError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import finite_element_part, solve_nominal
-from halbach_fe.synthetic import magpylib_field, optional_packages
+from halbach_fe.synthetic import import_extra, magpylib_field
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
 from halbach_fe.synthetic.ngsolve_reaction import Elements, moment_field, reaction_field
@@ -271,4 +271,4 @@ def test_programs_that_are_not_installed(monkeypatch):
     """One sentence that says what to install."""
     monkeypatch.setitem(__import__("sys").modules, "magpylib", None)
     with pytest.raises(ExtraMissingError, match=r"pip install halbach-fe\[campaign\]"):
-        optional_packages.import_extra("magpylib")
+        import_extra("magpylib")
