@@ -17,13 +17,13 @@ from halbach_fe.synthetic.faulty_instrument import FaultyInstrument
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     Draw,
     HiddenEffect,
-    HiddenParameter,
     Need,
     Site,
     draw_direction,
     draw_length,
     draw_number,
     log_uniform,
+    parameters,
     signed_log_uniform,
 )
 from halbach_fe.synthetic.iron import Ball
@@ -76,20 +76,19 @@ def _draw_vector(low: float, high: float) -> Draw:
     return draw
 
 
-def _fault(name: str, parameters: str | tuple[HiddenParameter, ...], draw: Draw, apply: Apply,
-           *needs: Need) -> HiddenEffect:
-    """Return an effect of the instrument, whose parameters are stated as ``name unit, ...``."""
-    return HiddenEffect(name, "instrument", tuple(
-        HiddenParameter(*one.split()) for one in parameters.split(", "))
-        if isinstance(parameters, str) else parameters, draw, instrument=apply, needs=needs)
+def _fault(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need,
+           **limits: Any) -> HiddenEffect:
+    """Return an effect of the instrument, whose parameters are stated as in `parameters`."""
+    return HiddenEffect(name, "instrument", parameters(stated, **limits), draw, instrument=apply,
+                        needs=needs)
 
 
 NUMBERED = tuple(enumerate(COMPONENTS))
-STRETCH = (HiddenParameter("fraction", least=-0.5, most=1.0),)
+STRETCH = {"fraction": (-0.5, 1.0)}
 
 FAULTS = (
-    *(_fault(f"gain_{name}", (HiddenParameter("fraction", least=-0.9, most=10.0),),
-             draw_number(5e-4, 1e-2), _plus("gain", sensor), name) for sensor, name in NUMBERED),
+    *(_fault(f"gain_{name}", "fraction", draw_number(5e-4, 1e-2), _plus("gain", sensor), name,
+             fraction=(-0.9, 10.0)) for sensor, name in NUMBERED),
     *(_fault(f"offset_{name}", "value T", draw_number(5e-5, 1e-3), _plus("offset", sensor), name)
       for sensor, name in NUMBERED),
     *(_fault(f"sensor_position_{name}", "x m, y m, z m", _draw_vector(3e-4, 3e-3),
@@ -106,8 +105,9 @@ FAULTS = (
     _fault("mapper_roll", "angle rad", draw_number(5e-4, 5e-3), _turned(2)),
     _fault("mapper_tilt_x", "angle rad", draw_number(5e-4, 5e-3), _turned(0), "3d"),
     _fault("mapper_tilt_y", "angle rad", draw_number(5e-4, 5e-3), _turned(1), "3d"),
-    _fault("z_scale", STRETCH, draw_number(2e-4, 3e-3), _plus("z_scale"), "3d"),
-    _fault("radius_scale", STRETCH, draw_number(1e-3, 1e-2), _plus("radius_scale"), "circles"),
+    _fault("z_scale", "fraction", draw_number(2e-4, 3e-3), _plus("z_scale"), "3d", **STRETCH),
+    _fault("radius_scale", "fraction", draw_number(1e-3, 1e-2), _plus("radius_scale"), "circles",
+           **STRETCH),
     _fault("arm_sag", "distance m", draw_length(3e-4, 3e-3, False), _sagging, "3d"),
     _fault("eccentric_circle", "distance m, angle rad",
            lambda site, generator: (site.scale * log_uniform(generator, 2e-4, 2e-3),
@@ -116,15 +116,15 @@ FAULTS = (
     _fault("drift", "value T", draw_number(1e-4, 1e-3), _plus("drift")),
     _fault("gain_drift", "change", draw_number(5e-4, 5e-3), _plus("gain_drift")),
     _fault("lag", "distance m", draw_length(1e-4, 5e-4, False), _plus("lag"), "3d"),
-    _fault("slow_readings", (HiddenParameter("fraction", least=-0.5, most=0.5),
-                             HiddenParameter("rows", least=0.0)),
-           lambda site, generator: (log_uniform(generator, 1e-3, 1e-2), 0.0), _set("memory")),
-    _fault("vibration", (HiddenParameter("distance", "m", 0.0, 0.1),),
-           draw_length(5e-5, 5e-4, False), _set("vibration")),
-    _fault("outliers", (HiddenParameter("fraction", least=0.0, most=1.0),
-                        HiddenParameter("value", "T")),
+    _fault("slow_readings", "fraction, rows",
+           lambda site, generator: (log_uniform(generator, 1e-3, 1e-2), 0.0), _set("memory"),
+           fraction=(-0.5, 0.5), rows=(0.0,)),
+    _fault("vibration", "distance m", draw_length(5e-5, 5e-4, False), _set("vibration"),
+           distance=(0.0, 0.1)),
+    _fault("outliers", "fraction, value T",
            lambda site, generator: (log_uniform(generator, 3e-3, 2e-2),
-                                    log_uniform(generator, 1e-3, 1e-2)), _set("outliers")))
+                                    log_uniform(generator, 1e-3, 1e-2)), _set("outliers"),
+           fraction=(0.0, 1.0)))
 """What an instrument may do wrong, see the faults of `FaultyInstrument`."""
 
 
@@ -182,10 +182,9 @@ def wrong_ring_count(magnet: TrueMagnet, site: Site, more: float) -> TrueMagnet:
         for body in bodies))
 
 
-def _gross(name: str, draw: Draw, apply: Apply, *needs: Need,
-           parameters: str = "") -> HiddenEffect:
+def _gross(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need) -> HiddenEffect:
     """Return a gross error of the instrument."""
-    return replace(_fault(name, parameters or (), draw, apply, *needs), group="gross")
+    return replace(_fault(name, stated, draw, apply, *needs), group="gross")
 
 
 def _nothing(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
@@ -195,24 +194,23 @@ def _nothing(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
 
 GROSS_ERRORS = (
     # on another radius; a line on the axis becomes one beside it
-    _gross("wrong_radius", lambda site, generator: (signed_log_uniform(generator, 0.05, 0.2) * (
-        site.radius if site.radius > 0 else site.inner),), _plus("radius_error"),
-        parameters="change m"),
-    _gross("swapped_axes", _draw_swap, _swapped, "axes", parameters="first, second"),
-    _gross("sign_flipped_axis", lambda site, generator: (
-        float(1 + "xyz".index(generator.choice(site.components))),), _sign_flipped, "axes",
-        parameters="axis"),
-    _gross("millimetres", _nothing, lambda instrument, site: replace(
+    _gross("wrong_radius", "change m", lambda site, generator: (
+        signed_log_uniform(generator, 0.05, 0.2) * (
+            site.radius if site.radius > 0 else site.inner),), _plus("radius_error")),
+    _gross("swapped_axes", "first, second", _draw_swap, _swapped, "axes"),
+    _gross("sign_flipped_axis", "axis", lambda site, generator: (
+        float(1 + "xyz".index(generator.choice(site.components))),), _sign_flipped, "axes"),
+    _gross("millimetres", "", _nothing, lambda instrument, site: replace(
         instrument, length_unit=1000.0)),
-    _gross("millitesla", _nothing, lambda instrument, site: replace(
+    _gross("millitesla", "", _nothing, lambda instrument, site: replace(
         instrument, field_unit=1000.0)),
     # measured from the other end, with the probe's axes as they should be
-    _gross("reversed_z", _nothing, lambda instrument, site: replace(
+    _gross("reversed_z", "", _nothing, lambda instrument, site: replace(
         instrument, reversed_z=not instrument.reversed_z), "3d"),
-    HiddenEffect("rotated_by_one_block", "gross", (HiddenParameter("blocks"),),
+    HiddenEffect("rotated_by_one_block", "gross", parameters("blocks"),
                  lambda site, generator: (float(generator.choice([-1.0, 1.0])),),
                  rotated_by_one_block, needs=("equal rings",)),
-    HiddenEffect("wrong_ring_count", "gross", (HiddenParameter("more"),),
+    HiddenEffect("wrong_ring_count", "gross", parameters("more"),
                  lambda site, generator: (float(generator.choice([-1.0, 1.0]))
                                           if site.rings > 1 else 1.0,),
                  wrong_ring_count, needs=("3d", "equal rings")),
