@@ -258,6 +258,22 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
         [column for candidate in candidates for column in candidate.free]).log_evidence
 
 
+def odds_beside(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], prior: Floats,
+    excluded: Collection[int] = (),
+) -> Floats:
+    """Return the log posterior odds (candidates,) of each candidate beside chosen ones.
+
+    They are -inf of these, of excluded ones, and at other places of chosen effects that are unique.
+    """
+    beside = [candidates[number] for number in chosen]
+    odds = log_bayes_factors(with_candidates(evidence, beside), candidates) + prior
+    taken = {candidate.effect for candidate in beside if candidate.unique}
+    odds[[number for number, candidate in enumerate(candidates)
+          if number in chosen or number in excluded or candidate.effect in taken]] = -np.inf
+    return odds
+
+
 def select_effects(
     evidence: Evidence, candidates: Sequence[Candidate], max_effects: int = MAX_EFFECTS,
     excluded: Collection[int] = (),
@@ -277,12 +293,7 @@ def select_effects(
     chosen: list[int] = []
     seen: set[frozenset[int]] = set()
     while candidates and len(chosen) < max_effects:
-        conditional = with_candidates(evidence, [candidates[number] for number in chosen])
-        odds = log_bayes_factors(conditional, candidates) + prior
-        odds[[*chosen, *excluded]] = -np.inf
-        taken = {candidates[number].effect for number in chosen if candidates[number].unique}
-        odds[[number for number, candidate in enumerate(candidates)
-              if candidate.effect in taken]] = -np.inf
+        odds = odds_beside(evidence, candidates, chosen, prior, excluded)
         best = int(np.argmax(odds))
         if odds[best] < DETECTION_LOG_ODDS:
             break
@@ -290,7 +301,7 @@ def select_effects(
         chosen = _at_best_places(evidence, candidates, [*chosen, best], excluded)
         chosen = _exchanged(evidence, candidates, chosen, prior, excluded)
         best = chosen[-1]
-        chosen = _without_needless(evidence, candidates, chosen, prior)
+        chosen = without_needless(evidence, candidates, chosen, prior, fewest=1)
         if best not in chosen or len(chosen) <= before - 1 or frozenset(chosen) in seen:
             break  # else the same candidates would be added and dropped for ever
         seen.add(frozenset(chosen))
@@ -326,31 +337,42 @@ def _exchanged(
     """
     chosen = list(chosen)
     for index, number in enumerate(chosen):
-        others = [k for k in chosen if k != number]
-        odds = log_bayes_factors(
-            with_candidates(evidence, [candidates[k] for k in others]), candidates) + prior
-        taken = {candidates[k].effect for k in others if candidates[k].unique}
-        odds[[k for k, one in enumerate(candidates)
-              if k in others or k in excluded or one.effect in taken]] = -np.inf
+        odds = odds_beside(evidence, candidates, [k for k in chosen if k != number], prior,
+                           excluded)
         best = int(np.argmax(odds))
         if odds[best] > odds[number] + INDISTINGUISHABLE_LOG_EVIDENCE:
             chosen[index] = best
     return chosen
 
 
-def _without_needless(
-    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int], prior: Floats
+def without_needless(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], prior: Floats,
+    fewest: int = 0, by_scatter: bool = False,
 ) -> list[int]:
-    """Drop candidates whose odds given the others are too small, the smallest first."""
-    while len(chosen) > 1:
+    """Drop candidates whose odds given the others are too small, the smallest first.
+
+    ``fewest`` remain in any case. With ``by_scatter`` the noise counts as large as they leave it.
+    """
+    kept = list(chosen)
+    while len(kept) > fewest:
+        judged = tempered(evidence, [candidates[k] for k in kept]) if by_scatter else evidence
         odds = [float(log_bayes_factors(
-            with_candidates(evidence, [candidates[k] for k in chosen if k != number]),
-                            [candidates[number]])[0]) + prior[number] for number in chosen]
+            with_candidates(judged, [candidates[k] for k in kept if k != number]),
+            [candidates[number]])[0]) + prior[number] for number in kept]
         worst = int(np.argmin(odds))
         if odds[worst] >= DETECTION_LOG_ODDS:
             break
-        chosen = chosen[:worst] + chosen[worst + 1:]
-    return chosen
+        del kept[worst]
+    return kept
+
+
+def tempered(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
+    """Return the evidence by the scatter that candidates leave beside terms of any shape.
+
+    What terms of a limited fineness leave is no longer noise of the stated size.
+    """
+    left = with_candidates(evidence, candidates)
+    return evidence.tempered(max(1.0, left.chi2 / left.readings))
 
 
 def selected_effect(

@@ -28,6 +28,7 @@ from halbach_fe.diagnosis.model_selection import (
     Candidate,
     SelectedEffect,
     log_bayes_factors,
+    odds_beside,
     selected_effect,
     with_candidates,
     with_wide_priors,
@@ -284,13 +285,8 @@ class Further:
     def of(cls, judgement: Judgement) -> Further:
         """Compare all candidates beside the effects of the best explanation."""
         competition, best = judgement.competition, judgement.best
-        candidates = competition.candidates
-        odds = log_bayes_factors(with_candidates(
-            competition.evidence, [candidates[k] for k in best.effects]), candidates)
-        odds += competition.prior
-        taken = {candidates[k].effect for k in best.effects if candidates[k].unique}
-        odds[[number for number, candidate in enumerate(candidates)
-              if number in best.effects or candidate.effect in taken]] = -np.inf
+        odds = odds_beside(
+            competition.evidence, competition.candidates, best.effects, competition.prior)
         others = [term.fitted.log_bayes_factor + competition.prior_of_family
                   for term in competition.terms_beside(best.effects, ())]
         return cls(odds, np.exp(odds - logsumexp([0.0, *others, *odds])))

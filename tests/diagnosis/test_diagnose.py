@@ -12,8 +12,8 @@ from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.assembly import BlocksSwappedEffect
 from halbach_fe.diagnosis.effects.base import Hypothesis, InstrumentEffect, Parameter, Place
+from halbach_fe.diagnosis.effects.blocks import BlocksSwappedEffect
 from halbach_fe.diagnosis.map_errors import beside_amplitudes
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier

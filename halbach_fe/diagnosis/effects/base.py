@@ -153,7 +153,7 @@ class Effect(ABC):
 
     name: str
     title: str
-    kind: Literal["field", "instrument"]
+    kind: Literal["field", "instrument"] = "field"
     parameters: tuple[Parameter, ...]
     refinements: tuple[Parameter, ...] = ()
     is_binary: bool = False
