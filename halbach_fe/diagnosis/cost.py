@@ -16,8 +16,12 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Place
 from halbach_fe.diagnosis.effects.blocks import SHORTLIST, AssemblyEffect
 from halbach_fe.diagnosis.linearization import apply_effects
-from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
-from halbach_fe.diagnosis.map_pose import MIN_MISFIT_OF_A_POSE, misfits_of
+from halbach_fe.diagnosis.map_errors import (
+    MIN_MISFIT_OF_A_POSE,
+    blocks_of,
+    correct_map_errors,
+    misfits_of,
+)
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import build_magnet

@@ -53,9 +53,9 @@ from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
     blocks_of,
     correct_map_errors,
+    find_poses,
     possible_positions,
 )
-from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import EFFECT_PRIOR_ODDS, Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
@@ -67,6 +67,7 @@ from halbach_fe.diagnosis.position_noise import (
 from halbach_fe.diagnosis.result import (
     Diagnosis,
     Floor,
+    FoundPose,
     IdentifiedEffect,
     Imitation,
     SolverErrorExplanation,

@@ -21,19 +21,17 @@ from halbach_fe.diagnosis.model_selection import (
     PINNED_SD,
     Candidate,
     SelectedEffect,
+    is_noticeable,
     log_evidence,
+    most_likely,
+    near_the_likeliest,
     prior_log_odds,
+    renumbered,
     select_effects,
     with_wide_priors,
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, Scene
-from halbach_fe.diagnosis.screening import (
-    is_noticeable,
-    most_likely,
-    near_the_likeliest,
-    renumbered,
-)
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.study.model import Study
