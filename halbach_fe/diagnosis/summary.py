@@ -478,6 +478,24 @@ def _limits_entry(limits: DetectionLimits) -> dict[str, object]:
     return {"loss": entry(limits.loss), "displacement_m": entry(limits.displacement_m)}
 
 
+def hidden_by_solver(update: InferenceResult) -> str:
+    """Say that the solver's error hides what is smaller; nothing if the noise hides more.
+
+    That error is an upper bound. Where readings are far nearer to the model than it allows, a
+    finer mesh would show more.
+    """
+    # chi-squared per reading below which an error that exceeds the noise is stated too large, by
+    # 1.4 or more; if it is right, a hundred readings leave 0.5 with a probability of 1e-5
+    too_wide = 0.5
+    if update.solver_over_noise < 1 or update.prior_conflict > too_wide:
+        return ""
+    return (f"The solver's own error is {update.solver_over_noise:.2g} times the noise and hides "
+            f"what is smaller, though the readings are far nearer to the model (chi² per reading "
+            f"{decimals(update.prior_conflict)}, where 1 is expected): an effect that hides there "
+            "makes the blocks of an update wrong by more than their error bars. Refine `mesh`, "
+            "and diagnose again.")
+
+
 def limits_in_words(limits: DetectionLimits) -> str:
     """Say in a sentence which changes of a block the map would have shown."""
     # Largest displacement of a block that reports state; signatures are linear up to a few mm.
