@@ -275,8 +275,7 @@ def odds_beside(
 
 
 def select_effects(
-    evidence: Evidence, candidates: Sequence[Candidate], max_effects: int = MAX_EFFECTS,
-    excluded: Collection[int] = (),
+    evidence: Evidence, candidates: Sequence[Candidate], excluded: Collection[int] = (),
 ) -> list[SelectedEffect]:
     """Select missing effects one at a time, and drop those that later ones make needless.
 
@@ -284,15 +283,13 @@ def select_effects(
     ----------
     evidence : Evidence
     candidates : sequence of Candidate
-    max_effects : int
-        Largest number of effects.
     excluded : collection of int
         Numbers of candidates that cannot be selected, because their amplitudes are impossible.
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
     seen: set[frozenset[int]] = set()
-    while candidates and len(chosen) < max_effects:
+    while candidates and len(chosen) < MAX_EFFECTS:
         odds = odds_beside(evidence, candidates, chosen, prior, excluded)
         best = int(np.argmax(odds))
         if odds[best] < DETECTION_LOG_ODDS:

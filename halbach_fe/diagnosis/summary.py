@@ -14,8 +14,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
-from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
-from halbach_fe.diagnosis.evidence import ResidualGroup
+from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.map_conventions import MapConvention
 from halbach_fe.diagnosis.map_errors import with_poses
@@ -402,14 +401,14 @@ def diagnosis_summary(
             "probability", "effects", "shares")} if diagnosis.imitated else None,
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
-        "groups": {"before": _groups(diagnosis.groups_before),
-                   "after": _groups(diagnosis.groups_after)},
+        "groups": {"before": [asdict(group) for group in diagnosis.groups_before],
+                   "after": [asdict(group) for group in diagnosis.groups_after]},
         "main_field_T": main_field_T(diagnosis), "floor_T": diagnosis.floor_T,
         "scores": {"before": [asdict(fit) for fit in region_scores(
                        diagnosis.before, diagnosis.loo_residuals_before)],
                    "after": [asdict(fit) for fit in region_scores(
                        diagnosis.after, diagnosis.loo_residuals_after)]},
-        "next": [{"effect": _name(pair.identified), "rival": _name(pair.rival),
+        "next": [{"effect": pair.identified.name, "rival": pair.rival.name,
                   "gains": pair.gains,
                   "recommended": pair.recommended and pair.recommended.name}
                  for pair in separations],
@@ -537,13 +536,3 @@ def _entry(identified: IdentifiedEffect) -> dict[str, object]:
             {"effect": candidate.effect, "place": candidate.place, "log_bayes_factor": factor}
             for candidate, factor in selection.alternatives],
     }
-
-
-def _groups(found: Sequence[ResidualGroup]) -> list[dict[str, object]]:
-    """Return the JSON entries of groups of readings."""
-    return [asdict(group) for group in found]
-
-
-def _name(hypothesis: Hypothesis) -> str:
-    """Return effect and place of a hypothesis."""
-    return f"{hypothesis.effect.name} {hypothesis.place.name}".strip()

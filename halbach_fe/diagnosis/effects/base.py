@@ -394,6 +394,11 @@ class Hypothesis:
     place: Place
 
     @property
+    def name(self) -> str:
+        """Effect and place."""
+        return f"{self.effect.name} {self.place.name}".strip()
+
+    @property
     def key(self) -> tuple[str, Place]:
         """The name of the effect and its place, which outlive the object of the effect."""
         return self.effect.name, self.place
