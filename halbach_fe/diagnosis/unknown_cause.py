@@ -140,7 +140,7 @@ def judge(
         return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
 
     competition = Competition(search.marginal, search.columns, search.absorbed, search.residual,
-                              search.evidence, search.candidates, flexible, whiten, search.rough)
+                              search.evidence, search.candidates, flexible, whiten, search.excluded)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     sources = {number: effect.hypothesis.place.at_m
                for number, effect in zip(numbers, identified, strict=True)
@@ -478,7 +478,7 @@ def _why_not_named(
     if own.log_odds < DETECTION_LOG_ODDS:
         certain = probability > (1 - probability) * np.exp(DETECTION_LOG_ODDS)
         return "which" if certain else "odds"
-    if likeliest in competition.excluded:
+    if likeliest in search.rough:
         return "roughly"
     found = amplitudes(replace(search, evidence=competition.evidence), [own])
     return "dropped" if possible(corrected, found, search.campaign) else "impossible"
