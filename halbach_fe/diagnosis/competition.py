@@ -101,7 +101,7 @@ class Competition:
         whiten: Callable[[Floats], Floats], excluded: Collection[int] = (),
     ) -> None:
         self.candidates, self.families, self.evidence = candidates, families, evidence
-        self.excluded = frozenset(excluded)
+        self.excluded, self.whiten = frozenset(excluded), whiten
         self.prior = prior_log_odds(candidates)
         self.prior_of_family = float(np.log(EFFECT_PRIOR_ODDS / max(len(families), 1)))
         ends = np.cumsum([0, *(len(family.axis) for family in families)]).tolist()

@@ -13,7 +13,7 @@ is compared.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -49,14 +49,6 @@ Start = tuple[IdentifiedEffect, ...]
 """Effects that amount to a displacement of the map."""
 
 
-@dataclass(frozen=True)
-class _Refined:
-    """A position with its evidence."""
-
-    start: Start
-    log_evidence: float
-
-
 def possible_positions(
     starts: Sequence[Start], updated: Callable[[Start, str], InferenceResult], campaign: Campaign,
 ) -> tuple[Start, tuple[PossiblePosition, ...]]:
@@ -80,16 +72,15 @@ def possible_positions(
     if len(starts) < 2:
         return (starts[0] if starts else ()), ()
     refined = sorted((_refined(start, f"position-{number}", updated, campaign)
-                      for number, start in enumerate(starts, start=1)),
-                     key=lambda each: -each.log_evidence)
-    best = refined[0]
-    near = [each for each in refined
-            if each.log_evidence >= best.log_evidence - INDISTINGUISHABLE_LOG_EVIDENCE]
-    weights = np.exp([each.log_evidence - best.log_evidence for each in near])
-    return best.start, tuple(
+                      for number, start in enumerate(starts, start=1)), key=lambda each: -each[1])
+    best, largest = refined[0]
+    near = [(start, evidence - largest) for start, evidence in refined
+            if evidence >= largest - INDISTINGUISHABLE_LOG_EVIDENCE]
+    weights = np.exp([less for _, less in near])
+    return best, tuple(
         PossiblePosition({effect.name: tuple(effect.values.tolist())
-                          for effect in each.start}, float(weight / weights.sum()))
-        for each, weight in zip(near, weights, strict=True)) if len(near) > 1 else ()
+                          for effect in start}, float(weight / weights.sum()))
+        for (start, _), weight in zip(near, weights, strict=True)) if len(near) > 1 else ()
 
 
 def start_of(
@@ -106,7 +97,7 @@ def start_of(
 def _refined(
     start: Start, name: str, updated: Callable[[Start, str], InferenceResult],
     campaign: Campaign,
-) -> _Refined:
+) -> tuple[Start, float]:
     """Return the position to which a few steps lead, and its log evidence."""
     # number of steps that refine a position: it starts from a fit of nominal blocks, within 2 mm
     steps = 2
@@ -124,7 +115,7 @@ def _refined(
         ends = np.cumsum([len(effect.values) for effect in start])[:-1]
         start = tuple(replace(effect, values=effect.values + part) for effect, part in zip(
             start, np.split(change, ends), strict=True))
-    return _Refined(start, update.log_evidence)
+    return start, update.log_evidence
 
 
 def correct_map_errors(

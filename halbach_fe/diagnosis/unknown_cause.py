@@ -7,7 +7,7 @@ what it acts on, along which coordinate it varies, and how large it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -70,15 +70,12 @@ class Judgement:
         The best explanation, with such effects only as may be named.
     without : Explanation
         The best explanation without any effect.
-    whiten : callable
-        Function of the changes (k, n, 3) in T of a map that returns whitened readings (rows, k).
     """
 
     competition: Competition
     catalogued: Explanation
     best: Explanation
     without: Explanation
-    whiten: Callable[[Floats], Floats]
 
     @property
     def is_clear(self) -> bool:
@@ -103,7 +100,7 @@ class Judgement:
 
     def whitened_terms(self) -> list[Floats]:
         """Return the columns (rows, k) of each term, per standard deviation of its amplitudes."""
-        return [self.whiten(term.family.fields()) * term.fitted.deviations
+        return [self.competition.whiten(term.family.fields()) * term.fitted.deviations
                 for term in self.best.terms]
 
 
@@ -147,7 +144,7 @@ def judge(
                if effect.hypothesis.effect.name == "ferromagnetic_object"}
     best, without = competition.best_explanations(
         numbers, list(sources) if are_scattered(list(sources.values())) else ())
-    return Judgement(competition, competition.explanation(numbers, ()), best, without, whiten)
+    return Judgement(competition, competition.explanation(numbers, ()), best, without)
 
 
 def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
