@@ -26,8 +26,8 @@ from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.session import Session
-from halbach_fe.synthetic.unlisted_causes import UnlistedCause, simulate_unlisted
 from tests.support.unlisted import STUDY, false_names
+from tests.support.unlisted_causes import UnlistedCause, simulate_unlisted
 
 FOLDER = Path(__file__).parent.parent / "results" / "unknown"
 SEEDS = range(16, 76)

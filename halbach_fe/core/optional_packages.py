@@ -41,8 +41,3 @@ def import_extra(module: str, extra: str = "campaign", purpose: str = _CAMPAIGN)
         raise ExtraMissingError(
             f"{purpose}, but {error.name or module} cannot be imported here. Install what is "
             f"missing: {install_command(extra)}") from None
-
-
-def version_of(name: str) -> str:
-    """Return the version of an installed distribution."""
-    return metadata.version(name)

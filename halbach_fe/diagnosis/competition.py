@@ -23,10 +23,12 @@ from halbach_fe.diagnosis.model_selection import (
     INDISTINGUISHABLE_LOG_EVIDENCE,
     MAX_EFFECTS,
     Candidate,
-    log_bayes_factors,
     log_evidence,
+    odds_beside,
     prior_log_odds,
+    tempered,
     with_candidates,
+    without_needless,
 )
 
 
@@ -99,7 +101,7 @@ class Competition:
         whiten: Callable[[Floats], Floats], excluded: Collection[int] = (),
     ) -> None:
         self.candidates, self.families, self.evidence = candidates, families, evidence
-        self.excluded = frozenset(excluded)
+        self.excluded, self.whiten = frozenset(excluded), whiten
         self.prior = prior_log_odds(candidates)
         self.prior_of_family = float(np.log(EFFECT_PRIOR_ODDS / max(len(families), 1)))
         ends = np.cumsum([0, *(len(family.axis) for family in families)]).tolist()
@@ -274,29 +276,17 @@ class Competition:
     def detected_effects(self, effects: Sequence[int], terms: Sequence[Term]) -> list[int]:
         """Drop effects whose odds beside the others and the terms are too small."""
         evidence, candidates = self._evidence_of(effects, terms)
-        kept = list(range(len(effects)))
-        while kept:
-            tempered = _tempered(evidence, [candidates[k] for k in kept])
-            odds = [float(log_bayes_factors(with_candidates(
-                tempered, [candidates[k] for k in kept if k != number]),
-                [candidates[number]])[0]) + self.prior[effects[number]] for number in kept]
-            worst = int(np.argmin(odds))
-            if odds[worst] >= DETECTION_LOG_ODDS:
-                break
-            del kept[worst]
+        kept = without_needless(evidence, candidates, range(len(effects)),
+                                self.prior[list(effects)], by_scatter=True)
         return [effects[number] for number in kept]
 
     def with_more_effects(self, start: Explanation) -> Explanation:
         """Add effects beside the terms of an explanation, one at a time."""
         kept, evidence = list(start.effects), self.evidence_beside(start.terms)
         while start.terms and len(kept) < MAX_EFFECTS:
-            chosen = [self.candidates[k] for k in kept]
-            odds = log_bayes_factors(with_candidates(_tempered(evidence, chosen), chosen),
-                                     self.candidates) + self.prior
-            taken = {self.candidates[k].effect for k in kept if self.candidates[k].unique}
-            odds[[number for number, candidate in enumerate(self.candidates)
-                  if number in kept or number in self.excluded
-                  or candidate.effect in taken]] = -np.inf
+            odds = odds_beside(
+                tempered(evidence, [self.candidates[k] for k in kept]), self.candidates, kept,
+                self.prior, self.excluded)
             if not len(odds):  # there was no time for any hypothesis
                 break
             best = int(np.argmax(odds))
@@ -374,12 +364,3 @@ class Competition:
         if not kept:
             return without, without
         return best if len(kept) == len(best.effects) else self.extension(kept), without
-
-
-def _tempered(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
-    """Return the evidence by the scatter that candidates leave beside terms of any shape.
-
-    What terms of a limited fineness leave is no longer noise of the stated size.
-    """
-    left = with_candidates(evidence, candidates)
-    return evidence.tempered(max(1.0, left.chi2 / left.readings))

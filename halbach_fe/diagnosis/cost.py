@@ -13,11 +13,15 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.diagnosis.diagnose import MAX_ROUNDS
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.assembly import SHORTLIST, AssemblyEffect
 from halbach_fe.diagnosis.effects.base import Effect, Place
+from halbach_fe.diagnosis.effects.blocks import SHORTLIST, AssemblyEffect
 from halbach_fe.diagnosis.linearization import apply_effects
-from halbach_fe.diagnosis.map_errors import blocks_of, correct_map_errors
-from halbach_fe.diagnosis.map_pose import MIN_MISFIT_OF_A_POSE, misfits_of
+from halbach_fe.diagnosis.map_errors import (
+    MIN_MISFIT_OF_A_POSE,
+    blocks_of,
+    correct_map_errors,
+    misfits_of,
+)
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.geometry.magnet import build_magnet

@@ -12,7 +12,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, each_block
-from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect, BlockDisplacedEffect
+from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
 from halbach_fe.diagnosis.linearization import Training
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
@@ -69,7 +70,7 @@ def detection_limits(
 
     return DetectionLimits(
         tuple(place.name for place in places), limits(BlockDemagnetizedEffect(), 1),
-        limits(BlockDisplacedEffect(), update.magnet.dimension))
+        limits(BLOCK_DISPLACED, update.magnet.dimension))
 
 
 def smallest_amplitude(information: Floats, threshold: float) -> float:

@@ -29,7 +29,7 @@ must explain all of them, and those of an instrument belong to a map or to a pro
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,9 +53,9 @@ from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
     blocks_of,
     correct_map_errors,
+    find_poses,
     possible_positions,
 )
-from halbach_fe.diagnosis.map_pose import FoundPose, find_poses
 from halbach_fe.diagnosis.model_selection import EFFECT_PRIOR_ODDS, Candidate, probabilities
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
@@ -67,6 +67,7 @@ from halbach_fe.diagnosis.position_noise import (
 from halbach_fe.diagnosis.result import (
     Diagnosis,
     Floor,
+    FoundPose,
     IdentifiedEffect,
     Imitation,
     SolverErrorExplanation,
@@ -234,6 +235,10 @@ class _Diagnosing:
         Whether the time is up, so that no further signatures are computed.
     update, search, judgement
         Those of the round under way, or of the answer.
+    models : list of frozenset of Hypothesis
+        The effects in the models of all rounds so far.
+    given_up : set of str
+        Names of effects that are not selected any more, see `dropped_with_rivals`.
     first : tuple of InferenceResult and Search
         Of the first round; that of another noise of positions has none of its own.
     """
@@ -273,6 +278,8 @@ class _Diagnosing:
         self.flexible: list[Family] = []
         self.best: _Round | None = None
         self.rivals: Rivals = {}
+        self.models: list[frozenset[Hypothesis]] = []
+        self.given_up: set[str] = set()
         self.solved: Magnet | None = None  # the last whose single blocks were solved for
         if len(starts) > 1:
             self.say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
@@ -301,6 +308,8 @@ class _Diagnosing:
             self.say("the solver's own error explains the misfit")
             return True
         found = self._select(number)
+        self.given_up |= dropped_with_rivals(self.models, self.identified, found)
+        self.models.append(frozenset(effect.hypothesis for effect in self.identified))
         if self._noise_has_changed():
             self.closing = self.pace.is_over
             return False
@@ -352,7 +361,8 @@ class _Diagnosing:
         self.search = score_hypotheses(
             Linearization(self.corrected, self.start, self.update, prior_mean, self.campaign,
                           self.solver, self.identified, self.signatures),
-            self.task.effects, self.pace.advance, lambda: self.closing or self.pace.is_over)
+            self.task.effects, self.pace.advance, lambda: self.closing or self.pace.is_over
+        ).without(self.given_up)
         self.first = self.first or (self.update, self.search)
         self.solver_error = None if self.identified else explain_by_solver_error(self.update)
 
@@ -568,6 +578,25 @@ def with_first_rivals(
         changed.append(replace(effect, selection=replace(
             own, alternatives=(*own.alternatives, *further))))
     return tuple(changed)
+
+
+def dropped_with_rivals(
+    models: Collection[frozenset[Hypothesis]], identified: Sequence[IdentifiedEffect],
+    found: Sequence[IdentifiedEffect],
+) -> set[str]:
+    """Return the names of the effects that took the search back to one of its earlier models.
+
+    They were dropped in their own model, and would be found again and again. (The solver's error of
+    a magnet with an iron ring may hide what that ring was to explain.) Where others explain the
+    readings as well as they seemed to, the search goes on with those.
+    """
+    left = {effect.hypothesis for effect in found}
+    if left not in models:
+        return set()
+    return {effect.hypothesis.effect.name for effect in identified
+            if effect.hypothesis not in left and any(
+                other.effect != effect.hypothesis.effect.name
+                for other, _ in effect.selection.alternatives)}
 
 
 def _has_converged(old: Sequence[IdentifiedEffect], new: Sequence[IdentifiedEffect]) -> bool:

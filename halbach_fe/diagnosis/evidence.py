@@ -108,6 +108,12 @@ class Evidence:
         return Fit(float(self.score[index] @ mean / 2) - size, mean,
                    linalg.cho_solve(factor, np.eye(len(index))))
 
+    def explained(self, chosen: Sequence[int]) -> float:
+        """Return the part of chi-squared that columns account for together, at any amplitudes."""
+        index = np.asarray(chosen, int)
+        score = self.score[index]
+        return float(score @ np.linalg.lstsq(self.part(index), score)[0])
+
     def given(self, chosen: Sequence[int]) -> Evidence:
         """Return the evidence with the amplitudes of a set of columns integrated out."""
         index = np.asarray(chosen, int)

@@ -143,14 +143,17 @@ class _Misfit:
         Relative to what tolerances of blocks and usual effects cause.
     relative : float
         Relative to the map's rms.
+    factor : float
+        Common factor of the readings.
     """
 
     standard: float
     relative: float
+    factor: float = 1.0
 
 
-INFINITE_MISFIT = _Misfit(np.inf, np.inf)
-"""Misfit of a convention that cannot be compared with the magnet."""
+NOT_COMPARED = np.zeros(0), _Misfit(np.inf, np.inf)
+"""Residuals and misfit of a convention that cannot be compared with the magnet."""
 
 
 def find_gross_errors(
@@ -274,10 +277,11 @@ class _Search:
         that leaves a misfit; None if none does.
         """
         _, nominal = self.nominal_of(MapConvention())
-        found = nominal and self.compared(
-            MapConvention(), nominal.field(0.0), nominal.variance, np.inf)
-        return found[2] if found and float(np.sqrt(np.mean(found[0]**2))) <= (
-            INDISTINGUISHABLE_MISFIT_RATIO * after.standard) else None
+        if nominal is None:
+            return None
+        _, found = self.compared(MapConvention(), nominal.field(0.0), nominal.variance, np.inf)
+        return found.factor if (
+            found.standard <= INDISTINGUISHABLE_MISFIT_RATIO * after.standard) else None
 
     def hidden_by_symmetry(self, nominal: _Misfit) -> GrossError | None:
         """Return the single error that changes nothing in the nominal magnet, but in the measured
@@ -450,8 +454,8 @@ class _Search:
             return MapConvention(shift_m=(x, y, z))
 
         def residual(shift: Floats) -> Floats:
-            own = self.residual(convention(shift))
-            return np.full(self.present, 1e3) if own is None else own[0]
+            own, _ = self.fit(convention(shift))
+            return own if len(own) else np.full(self.present, 1e3)
 
         def improved(moved: MapConvention) -> MapConvention:
             return convention(least_squares(residual, np.array(moved.shift_m), x_scale=size,
@@ -483,15 +487,22 @@ class _Search:
                     yield image
 
     def misfit(self, convention: MapConvention, measured_blocks: bool = False) -> _Misfit:
-        """Return the misfit of a map read by a convention.
+        """Return the misfit of a map read by a convention, see `fit`."""
+        return self.fit(convention, measured_blocks)[1]
 
-        The map is compared with the nominal magnet, or with that of ``measured_blocks``.
+    def fit(
+        self, convention: MapConvention, measured_blocks: bool = False
+    ) -> tuple[Floats, _Misfit]:
+        """Compare the map, read by a convention, with the nominal magnet, or with that of
+        ``measured_blocks``, see `compared`; not if points are inside material.
         """
-        found = self.residual(convention, measured_blocks)
-        if found is None:
-            return INFINITE_MISFIT
-        residual, relative, _ = found
-        return _Misfit(float(np.sqrt(np.mean(residual**2))), relative)
+        turned, nominal = self.nominal_of(convention)
+        if nominal is None:
+            return NOT_COMPARED
+        field = nominal.field(turned.turn_rad if turned and turned.turn_rad else 0.0)
+        if measured_blocks:
+            field = self.of_measured_blocks(convention, field)
+        return self.compared(convention, field, nominal.variance)
 
     def with_a_wrong_block(self, convention: MapConvention) -> _Misfit:
         """Return the smallest misfit with one block missing or upside down."""
@@ -499,43 +510,26 @@ class _Search:
         wrong_block_factors = (1.0, 2.0)
         turned, nominal = self.nominal_of(convention)
         if nominal is None:
-            return INFINITE_MISFIT
+            return NOT_COMPARED[1]
         turn = turned.turn_rad if turned and turned.turn_rad else 0.0
         study = (replace(convention, magnet=None) if turned else convention).apply(self.study)
         points, sensors = _probe_points(study.instrument, self.points), sensor_matrix(
             study.instrument).T
-        whole, best = nominal.field(turn), INFINITE_MISFIT
+        whole, best = nominal.field(turn), NOT_COMPARED[1]
         blocks = self.blocks[None if turned else convention.magnet]
         for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             own = unit @ (rotation_about_z(turn) @ block.easy_axis) * block.remanence @ sensors
             for factor in wrong_block_factors if block.remanence else ():
-                found = self.compared(convention, whole - factor * own, nominal.variance)
-                if found is not None:
-                    misfit = _Misfit(float(np.sqrt(np.mean(found[0]**2))), found[1])
-                    best = min(best, misfit, key=lambda each: each.standard)
+                _, found = self.compared(convention, whole - factor * own, nominal.variance)
+                best = min(best, found, key=lambda each: each.standard)
         return best
-
-    def residual(
-        self, convention: MapConvention, measured_blocks: bool = False
-    ) -> tuple[Floats, float, float] | None:
-        """Return standardized residuals (values,), their rms relative to that of the map, and the
-        common factor of the readings.
-
-        None if points are inside material, or too few of the observed values remain.
-        """
-        turned, nominal = self.nominal_of(convention)
-        if nominal is None:
-            return None
-        field = nominal.field(turned.turn_rad if turned and turned.turn_rad else 0.0)
-        if measured_blocks:
-            field = self.of_measured_blocks(convention, field)
-        return self.compared(convention, field, nominal.variance)
 
     def compared(
         self, convention: MapConvention, field: Floats, variance: Floats,
         max_scale_change: float = 0.1,
-    ) -> tuple[Floats, float, float] | None:
-        """Compare the map with a field (n, 3) in T of given variance, see `residual`.
+    ) -> tuple[Floats, _Misfit]:
+        """Return standardized residuals (values,) from a field (n, 3) in T of given variance, and
+        the misfit; `NOT_COMPARED` if too few of the observed values remain.
 
         Iron, permeability and temperature may cause a relative change of the whole field, of 0.1 at
         most.
@@ -552,7 +546,7 @@ class _Search:
             old.flux_density_unit_T * convention.flux_density_unit)
         used = ~np.isnan(shown) & (self.observed | np.isin(COMPONENTS, convention.components))
         if not used.any() or used.sum() < least_used * self.present:
-            return None
+            return NOT_COMPARED
         whole = max(_size(shown), 1e-300)
         sd = np.sqrt(variance[used] + (effect_field_sd * max(whole, _size(field))) ** 2)
         shown, field = shown[used], field[used]
@@ -560,8 +554,10 @@ class _Search:
         scale = np.clip(weighted @ (shown / sd) / max(float(weighted @ weighted), 1e-300),
                         1 - max_scale_change, 1 + max_scale_change)
         difference = shown - scale * field
-        return (difference / sd, float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole),
-                float(scale))
+        residual = difference / sd
+        return residual, _Misfit(
+            float(np.sqrt(np.mean(residual**2))),
+            float(np.sqrt(np.sum(difference**2) / len(self.values)) / whole), float(scale))
 
     def of_measured_blocks(self, convention: MapConvention, nominal: Floats) -> Floats:
         """Return B (n, 3) in T of the measured blocks.

@@ -1,14 +1,19 @@
-"""Correct the gross errors of all maps of a campaign before any inference.
+"""Correct the gross errors of all maps of a campaign before any inference, and find where they lie.
 
 Every map is compared with the nominal magnet by itself. Another magnet than the study's is only
 possible if all maps are of that magnet. Positions of a displaced map that a symmetric magnet hardly
 distinguishes are compared by evidence.
+
+A stage has coordinates of its own. A map in these may be half a metre away from where the study
+says, and turned by a right angle and a few degrees. No effect of the catalogue, and no gross error
+of units or axes, reaches so far, and so such maps are registered from nothing before anything else
+is compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -16,30 +21,32 @@ import xarray as xr
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
-from halbach_fe.diagnosis.gross_errors import GrossError, find_gross_errors
+from halbach_fe.diagnosis.gross_errors import MIN_READINGS, GrossError, find_gross_errors, misfit_of
 from halbach_fe.diagnosis.linearization import Training
 from halbach_fe.diagnosis.model_selection import (
     INDISTINGUISHABLE_LOG_EVIDENCE,
     Candidate,
     SelectedEffect,
 )
-from halbach_fe.diagnosis.result import IdentifiedEffect, PossiblePosition
+from halbach_fe.diagnosis.result import FoundPose, IdentifiedEffect, PossiblePosition
 from halbach_fe.diagnosis.scene import Campaign
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.campaign_registration import register_maps, registered_study
+from halbach_fe.inference.registration import odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.measurement.campaign import Data
+from halbach_fe.measurement.campaign import Data, maps_of
+from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
+
+MIN_MISFIT_OF_A_POSE = 0.3
+"""Smallest misfit of a map in its stated place, relative to the map's rms, from which its pose is
+searched. In a bore of radius 20 mm a displacement by 4 mm leaves up to 0.13 and one by 6 mm, which
+is found as a gross error, up to 0.2."""
+
 
 Start = tuple[IdentifiedEffect, ...]
 """Effects that amount to a displacement of the map."""
-
-
-@dataclass(frozen=True)
-class _Refined:
-    """A position with its evidence."""
-
-    start: Start
-    log_evidence: float
 
 
 def possible_positions(
@@ -65,16 +72,15 @@ def possible_positions(
     if len(starts) < 2:
         return (starts[0] if starts else ()), ()
     refined = sorted((_refined(start, f"position-{number}", updated, campaign)
-                      for number, start in enumerate(starts, start=1)),
-                     key=lambda each: -each.log_evidence)
-    best = refined[0]
-    near = [each for each in refined
-            if each.log_evidence >= best.log_evidence - INDISTINGUISHABLE_LOG_EVIDENCE]
-    weights = np.exp([each.log_evidence - best.log_evidence for each in near])
-    return best.start, tuple(
+                      for number, start in enumerate(starts, start=1)), key=lambda each: -each[1])
+    best, largest = refined[0]
+    near = [(start, evidence - largest) for start, evidence in refined
+            if evidence >= largest - INDISTINGUISHABLE_LOG_EVIDENCE]
+    weights = np.exp([less for _, less in near])
+    return best, tuple(
         PossiblePosition({effect.name: tuple(effect.values.tolist())
-                          for effect in each.start}, float(weight / weights.sum()))
-        for each, weight in zip(near, weights, strict=True)) if len(near) > 1 else ()
+                          for effect in start}, float(weight / weights.sum()))
+        for (start, _), weight in zip(near, weights, strict=True)) if len(near) > 1 else ()
 
 
 def start_of(
@@ -91,7 +97,7 @@ def start_of(
 def _refined(
     start: Start, name: str, updated: Callable[[Start, str], InferenceResult],
     campaign: Campaign,
-) -> _Refined:
+) -> tuple[Start, float]:
     """Return the position to which a few steps lead, and its log evidence."""
     # number of steps that refine a position: it starts from a fit of nominal blocks, within 2 mm
     steps = 2
@@ -109,7 +115,7 @@ def _refined(
         ends = np.cumsum([len(effect.values) for effect in start])[:-1]
         start = tuple(replace(effect, values=effect.values + part) for effect, part in zip(
             start, np.split(change, ends), strict=True))
-    return _Refined(start, update.log_evidence)
+    return start, update.log_evidence
 
 
 def correct_map_errors(
@@ -210,3 +216,80 @@ def _starts(
         by_map.append([start_of(start, hypotheses) for start in error.starts
                        if start.keys() <= catalogued.keys()])
     return tuple(sum(parts, ()) for parts in product(*by_map))
+
+
+def with_poses(study: Study, poses: Sequence[FoundPose]) -> Study:
+    """Return the study with its maps in these poses, all at once: they may share probe and stage,
+    whose terms must agree.
+    """
+    tables = {one.map or "": {"instrument": one.instrument, "instrument_sd": one.open}
+              for one in poses}
+    return study.with_(**tables[""]) if "" in tables else study.with_tables(tables)
+
+
+def misfits_of(study: Study, data: Data) -> dict[str, float]:
+    """Return the `misfit_of` of each map in its stated place, by name.
+
+    It is 0 for maps with so few readings that some pose would fit any of them.
+    """
+    return {one.name: misfit_of(one.study, one.data) if one.data["B_T"].notnull().sum()
+            >= MIN_READINGS else 0.0 for one in maps_of(study, data)}
+
+
+def find_poses(
+    study: Study, data: Data, session: Session, say: Callable[[str], None]
+) -> tuple[tuple[FoundPose, ...], Study]:
+    """Register the maps if one of them is far from the magnet's field where the study states it.
+
+    Several maps of one study are registered together, since a stage may be common to them.
+
+    Parameters
+    ----------
+    study : Study
+        Corrected for gross errors.
+    data : Dataset or dict of str to Dataset
+        The map, or the maps that the study lists.
+    session : Session
+    say : callable
+        Called with a description of each step before it starts.
+
+    Returns
+    -------
+    poses : tuple of FoundPose
+        Empty if the maps lie about where the study says, if no pose explains them, or if the study
+        is a cross-section.
+    study : Study
+        The study with the instruments of these poses.
+    """
+    possible = 0.05  # odds from which another pose is named beside the best one
+    min_reduction = 3.0  # factor by which the registered pose must reduce the misfit to be believed
+    before = misfits_of(study, data)
+    if study.dimension == 2 or max(before.values()) < MIN_MISFIT_OF_A_POSE:
+        return (), study
+    several, maps = isinstance(data, dict), maps_of(study, data)
+    say("the field is not that of the place that the study states: searching the pose")
+    magnet = build_magnet(study.with_(maps=()))
+    try:
+        if several:
+            found = register_maps(magnet, maps, session, say=say)
+            registered = registered_study(study, maps, found)
+        else:
+            found = {maps[0].name: register(magnet, maps[0].data, session, say=say)}
+            registered = found[maps[0].name][0].study
+    except MeasurementError as error:
+        say(f"no pose explains the map: {error}")
+        return (), study
+    after = misfits_of(registered, data)
+    # misfit that is good enough even if it was not larger in the stated place: of a map that lies
+    # right beside another one that does not
+    good = 0.05
+    if any(after[name] > min(MIN_MISFIT_OF_A_POSE, max(misfit / min_reduction, good))
+           for name, misfit in before.items()):
+        say("no pose explains the map")
+        return (), study
+    poses = [FoundPose(
+        found[one.name][0], one.study.instrument, one.study.instrument_sd,
+        tuple(float(each) for each in odds(found[one.name])[1:] if each > possible),
+        before[one.name], after[one.name], one.name if several else None)
+        for one in maps_of(registered, data)]
+    return tuple(poses), with_poses(study, poses)

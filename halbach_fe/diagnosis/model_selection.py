@@ -14,13 +14,13 @@ give it its name: it must be likelier than that alone, by `DETERMINED_LOG_EVIDEN
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.evidence import Evidence, Marginal
 
 DETECTION_LOG_ODDS = 5.0
 """Log posterior odds above which an effect is selected."""
@@ -258,9 +258,24 @@ def log_evidence(evidence: Evidence, candidates: Sequence[Candidate]) -> float:
         [column for candidate in candidates for column in candidate.free]).log_evidence
 
 
-def select_effects(
-    evidence: Evidence, candidates: Sequence[Candidate], max_effects: int = MAX_EFFECTS,
+def odds_beside(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], prior: Floats,
     excluded: Collection[int] = (),
+) -> Floats:
+    """Return the log posterior odds (candidates,) of each candidate beside chosen ones.
+
+    They are -inf of these, of excluded ones, and at other places of chosen effects that are unique.
+    """
+    beside = [candidates[number] for number in chosen]
+    odds = log_bayes_factors(with_candidates(evidence, beside), candidates) + prior
+    taken = {candidate.effect for candidate in beside if candidate.unique}
+    odds[[number for number, candidate in enumerate(candidates)
+          if number in chosen or number in excluded or candidate.effect in taken]] = -np.inf
+    return odds
+
+
+def select_effects(
+    evidence: Evidence, candidates: Sequence[Candidate], excluded: Collection[int] = (),
 ) -> list[SelectedEffect]:
     """Select missing effects one at a time, and drop those that later ones make needless.
 
@@ -268,21 +283,14 @@ def select_effects(
     ----------
     evidence : Evidence
     candidates : sequence of Candidate
-    max_effects : int
-        Largest number of effects.
     excluded : collection of int
         Numbers of candidates that cannot be selected, because their amplitudes are impossible.
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
     seen: set[frozenset[int]] = set()
-    while candidates and len(chosen) < max_effects:
-        conditional = with_candidates(evidence, [candidates[number] for number in chosen])
-        odds = log_bayes_factors(conditional, candidates) + prior
-        odds[[*chosen, *excluded]] = -np.inf
-        taken = {candidates[number].effect for number in chosen if candidates[number].unique}
-        odds[[number for number, candidate in enumerate(candidates)
-              if candidate.effect in taken]] = -np.inf
+    while candidates and len(chosen) < MAX_EFFECTS:
+        odds = odds_beside(evidence, candidates, chosen, prior, excluded)
         best = int(np.argmax(odds))
         if odds[best] < DETECTION_LOG_ODDS:
             break
@@ -290,7 +298,7 @@ def select_effects(
         chosen = _at_best_places(evidence, candidates, [*chosen, best], excluded)
         chosen = _exchanged(evidence, candidates, chosen, prior, excluded)
         best = chosen[-1]
-        chosen = _without_needless(evidence, candidates, chosen, prior)
+        chosen = without_needless(evidence, candidates, chosen, prior, fewest=1)
         if best not in chosen or len(chosen) <= before - 1 or frozenset(chosen) in seen:
             break  # else the same candidates would be added and dropped for ever
         seen.add(frozenset(chosen))
@@ -326,31 +334,42 @@ def _exchanged(
     """
     chosen = list(chosen)
     for index, number in enumerate(chosen):
-        others = [k for k in chosen if k != number]
-        odds = log_bayes_factors(
-            with_candidates(evidence, [candidates[k] for k in others]), candidates) + prior
-        taken = {candidates[k].effect for k in others if candidates[k].unique}
-        odds[[k for k, one in enumerate(candidates)
-              if k in others or k in excluded or one.effect in taken]] = -np.inf
+        odds = odds_beside(evidence, candidates, [k for k in chosen if k != number], prior,
+                           excluded)
         best = int(np.argmax(odds))
         if odds[best] > odds[number] + INDISTINGUISHABLE_LOG_EVIDENCE:
             chosen[index] = best
     return chosen
 
 
-def _without_needless(
-    evidence: Evidence, candidates: Sequence[Candidate], chosen: list[int], prior: Floats
+def without_needless(
+    evidence: Evidence, candidates: Sequence[Candidate], chosen: Sequence[int], prior: Floats,
+    fewest: int = 0, by_scatter: bool = False,
 ) -> list[int]:
-    """Drop candidates whose odds given the others are too small, the smallest first."""
-    while len(chosen) > 1:
+    """Drop candidates whose odds given the others are too small, the smallest first.
+
+    ``fewest`` remain in any case. With ``by_scatter`` the noise counts as large as they leave it.
+    """
+    kept = list(chosen)
+    while len(kept) > fewest:
+        judged = tempered(evidence, [candidates[k] for k in kept]) if by_scatter else evidence
         odds = [float(log_bayes_factors(
-            with_candidates(evidence, [candidates[k] for k in chosen if k != number]),
-                            [candidates[number]])[0]) + prior[number] for number in chosen]
+            with_candidates(judged, [candidates[k] for k in kept if k != number]),
+            [candidates[number]])[0]) + prior[number] for number in kept]
         worst = int(np.argmin(odds))
         if odds[worst] >= DETECTION_LOG_ODDS:
             break
-        chosen = chosen[:worst] + chosen[worst + 1:]
-    return chosen
+        del kept[worst]
+    return kept
+
+
+def tempered(evidence: Evidence, candidates: Sequence[Candidate]) -> Evidence:
+    """Return the evidence by the scatter that candidates leave beside terms of any shape.
+
+    What terms of a limited fineness leave is no longer noise of the stated size.
+    """
+    left = with_candidates(evidence, candidates)
+    return evidence.tempered(max(1.0, left.chi2 / left.readings))
 
 
 def selected_effect(
@@ -406,3 +425,146 @@ def best_factors(
     for candidate, factor in zip(candidates, factors, strict=True):
         found[candidate.effect] = max(found.get(candidate.effect, -np.inf), float(factor))
     return found
+
+
+# --- hypotheses that are hopeless by themselves --------------------------------------------------
+#
+# Hundreds of blocks, each of which may be displaced, turned, missing ..., make thousands of
+# signatures. A matrix of the products of all of them takes longer than everything else in a round.
+# One by one they are cheap.
+
+MOST_COLUMNS = 1500
+"""Largest number of signatures that are compared with each other: their products take a tenth of
+a second for each thousand readings."""
+
+AT_ONCE = 30
+"""Number of hypotheses that are judged by themselves at a time. Their products with each other are
+computed needlessly, but few calls of the linear algebra are faster than many."""
+
+FEW_PLACES = 100
+"""Effects of at most so many places are never left out."""
+
+NOTICEABLE_CHI2 = 9.0
+"""Part of chi-squared that a signature must account for if others like it are to be computed: three
+standard deviations of its amplitude."""
+
+NEAR = 0.3
+"""An effect with a rough signature is solved for if it explains at least this share of the part of
+chi-squared that a likely effect explains in its place. A rough signature that correlates by 0.7
+with the exact one, beside the blocks, explains half of what that does; of the FASER dipole in its
+tube the correlations are 0.98 for iron that saturates and 0.96 for the permeability across."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Candidates that are compared with each other.
+
+    Attributes
+    ----------
+    numbers : tuple of int
+        Of these candidates among all, in order.
+    columns : ndarray, shape (rows, k)
+        Their whitened signatures.
+    absorbed : ndarray, shape (m, k + 1)
+        `Marginal.absorbed` of these and of the residual.
+    evidence : Evidence
+    """
+
+    numbers: tuple[int, ...]
+    columns: Floats
+    absorbed: Floats
+    evidence: Evidence
+
+
+def most_likely(
+    candidates: Sequence[Candidate], columns: Sequence[Floats], marginal: Marginal,
+    residual: Floats, in_model: Collection[int]
+) -> Compared:
+    """Return the candidates that are compared with each other.
+
+    These are all candidates, unless they have more than `MOST_COLUMNS` signatures. Then those in
+    the model and those of effects of a few places are compared with the others whose evidence is
+    largest beside the model. An effect that another one hides is found in a later round, when that
+    one is in the model.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+    columns : sequence of ndarray, shape (rows, k)
+        Whitened signatures of every candidate.
+    marginal : Marginal
+    residual : ndarray, shape (rows,)
+        Whitened residual to which the signatures are fitted.
+    in_model : collection of int
+        Numbers of candidates that are in the model, and must be compared.
+    """
+    width = np.array([part.shape[1] for part in columns], int)
+    ends = np.cumsum(width)
+    own = [np.arange(end - size, end) for end, size in zip(ends, width, strict=True)]
+    # by column in memory, as columns are chosen below
+    stacked = np.vstack([*(part.T for part in columns), residual]).T
+    absorbed = marginal.absorbed(stacked)
+
+    def compared(numbers: Sequence[int]) -> Compared:
+        index = np.concatenate([np.zeros(0, int), *(own[number] for number in numbers)])
+        chosen, taken = stacked[:, index], absorbed[:, np.append(index, width.sum())]
+        return Compared(tuple(numbers), chosen, taken,
+                        marginal.evidence(chosen, residual, taken))
+
+    if width.sum() <= MOST_COLUMNS:
+        return compared(range(len(candidates)))
+    factors = np.empty(len(candidates))
+    model = sorted(in_model)
+    for first in range(0, len(candidates), AT_ONCE):
+        some = list(range(first, min(first + AT_ONCE, len(candidates))))
+        numbered = renumbered([candidates[number] for number in (*model, *some)])
+        beside = with_candidates(compared([*model, *some]).evidence, numbered[:len(model)])
+        factors[some] = log_bayes_factors(beside, numbered[len(model):])
+    names = [candidate.effect for candidate in candidates]
+    places = {name: names.count(name) for name in dict.fromkeys(names)}
+    chosen = {number for number, name in enumerate(names)
+              if number in in_model or places[name] <= FEW_PLACES}
+    left = MOST_COLUMNS - sum(width[number] for number in chosen)
+    for number in np.argsort(-factors).tolist():
+        if number not in chosen and width[number] <= left:
+            chosen.add(number)
+            left -= width[number]
+    return compared(sorted(chosen))
+
+
+def near_the_likeliest(
+    evidence: Evidence, candidates: Sequence[Candidate], rough: Collection[int]
+) -> list[int]:
+    """Return the numbers of candidates with rough signatures that come near to the likeliest ones.
+
+    They explain a part of chi-squared that is not chance beside the likeliest effects, or in place
+    of one of these at least `NEAR` of what it explains.
+    """
+    if not rough:
+        return []
+    likeliest = [candidates.index(one.candidate) for one in select_effects(evidence, candidates)]
+    near = set(likeliest) & set(rough)
+    for missing in (None, *likeliest):
+        beside = with_candidates(evidence, [candidates[k] for k in likeliest if k != missing])
+        least = NOTICEABLE_CHI2 if missing is None else max(
+            NOTICEABLE_CHI2, NEAR * beside.explained(candidates[missing].columns))
+        near |= {k for k in rough if beside.explained(candidates[k].columns) > least}
+    return sorted(near)
+
+
+def renumbered(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return candidates whose columns are numbered one after the other."""
+    ends = np.cumsum([len(candidate.columns) for candidate in candidates]).tolist()
+    return [replace(candidate, columns=tuple(range(end - len(candidate.columns), end)))
+            for candidate, end in zip(candidates, ends, strict=True)]
+
+
+def is_noticeable(
+    signature: Floats, fixed: Floats, marginal: Marginal, residual: Floats
+) -> bool:
+    """Tell whether a whitened signature (rows, k) accounts for a part of chi-squared that is not
+    chance, beside those (rows, f) of what is in the model.
+    """
+    count = fixed.shape[1]
+    beside = marginal.evidence(np.hstack([fixed, signature]), residual).given(range(count))
+    return beside.explained(range(count, count + signature.shape[1])) > NOTICEABLE_CHI2

@@ -151,18 +151,14 @@ class NominalFields:
         quick = self.solve_iron(study)
         return self.solve(study) - self.finite_element_field if quick is None else quick
 
-    def measured_block_field(self, number: int) -> Floats:
-        """Return B (n, 3) in T of block ``number`` with its measured magnetization.
+    @cached_property
+    def magnetizations(self) -> Floats:
+        """Magnetizations of the blocks, measured or else nominal, (blocks, D) in A/m.
 
         A missing or reversed block changes the field by as much as the block contributes. The
         nominal magnetization would leave an error of the order of the block's tolerance in such a
-        signature, so the measured one is used where there is one.
+        signature.
         """
-        return self.field_with(number, self.magnetizations[number])
-
-    @cached_property
-    def magnetizations(self) -> Floats:
-        """Magnetizations of the blocks, measured or else nominal, (blocks, D) in A/m."""
         size = self.study.dimension
         return np.array([block.magnetization[:size] for block in self.blocks]
                         ) if self.measured_magnetizations is None else self.measured_magnetizations

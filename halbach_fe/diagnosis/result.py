@@ -13,11 +13,14 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.evidence import Evidence, Marginal, ResidualGroup, with_fewer_columns
 from halbach_fe.diagnosis.gross_errors import GrossError
-from halbach_fe.diagnosis.map_pose import FoundPose
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier
 from halbach_fe.diagnosis.position_noise import PositionNoise
+from halbach_fe.inference.pose_result import Registration
+from halbach_fe.inference.registration import axes_of_map
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
 
@@ -112,6 +115,47 @@ class IdentifiedEffect:
         """The parameters (and refinements) to which the amplitudes belong."""
         effect = self.hypothesis.effect
         return (*effect.parameters, *effect.refinements)[:len(self.values)]
+
+
+@dataclass(frozen=True)
+class FoundPose:
+    """Where a map lies, found from nothing.
+
+    Attributes
+    ----------
+    best : Registration
+        The most probable pose.
+    instrument : Instrument
+        The instrument of the study with that pose.
+    open : InstrumentSd
+        How far that pose, and the probe, are open from then on.
+    others : tuple of float
+        Probabilities of the other poses that the map hardly tells from the best one.
+    misfit_before, misfit_after : float
+        Rms difference from the nominal magnet in the stated and in the best pose, relative to the
+        map's rms; infinite for points that the study states inside of material.
+    map : str or None
+        Name of the map among those that the study lists; None if it lists none.
+    """
+
+    best: Registration
+    instrument: Instrument
+    open: InstrumentSd
+    others: tuple[float, ...]
+    misfit_before: float
+    misfit_after: float
+    map: str | None = None
+
+    @property
+    def text(self) -> str:
+        """Where the map lies, in words."""
+        place = ", ".join(
+            f"{1e3 * value:.2f} ± {1e3 * sd:.2g}" for value, sd in zip(
+                self.best.middle_m, self.best.translation_sd_m, strict=True)).replace("-", "−")
+        axes = ", ".join(f"{name} along {axis}" for name, axis in axes_of_map(
+            self.best.instrument).items()).replace("-", "−")
+        return (f"the middle of {f'map {self.map}' if self.map else 'the map'} lies at ({place}) "
+                f"mm in the magnet, with its axis {axes} of the magnet")
 
 
 @dataclass(frozen=True)

@@ -297,14 +297,14 @@ class Scene:
             nominal, hypothesis.place, amounts.tolist()))
 
     def seen(self, hypothesis: Hypothesis, of: Callable[[NominalFields], Floats]) -> Floats:
-        """Return what the maps show of changes (k, n, 3) in T of the field of an effect."""
-        if hypothesis.effect.kind == "instrument":  # changes of the values themselves
-            return self._by_map(hypothesis.place, of)
-        return self._by_map(hypothesis.place, lambda nominal: of(nominal) @ _sensors(nominal).T)
+        """Return what maps show of changes (k, n, 3) in T of an effect; 0 where it does not act.
 
-    def _by_map(self, place: Place, of: Callable[[NominalFields], Floats]) -> Floats:
-        """Return changes (k, n, 3) of the values of all maps; 0 where a place does not act."""
-        found = [of(nominal) if not place.maps or one.name in place.maps else None
+        Those of an effect of the magnet are changes of the field, those of an instrument changes of
+        the values themselves.
+        """
+        place, is_field = hypothesis.place, hypothesis.effect.kind == "field"
+        found = [None if place.maps and one.name not in place.maps else
+                 of(nominal) @ _sensors(nominal).T if is_field else of(nominal)
                  for nominal, one in zip(self.fields, self.maps, strict=True)]
         count = next(len(part) for part in found if part is not None)
         return np.concatenate([np.zeros((count, *nominal.points.shape)) if part is None else part

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -21,19 +21,17 @@ from halbach_fe.diagnosis.model_selection import (
     PINNED_SD,
     Candidate,
     SelectedEffect,
+    is_noticeable,
     log_evidence,
+    most_likely,
+    near_the_likeliest,
     prior_log_odds,
+    renumbered,
     select_effects,
     with_wide_priors,
 )
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, Scene
-from halbach_fe.diagnosis.screening import (
-    is_noticeable,
-    most_likely,
-    near_the_likeliest,
-    renumbered,
-)
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.study.model import Study
@@ -76,6 +74,8 @@ class Search:
     rough : frozenset of int
         Numbers of the hypotheses with rough signatures. They explain too little to be solved for,
         and cannot be selected.
+    given_up : frozenset of int
+        Numbers of hypotheses that cannot be selected as the search dropped them in their own model.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -90,6 +90,17 @@ class Search:
     nominal: Scene
     uncompared: int = 0
     rough: frozenset[int] = frozenset()
+    given_up: frozenset[int] = frozenset()
+
+    @property
+    def excluded(self) -> frozenset[int]:
+        """Numbers of the hypotheses that cannot be selected."""
+        return self.rough | self.given_up
+
+    def without(self, effects: Collection[str]) -> Search:
+        """Return the search that cannot select some effects, by name."""
+        return replace(self, given_up=frozenset(
+            number for number, one in enumerate(self.candidates) if one.effect in effects))
 
 
 @dataclass(frozen=True)
@@ -354,7 +365,7 @@ def identify_effects(
         The study corrected for gross errors and outliers.
     search : Search
     """
-    excluded = set(search.rough)
+    excluded = set(search.excluded)
     while True:
         found = amplitudes(
             search, select_effects(search.evidence, search.candidates, excluded=excluded))

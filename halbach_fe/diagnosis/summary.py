@@ -14,16 +14,16 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
-from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
-from halbach_fe.diagnosis.evidence import ResidualGroup
+from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.map_conventions import MapConvention
-from halbach_fe.diagnosis.map_pose import FoundPose, with_poses
+from halbach_fe.diagnosis.map_errors import with_poses
 from halbach_fe.diagnosis.model_selection import Candidate
 from halbach_fe.diagnosis.position_noise import PositionNoise
 from halbach_fe.diagnosis.result import (
     DetectionLimits,
     Diagnosis,
+    FoundPose,
     IdentifiedEffect,
     PossiblePosition,
     Suspicion,
@@ -401,14 +401,14 @@ def diagnosis_summary(
             "probability", "effects", "shares")} if diagnosis.imitated else None,
         "unknown": _unknown_entry(diagnosis.unknown) if diagnosis.unknown else None,
         "probabilities": dict(sorted(diagnosis.probabilities.items(), key=lambda item: -item[1])),
-        "groups": {"before": _groups(diagnosis.groups_before),
-                   "after": _groups(diagnosis.groups_after)},
+        "groups": {"before": [asdict(group) for group in diagnosis.groups_before],
+                   "after": [asdict(group) for group in diagnosis.groups_after]},
         "main_field_T": main_field_T(diagnosis), "floor_T": diagnosis.floor_T,
         "scores": {"before": [asdict(fit) for fit in region_scores(
                        diagnosis.before, diagnosis.loo_residuals_before)],
                    "after": [asdict(fit) for fit in region_scores(
                        diagnosis.after, diagnosis.loo_residuals_after)]},
-        "next": [{"effect": _name(pair.identified), "rival": _name(pair.rival),
+        "next": [{"effect": pair.identified.name, "rival": pair.rival.name,
                   "gains": pair.gains,
                   "recommended": pair.recommended and pair.recommended.name}
                  for pair in separations],
@@ -477,6 +477,24 @@ def _limits_entry(limits: DetectionLimits) -> dict[str, object]:
     return {"loss": entry(limits.loss), "displacement_m": entry(limits.displacement_m)}
 
 
+def hidden_by_solver(update: InferenceResult) -> str:
+    """Say that the solver's error hides what is smaller; nothing if the noise hides more.
+
+    That error is an upper bound. Where readings are far nearer to the model than it allows, a
+    finer mesh would show more.
+    """
+    # chi-squared per reading below which an error that exceeds the noise is stated too large, by
+    # 1.4 or more; if it is right, a hundred readings leave 0.5 with a probability of 1e-5
+    too_wide = 0.5
+    if update.solver_over_noise < 1 or update.prior_conflict > too_wide:
+        return ""
+    return (f"The solver's own error is {update.solver_over_noise:.2g} times the noise and hides "
+            f"what is smaller, though the readings are far nearer to the model (chi² per reading "
+            f"{decimals(update.prior_conflict)}, where 1 is expected): an effect that hides there "
+            "makes the blocks of an update wrong by more than their error bars. Refine `mesh`, "
+            "and diagnose again.")
+
+
 def limits_in_words(limits: DetectionLimits) -> str:
     """Say in a sentence which changes of a block the map would have shown."""
     # Largest displacement of a block that reports state; signatures are linear up to a few mm.
@@ -518,13 +536,3 @@ def _entry(identified: IdentifiedEffect) -> dict[str, object]:
             {"effect": candidate.effect, "place": candidate.place, "log_bayes_factor": factor}
             for candidate, factor in selection.alternatives],
     }
-
-
-def _groups(found: Sequence[ResidualGroup]) -> list[dict[str, object]]:
-    """Return the JSON entries of groups of readings."""
-    return [asdict(group) for group in found]
-
-
-def _name(hypothesis: Hypothesis) -> str:
-    """Return effect and place of a hypothesis."""
-    return f"{hypothesis.effect.name} {hypothesis.place.name}".strip()

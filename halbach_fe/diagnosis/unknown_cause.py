@@ -7,7 +7,7 @@ what it acts on, along which coordinate it varies, and how large it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -28,6 +28,7 @@ from halbach_fe.diagnosis.model_selection import (
     Candidate,
     SelectedEffect,
     log_bayes_factors,
+    odds_beside,
     selected_effect,
     with_candidates,
     with_wide_priors,
@@ -69,15 +70,12 @@ class Judgement:
         The best explanation, with such effects only as may be named.
     without : Explanation
         The best explanation without any effect.
-    whiten : callable
-        Function of the changes (k, n, 3) in T of a map that returns whitened readings (rows, k).
     """
 
     competition: Competition
     catalogued: Explanation
     best: Explanation
     without: Explanation
-    whiten: Callable[[Floats], Floats]
 
     @property
     def is_clear(self) -> bool:
@@ -102,7 +100,7 @@ class Judgement:
 
     def whitened_terms(self) -> list[Floats]:
         """Return the columns (rows, k) of each term, per standard deviation of its amplitudes."""
-        return [self.whiten(term.family.fields()) * term.fitted.deviations
+        return [self.competition.whiten(term.family.fields()) * term.fitted.deviations
                 for term in self.best.terms]
 
 
@@ -139,14 +137,14 @@ def judge(
         return noise.whiten(np.ascontiguousarray(observation.read(fields)[:, rows].T))
 
     competition = Competition(search.marginal, search.columns, search.absorbed, search.residual,
-                              search.evidence, search.candidates, flexible, whiten, search.rough)
+                              search.evidence, search.candidates, flexible, whiten, search.excluded)
     numbers = [search.hypotheses.index(effect.hypothesis) for effect in identified]
     sources = {number: effect.hypothesis.place.at_m
                for number, effect in zip(numbers, identified, strict=True)
                if effect.hypothesis.effect.name == "ferromagnetic_object"}
     best, without = competition.best_explanations(
         numbers, list(sources) if are_scattered(list(sources.values())) else ())
-    return Judgement(competition, competition.explanation(numbers, ()), best, without, whiten)
+    return Judgement(competition, competition.explanation(numbers, ()), best, without)
 
 
 def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
@@ -284,13 +282,8 @@ class Further:
     def of(cls, judgement: Judgement) -> Further:
         """Compare all candidates beside the effects of the best explanation."""
         competition, best = judgement.competition, judgement.best
-        candidates = competition.candidates
-        odds = log_bayes_factors(with_candidates(
-            competition.evidence, [candidates[k] for k in best.effects]), candidates)
-        odds += competition.prior
-        taken = {candidates[k].effect for k in best.effects if candidates[k].unique}
-        odds[[number for number, candidate in enumerate(candidates)
-              if number in best.effects or candidate.effect in taken]] = -np.inf
+        odds = odds_beside(
+            competition.evidence, competition.candidates, best.effects, competition.prior)
         others = [term.fitted.log_bayes_factor + competition.prior_of_family
                   for term in competition.terms_beside(best.effects, ())]
         return cls(odds, np.exp(odds - logsumexp([0.0, *others, *odds])))
@@ -482,7 +475,7 @@ def _why_not_named(
     if own.log_odds < DETECTION_LOG_ODDS:
         certain = probability > (1 - probability) * np.exp(DETECTION_LOG_ODDS)
         return "which" if certain else "odds"
-    if likeliest in competition.excluded:
+    if likeliest in search.rough:
         return "roughly"
     found = amplitudes(replace(search, evidence=competition.evidence), [own])
     return "dropped" if possible(corrected, found, search.campaign) else "impossible"

@@ -20,6 +20,7 @@ from halbach_fe.diagnosis.summary import (
     PRESENT,
     STUDY_FILE,
     amounts,
+    hidden_by_solver,
     label_in_words,
     limits_in_words,
     other_findings,
@@ -249,7 +250,8 @@ def _gist(diagnosis: Diagnosis) -> str:
 def _trust(diagnosis: Diagnosis, sound: bool) -> str:
     """Say whether an answer without named effects can be trusted."""
     chi2 = f"chi² per training reading is {decimals(diagnosis.after.prior_conflict)}"
-    if sound and diagnosis.imitated is not None and not _has_imitated(diagnosis):
+    if sound and (hidden_by_solver(diagnosis.after) or (
+            diagnosis.imitated is not None and not _has_imitated(diagnosis))):
         return ("Only as far as this map shows: the readings are explained to their noise, with "
                 "the blocks' tolerances integrated out.")
     if sound:
@@ -517,8 +519,7 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "
             "many effects together are a fit rather than a diagnosis, and some of them take "
             "the place of another cause.")
-    if after.too_near:
-        sentences.append(after.too_near)
+    sentences += filter(None, (hidden_by_solver(after), after.too_near))
     nothing = not (diagnosis.identified or diagnosis.suspected or diagnosis.unknown
                    or _fails(diagnosis))
     if nothing and diagnosis.looked_for is not None:

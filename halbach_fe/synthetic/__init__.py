@@ -1,1 +1,4 @@
-"""Synthetic measurement campaigns, computed by programs other than the model that they test."""
+"""Synthetic campaigns, whose truth does not come from the model of the field that they test.
+
+magpylib and NGSolve come with the optional extra ``campaign``.
+"""

@@ -13,6 +13,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version as version_of
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,6 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.core.optional_packages import version_of
 from halbach_fe.core.pace import Progress
 from halbach_fe.measurement.block_table import BlockTable, write_blocks
 from halbach_fe.measurement.field_map import field_map, total_field_map, write_map

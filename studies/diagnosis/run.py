@@ -31,6 +31,7 @@ from sealed_cases_page import page
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, HalbachError
 from halbach_fe.core.files import write_text
+from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.material import TYPICAL_COEFFICIENT_PER_K
@@ -59,7 +60,6 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
-from halbach_fe.synthetic.optional_packages import import_extra
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 

@@ -7,7 +7,8 @@ import pytest
 
 from halbach_fe.diagnosis.detection_limits import smallest_amplitude
 from halbach_fe.diagnosis.diagnose import diagnose
-from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect, BlockDisplacedEffect
+from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
+from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
 from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.model_selection import Candidate, log_bayes_factors
 from halbach_fe.diagnosis.summary import limits_in_words
@@ -56,7 +57,7 @@ def test_losses_about_the_limit(session, generator, worst):
 
 
 def test_displacements_about_the_limit(session, generator):
-    effect = BlockDisplacedEffect()
+    effect = BLOCK_DISPLACED
     nominal = field_of(build_magnet(STUDY).blocks, CIRCLES)
     noise = NOISE_T * generator.standard_normal(CIRCLES.shape)
     clean = diagnose(STUDY, field_map(CIRCLES, nominal + noise), session, effects=[effect])

@@ -10,10 +10,10 @@ import halbach_fe as hf
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.cost import estimate_diagnosis
-from halbach_fe.diagnosis.diagnose import diagnose, only_equals_took_turns
+from halbach_fe.diagnosis.diagnose import diagnose, dropped_with_rivals, only_equals_took_turns
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.assembly import BlocksSwappedEffect
 from halbach_fe.diagnosis.effects.base import Hypothesis, InstrumentEffect, Parameter, Place
+from halbach_fe.diagnosis.effects.blocks import BlocksSwappedEffect
 from halbach_fe.diagnosis.map_errors import beside_amplitudes
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier
@@ -292,3 +292,40 @@ def test_an_effect_of_ones_own_is_searched_for(session, generator, gain):
     assert identified.values[0] == pytest.approx(0.01, abs=4 * np.hypot(identified.sd[0], 1e-4))
     assert found.study.instrument.gain == pytest.approx([identified.values[0]] * 3)
     assert "gain of the whole probe" in " ".join(answer(found).sentences)
+
+
+class ShyGain(CommonGain):
+    """Likelier than a common gain, as long as it is not in the model."""
+
+    name = "shy_gain"
+    relative_odds = 2.0
+
+    def derivative(self, nominal, place, values):
+        return 0 * self.signature(nominal, place)
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_an_effect_that_is_dropped_in_its_own_model_leaves_the_place_to_others(
+        goes_on, session, generator, monkeypatch):
+    """As an iron ring whose solution has an error that hides what the ring was to explain."""
+    if not goes_on:  # negative control: the search goes round in circles
+        monkeypatch.setattr(module, "dropped_with_rivals", lambda *given: set())
+    true = field(STUDY, drawn(STUDY, generator, 1e-4), CIRCLES)
+    data = field_map(CIRCLES, 1.01 * true + NOISE_T * generator.standard_normal(true.shape))
+    exact = STUDY.with_(prior__magnitude_sd=1e-4, prior__direction_sd_deg=0.006,
+                        prior__common_mode_sd=1e-4)
+    found = diagnose(exact, data, session, effects=[ShyGain(), CommonGain()])
+    assert found.is_at_rest == goes_on
+    assert [one.name for one in found.identified] == ["common_gain"] * goes_on
+    assert answer(found).trust.startswith("Yes") == goes_on
+
+
+def test_only_what_leads_back_and_has_rivals_is_given_up():
+    first, second = identified("z_scale", 3.0, "length"), identified("offset_x", 9.0)
+    nothing, one = frozenset(), frozenset([first.hypothesis])
+    assert dropped_with_rivals([nothing], [first, second], []) == {"z_scale"}
+    assert dropped_with_rivals([nothing, one], [first, second], [first]) == set()  # has no rival
+    assert dropped_with_rivals([nothing], [first, second], [second]) == set()  # leads on
+    assert dropped_with_rivals([nothing, one], [first], [first]) == set()  # is at rest
+    itself = identified("z_scale", 3.0, "z_scale")  # at another place
+    assert dropped_with_rivals([nothing], [itself], []) == set()

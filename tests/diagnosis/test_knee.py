@@ -10,7 +10,7 @@ import pytest
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter
-from halbach_fe.diagnosis.effects.knee import COERCIVITIES, STATED, KneeEffect
+from halbach_fe.diagnosis.effects.material import COERCIVITIES, STATED, KneeEffect
 from halbach_fe.diagnosis.linearization import NominalSolver
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.result import IdentifiedEffect

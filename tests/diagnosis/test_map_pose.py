@@ -17,7 +17,8 @@ from halbach_fe.diagnosis import unknown_cause
 from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.map_pose import FoundPose, find_poses, with_poses
+from halbach_fe.diagnosis.map_errors import find_poses, with_poses
+from halbach_fe.diagnosis.result import FoundPose
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.solver.session import Session
 from halbach_fe.study.inference import InstrumentSd

@@ -372,6 +372,23 @@ def test_a_turn_of_the_magnet_exchanges_names(flat, monkeypatch):
     assert "as well" not in said(placed, measured_blocks=("r01s01",))
 
 
+def test_what_the_error_of_the_solver_hides(flat):
+    """Readings far nearer to the model than the solver's error allows are no plain yes."""
+    found, _ = flat
+    noise, same = found.after.noise.sd, found.after.response
+    wide = replace(found.after, prior_conflict=0.2, response=replace(same, error=3 * noise))
+    nothing = replace(found, identified=(), suspected=(), gross_errors=(), imitated=None)
+    for diagnosis in (replace(found, identified=found.identified[:1]), nothing):
+        text = verdict(replace(diagnosis, before=wide, after=wide))
+        assert "error is 3 times the noise and hides what is smaller" in text
+        assert ("Only in part." if diagnosis.identified else "Only as far as this map") in text
+        for other in (replace(wide, prior_conflict=0.8),
+                      replace(wide, response=replace(same, error=0.5 * noise))):
+            assert "hides what is smaller" not in verdict(
+                replace(diagnosis, before=other, after=other))
+    assert "Yes: " in verdict(replace(nothing, before=other, after=other))
+
+
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
 def test_every_parameter_has_a_unit_that_is_told(effect):
     assert all(human_unit(parameter)[0] or parameter.unit == "1"

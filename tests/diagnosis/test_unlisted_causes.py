@@ -26,9 +26,9 @@ from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.hidden_effects import EFFECTS
 from halbach_fe.synthetic.simulate import simulate_campaign
-from halbach_fe.synthetic.unlisted_causes import families, random_function, rms, simulate_unlisted
 from tests.conftest import circle
 from tests.support.unlisted import STUDY, false_names
+from tests.support.unlisted_causes import families, random_function, rms, simulate_unlisted
 
 SLOW = ("iron_ring", "iron_saturation", "neighbour_magnet")
 """Effects whose signatures take long, and which no test here needs."""

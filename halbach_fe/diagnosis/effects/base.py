@@ -153,7 +153,7 @@ class Effect(ABC):
 
     name: str
     title: str
-    kind: Literal["field", "instrument"]
+    kind: Literal["field", "instrument"] = "field"
     parameters: tuple[Parameter, ...]
     refinements: tuple[Parameter, ...] = ()
     is_binary: bool = False
@@ -392,6 +392,11 @@ class Hypothesis:
 
     effect: Effect
     place: Place
+
+    @property
+    def name(self) -> str:
+        """Effect and place."""
+        return f"{self.effect.name} {self.place.name}".strip()
 
     @property
     def key(self) -> tuple[str, Place]:

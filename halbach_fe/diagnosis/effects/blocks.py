@@ -1,10 +1,13 @@
-"""Effects on single blocks: lost magnetization, displacements, rotations, gradients, corners."""
+"""Effects on the magnetization of blocks: lost, uneven, and of blocks in other slots or turned."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import (
@@ -16,11 +19,13 @@ from halbach_fe.diagnosis.effects.base import (
     changed,
     each_block,
     each_ring,
+    place_of,
     with_exceptions,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
-from halbach_fe.geometry.blocks import rotation_matrix
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_matrix
+from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.geometry.mounting import Move, moves_of_rings, turns_in_slot
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.model import Study
 
@@ -30,7 +35,6 @@ class BlockMissingEffect(Effect):
 
     name = "block_missing"
     title = "missing block"
-    kind = "field"
     parameters = (Parameter("there", "1", 1.0),)
     is_binary = True
     applied_in_full = True
@@ -44,10 +48,6 @@ class BlockMissingEffect(Effect):
     ) -> Mapping[int, Floats] | None:
         (block,) = blocks_at(nominal, place)
         return {block: (self.factor - 1) * nominal.magnetizations[block]}
-
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        (block,) = blocks_at(nominal, place)
-        return (self.factor - 1) * nominal.measured_block_field(block)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         return with_exceptions(study, [BlockException(
@@ -71,7 +71,6 @@ class BlockDemagnetizedEffect(Effect):
 
     name = "block_demagnetized"
     title = "demagnetized block"
-    kind = "field"
     parameters = (Parameter("loss", "1", 0.1),)
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -117,55 +116,6 @@ class RingDemagnetizedEffect(BlockDemagnetizedEffect):
         return rings if len(rings := each_ring(study)) > 1 else []
 
 
-class BlockDisplacedEffect(Effect):
-    """One block is displaced along its own axes: radially, azimuthally and axially."""
-
-    name = "block_displaced"
-    title = "displacement of a block"
-    kind = "field"
-    parameters = (
-        Parameter("radial", "m", 2e-4), Parameter("azimuthal", "m", 2e-4),
-        Parameter("axial", "m", 2e-4))
-
-    def places(self, study: Study) -> Sequence[Place]:
-        return each_block(study)
-
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        (block,) = blocks_at(nominal, place)
-        axes = rotation_matrix((0.0, 0.0, np.radians(nominal.blocks[block].angle_deg)))
-        return np.array([nominal.block_translation_derivative(block, axis) for axis in axes.T])
-
-    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        radial, azimuthal, axial = map(float, values)
-        return with_exceptions(study, [BlockException(
-            ring=place.ring, slot=place.slot, displacement_m=(radial, azimuthal, axial))])
-
-
-class BlockTurnedEffect(Effect):
-    """One block is rotated with its magnetization, about its own axes through its centre."""
-
-    name = "block_turned"
-    title = "rotation of a block"
-    kind = "field"
-    parameters = (
-        Parameter("radial", "rad", 0.02), Parameter("azimuthal", "rad", 0.02),
-        Parameter("axial", "rad", 0.02))
-
-    def places(self, study: Study) -> Sequence[Place]:
-        return each_block(study)
-
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        (block,) = blocks_at(nominal, place)
-        axes = rotation_matrix((0.0, 0.0, np.radians(nominal.blocks[block].angle_deg)))
-        middle = nominal.blocks[block].middle
-        return np.array([nominal.block_rotation_derivative(block, axis, middle) for axis in axes.T])
-
-    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        radial, azimuthal, axial = np.degrees(values).tolist()
-        return with_exceptions(study, [BlockException(
-            ring=place.ring, slot=place.slot, rotation_deg=(radial, azimuthal, axial))])
-
-
 class MagnetizationGradientEffect(Effect):
     """The outer half of the blocks is stronger than the inner one, in all blocks or in one.
 
@@ -174,7 +124,6 @@ class MagnetizationGradientEffect(Effect):
 
     name = "magnetization_gradient"
     title = "magnetization gradient inside the blocks"
-    kind = "field"
     parameters = (Parameter("gradient", "1", 0.02),)
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -201,7 +150,6 @@ class CornersDemagnetizedEffect(Effect):
 
     name = "corners_demagnetized"
     title = "demagnetized corners at the bore"
-    kind = "field"
     parameters = (Parameter("loss", "1", 0.1),)
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -220,6 +168,257 @@ class CornersDemagnetizedEffect(Effect):
             inner_corner_loss=present + float(values[0]))])
 
 
-EFFECTS = (BlockMissingEffect(), BlockFlippedEffect(), BlockDemagnetizedEffect(),
-           RingDemagnetizedEffect(), BlockDisplacedEffect(), BlockTurnedEffect(),
-           MagnetizationGradientEffect(), CornersDemagnetizedEffect())
+# --- blocks in other slots, or in another orientation: exact, however large the change is
+
+SHORTLIST = 40
+"""Number of places whose signatures are compared; all of them are ranked by an estimate of their
+evidence."""
+
+Sources = Sequence[tuple[int, int, Floats]]
+"""Number from 0 of every slot that changes, and of the slot from which the block that is there
+comes; and the rotation (3, 3) of this block."""
+
+
+class AssemblyEffect(Effect):
+    """Whole blocks are in other slots, or in other orientations, in which they fit."""
+
+    parameters = (Parameter("there", "1", 1.0),)
+    is_binary = True
+    applied_in_full = True
+
+    @abstractmethod
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        """Return which blocks are where, and how they are turned."""
+
+    def simpler(self, magnet: Magnet) -> Sequence[Sources]:
+        """Return changes by other effects, which explain a map in place of equal ones of this."""
+        return ()
+
+    def shortlist(
+        self, study: Study, mean: Floats, information: Floats, score: Floats
+    ) -> Sequence[Place]:
+        """Return the places of the largest estimated evidence, see `Effect.shortlist`.
+
+        The evidence of a known change c of the magnetizations is c' score - c' information c / 2.
+        Of places that change them equally, as far as they are known, the first is returned.
+        """
+        magnet, size = build_magnet(study), study.dimension
+        vectors = mean.reshape(-1, size)
+        places, evidence = [], []
+        known = {_rounded(_change(each, vectors), vectors) for each in self.simpler(magnet)}
+        known.add(())  # no change
+        for place in self.places(study):
+            change = _change(self.sources(magnet, place), vectors)
+            rounded = _rounded(change, vectors)
+            if rounded in known:
+                continue
+            known.add(rounded)
+            places.append(place)
+            index = (np.array(list(change))[:, None] * size + np.arange(size)).ravel()
+            values = np.concatenate(list(change.values()))
+            evidence.append(float(values @ score[index]
+                                  - values @ information[np.ix_(index, index)] @ values / 2))
+        return [places[k] for k in np.argsort(-np.array(evidence), kind="stable")[:SHORTLIST]]
+
+    def magnetization_change(
+        self, nominal: NominalFields, place: Place
+    ) -> Mapping[int, Floats] | None:
+        return _change(self.sources(nominal.magnet, place), nominal.magnetizations)
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        magnet = build_magnet(study)
+        return with_exceptions(study, [
+            _exception(magnet.blocks[to], magnet.blocks[source], turn)
+            for to, source, turn in self.sources(magnet, place)])
+
+
+def _change(sources: Sources, magnetizations: Floats) -> dict[int, Floats]:
+    """Return the change (D,) in A/m of the magnetization of every block, by its number."""
+    size = magnetizations.shape[1]
+    return {to: np.asarray(turn[:size, :size] @ magnetizations[source] - magnetizations[to])
+            for to, source, turn in sources}
+
+
+def _rounded(change: dict[int, Floats], vectors: Floats) -> tuple[tuple[int, ...], ...]:
+    """Return the blocks that change, and their changes in units of what counts as none."""
+    # Difference of magnetizations below which there is none, as a fraction of the largest one.
+    no_change = 1e-5
+    unit = no_change * float(np.abs(vectors).max())
+    whole = {number: np.rint(value / unit).astype(int) for number, value in change.items()}
+    return tuple((number, *value.tolist()) for number, value in sorted(whole.items())
+                 if np.abs(value).max() > 1)
+
+
+def _exception(to: MagnetBlock, source: MagnetBlock, turn: Floats) -> BlockException:
+    """Return the exception by which a block from another slot is turned by a rotation (3, 3)."""
+    rest = turn @ to.carried_from(source).T
+    axes = rotation_matrix((0.0, 0.0, np.radians(to.angle_deg)))
+    x, y, z = np.degrees(axes.T @ Rotation.from_matrix(rest).as_rotvec()).round(9).tolist()
+    came = None if to is source else (source.ring, source.slot)
+    return BlockException(ring=to.ring, slot=to.slot, mounted_from=came, rotation_deg=(x, y, z),
+                          **brought_along(to, source))
+
+
+def brought_along(to: MagnetBlock, source: MagnetBlock) -> dict[str, Any]:
+    """Return the keys of an exception for what a block from another slot has with it: its material.
+
+    They are empty if the material is the same in both slots.
+    """
+    names = ("remanence", "recoil_permeability", "recoil_permeability_across")
+    mine, theirs = ([getattr(block, name) for name in names] for block in (to, source))
+    if mine == theirs or not source.remanence:
+        return {}
+    return {"remanence_T": abs(source.remanence), "recoil_permeability": theirs[1],
+            "recoil_permeability_across": theirs[2]}
+
+
+class BlockPutInWronglyEffect(AssemblyEffect):
+    """One block is turned by a large angle, so that it fits its slot again."""
+
+    name = "block_put_in_wrongly"
+    title = "block put in the wrong way"
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return [place for block in build_magnet(study).blocks if block.remanence
+                for turn in turns_in_slot(block)
+                if (place := _place(block, np.array(turn))) is not None]
+
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        number = magnet.number_of(place.ring, place.slot)
+        return [(number, number, Rotation.from_rotvec(np.radians(place.at_m)).as_matrix())]
+
+
+def _place(block: MagnetBlock, turn: Floats) -> Place | None:
+    """Return a place whose ``at_m`` are the components of a rotation vector in degrees; None if
+    the turn reverses the magnetization.
+    """
+    # Cosine below which a turn reverses the magnetization, which is the effect of a reversed block.
+    opposite = -0.999
+    easy = np.array(block.easy_axis)
+    if easy @ turn @ easy < opposite:
+        return None
+    vector = Rotation.from_matrix(turn).as_rotvec(degrees=True)
+    vector *= np.sign(vector[np.abs(vector) > 1e-6][-1]) if abs(
+        np.linalg.norm(vector) - 180) < 1e-6 else 1.0  # half turns of both signs are the same
+    x, y, z = (vector.round(6) + 0.0).tolist()
+    return Place(block.ring, block.slot, at_m=(x, y, z), words=(
+        f"{block.name}, {_angle_in_words(block, vector)}"))
+
+
+def _angle_in_words(block: MagnetBlock, vector: Floats) -> str:
+    """Describe a rotation vector (3,) in degrees of a block."""
+    size = float(np.linalg.norm(vector))
+    angle = next((words for known, words in ((90, "a quarter turn"), (180, "half a turn"))
+                  if abs(size - known) < 0.1), f"by {size:.0f}°")
+    radial = rotation_matrix((0.0, 0.0, np.radians(block.angle_deg))).T @ vector / size
+    for axis, name in zip(np.eye(3), ("its radius", "its azimuthal direction", "z"), strict=True):
+        if abs(abs(axis @ radial) - 1) < 1e-3:
+            return f"{angle} about {'-' if axis @ radial < 0 else ''}{name}"
+    x, y, z = vector / size
+    return f"{angle} about ({x:.3g}, {y:.3g}, {z:.3g})"
+
+
+class BlocksSwappedEffect(AssemblyEffect):
+    """Two blocks are exchanged, and each keeps its magnetization in the axes of its shape.
+
+    The magnetization thus turns by the angle between the shapes in the two slots. Blocks that are
+    oriented along their magnetization are alike but for their errors.
+    """
+
+    name = "blocks_swapped"
+    title = "two blocks that changed places"
+
+    def places(self, study: Study) -> Sequence[Place]:
+        """Return pairs of successive blocks of a ring, as examples; the search uses `shortlist`."""
+        rings: dict[int, list[MagnetBlock]] = {}
+        for block in build_magnet(study).blocks:
+            rings.setdefault(block.ring, []).append(block)
+        return [place_of(block, after) for ring in rings.values()
+                for block, after in zip(ring, ring[1:] + ring[:1], strict=True)
+                if _interchangeable(block, after) and block is not after]
+
+    def shortlist(
+        self, study: Study, mean: Floats, information: Floats, score: Floats
+    ) -> Sequence[Place]:
+        """Return the pairs of the largest estimated evidence, see `Effect.shortlist`.
+
+        The exchange of two blocks changes the magnetizations by a known vector c, so that the log
+        evidence of the exchange is c' score - c' information c / 2. Both terms follow for all pairs
+        at once from the entries of the two blocks.
+        """
+        blocks, size = build_magnet(study).blocks, study.dimension
+        vectors = mean.reshape(len(blocks), size)
+        turns = np.array([block.shape_axes[:size, :size] for block in blocks])
+        own = np.einsum("jba,jb->ja", turns, vectors)
+        # change of the magnetization at place i when it receives the block of place j
+        change = np.einsum("iab,jb->ija", turns, own) - vectors[:, None]
+        weights = information.reshape(len(blocks), size, len(blocks), size)
+        here = np.einsum("ija,iaib,ijb->ij", change, weights, change, optimize=True)
+        cross = np.einsum("ija,iajb,jib->ij", change, weights, change, optimize=True)
+        gain = np.einsum("ija,ia->ij", change, score.reshape(len(blocks), size))
+        evidence = gain + gain.T - (here + here.T + 2 * cross) / 2
+        kinds = {key: number for number, key in enumerate(dict.fromkeys(map(_kind, blocks)))}
+        kind = np.array([kinds[_kind(block)] for block in blocks])
+        there = np.array([block.remanence != 0 for block in blocks])
+        possible = (kind[:, None] == kind) & np.outer(there, there)
+        first, second = np.nonzero(np.triu(possible, 1))
+        best = np.argsort(-evidence[first, second])[:SHORTLIST]
+        return [place_of(blocks[i], blocks[j])
+                for i, j in zip(first[best], second[best], strict=True)]
+
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        pair = magnet.number_of(place.ring, place.slot), magnet.number_of(*place.other)
+        return [(to, source, magnet.blocks[to].carried_from(magnet.blocks[source]))
+                for to, source in (pair, pair[::-1])]
+
+
+def _kind(block: MagnetBlock) -> tuple[float, float]:
+    """Return cross-section and length, which blocks share that could have changed places."""
+    return float(f"{block.area:.6g}"), float(f"{block.z_max - block.z_min:.6g}")
+
+
+def _interchangeable(block: MagnetBlock, other: MagnetBlock) -> bool:
+    """Tell whether two blocks could have changed places: neither is missing, and they are alike."""
+    return bool(block.remanence and other.remanence) and _kind(block) == _kind(other)
+
+
+KINDS = ("exchanged", "turned", "upside down")
+"""Moves of rings, the simplest first."""
+
+
+class RingsMovedEffect(AssemblyEffect):
+    """Whole rings are moved, after which every block fits a slot again."""
+
+    def __init__(self, name: str, title: str, move: str) -> None:
+        self.name = name
+        self.title = title
+        self.move = move
+
+    def places(self, study: Study) -> Sequence[Place]:
+        return [Place(words=words) for words in moves_of_rings(build_magnet(study), self.move)]
+
+    def simpler(self, magnet: Magnet) -> Sequence[Sources]:
+        """See `AssemblyEffect.simpler`: a ring of a regular order that is upside down may be equal
+        to one that is turned, and exchanged halves to turned ones.
+        """
+        kinds = KINDS[:KINDS.index(self.move)]
+        return [_moved(magnet, move) for kind in kinds
+                for move in moves_of_rings(magnet, kind).values()]
+
+    def sources(self, magnet: Magnet, place: Place) -> Sources:
+        return _moved(magnet, moves_of_rings(magnet, self.move)[place.words])
+
+
+def _moved(magnet: Magnet, move: Move) -> Sources:
+    """Return which blocks are where after a move of rings."""
+    return [(to, source, magnet.blocks[to].carried_from(magnet.blocks[source])
+             if move.turn is None else np.array(move.turn)) for to, source in move.pairs]
+
+
+EFFECTS = (
+    BlockMissingEffect(), BlockFlippedEffect(), BlockDemagnetizedEffect(),
+    RingDemagnetizedEffect(), MagnetizationGradientEffect(), CornersDemagnetizedEffect(),
+    BlockPutInWronglyEffect(), BlocksSwappedEffect(),
+    RingsMovedEffect("rings_swapped", "two rings or halves that changed places", "exchanged"),
+    RingsMovedEffect("rings_turned", "ring or half turned by slots", "turned"),
+    RingsMovedEffect("rings_upside_down", "ring or half put in upside down", "upside down"))

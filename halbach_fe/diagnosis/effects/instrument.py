@@ -118,6 +118,16 @@ def _row(name: str, title: str, amplitudes: str, unit: str, sd: float, change: C
         Parameter(amplitude, unit, sd) for amplitude in amplitudes.split()), change, **more)
 
 
+SENSORS = (
+    ("gain", "sensitivity of", "gain", "1", 3e-3, "gain"),
+    ("offset", "zero of", "offset", "T", 1e-4, "offset_T"),
+    ("quadratic_nonlinearity", "quadratic non-linearity of", "coefficient", "1/T", 3e-3,
+     "quadratic_per_T"),
+    ("cubic_nonlinearity", "cubic non-linearity of", "coefficient", "1/T^2", 5e-3,
+     "cubic_per_T2"))
+"""What a sensor of a component does wrong, and a probe of |B| as well: name, title, amplitude, unit
+and prior standard deviation, and key."""
+
 EFFECTS = (
     _row("mapper_translation", "displacement of the mapper", "x y z", "m", 1e-3,
          _plus("translation_m")),
@@ -141,30 +151,17 @@ EFFECTS = (
          "change", "1", 1e-3, _plus("gain_drift")),
     *(_row(name, f"mapper turned about {COMPONENTS[axis]}", "angle", "rad", 2e-3, _turned(axis))
       for axis, name in enumerate(("mapper_tilt_x", "mapper_tilt_y", "mapper_roll"))),
-    *(_row(f"{name}_{COMPONENTS[axis]}", title.format(COMPONENTS[axis]), amplitudes, unit, sd,
-           _plus(key, axis))
+    *(_row(f"{name}_{COMPONENTS[axis]}", f"{title} the B{COMPONENTS[axis]} sensor", amplitudes,
+           unit, sd, _plus(key, axis))
       for name, title, amplitudes, unit, sd, key in (
-          ("gain", "sensitivity of the B{} sensor", "gain", "1", 3e-3, "gain"),
-          ("offset", "zero of the B{} sensor", "offset", "T", 1e-4, "offset_T"),
-          ("planar_hall", "planar Hall effect of the B{} sensor", "coefficient", "1/T", 5e-3,
-           "planar_hall_per_T"),
-          ("quadratic_nonlinearity", "quadratic non-linearity of the B{} sensor", "coefficient",
-           "1/T", 3e-3, "quadratic_per_T"),
-          ("cubic_nonlinearity", "cubic non-linearity of the B{} sensor", "coefficient", "1/T^2",
-           5e-3, "cubic_per_T2"),
-          ("sensor_position", "place of the B{} sensor in the probe", "x y z", "m", 1e-3,
-           "sensor_position_m"))
-      for axis in range(3)),
+          *SENSORS, ("planar_hall", "planar Hall effect of", "coefficient", "1/T", 5e-3,
+                     "planar_hall_per_T")) for axis in range(3)),
+    *(_row(f"sensor_position_{COMPONENTS[axis]}", f"place of the B{COMPONENTS[axis]} sensor in the "
+           "probe", "x y z", "m", 1e-3, _plus("sensor_position_m", axis)) for axis in range(3)),
     *(_row(f"{name}_of_magnitude", f"{title} the probe of |B|", amplitude, unit, sd,
            _plus_alike(key), of_total_field=True)
       for name, title, amplitude, unit, sd, key in (
-          ("gain", "sensitivity of", "gain", "1", 3e-3, "gain"),
-          ("offset", "zero of", "offset", "T", 1e-4, "offset_T"),
-          ("drift", "drift of the zero of", "change", "T", 1e-4, "drift_T"),
-          ("quadratic_nonlinearity", "quadratic non-linearity of", "coefficient", "1/T", 3e-3,
-           "quadratic_per_T"),
-          ("cubic_nonlinearity", "cubic non-linearity of", "coefficient", "1/T^2", 5e-3,
-           "cubic_per_T2"))),
+          *SENSORS, ("drift", "drift of the zero of", "change", "T", 1e-4, "drift_T"))),
     *(_row(f"misalignment_{sensor}{other}", f"B{sensor} sensor tilted towards {other}",
            "crosstalk", "rad", 2e-3, _picked_up(sensor + other))
       for sensor in COMPONENTS for other in COMPONENTS if sensor != other),

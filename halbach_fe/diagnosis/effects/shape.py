@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -21,17 +21,20 @@ from halbach_fe.diagnosis.effects.base import (
     Place,
     blocks_at,
     changed,
+    each_block,
     each_ring,
     with_array,
     with_exceptions,
     with_remanence,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import Array, BlockException
 from halbach_fe.study.model import Study
 
 X, Y, Z = np.eye(3)
+OWN_AXES = ("radial", "azimuthal", "axial")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +47,6 @@ class ShapeRow(Effect):
     step: float
     keys: Callable[[Array, float], dict[str, Any]]
     dimensions: tuple[int, ...] = (2, 3)
-    kind: Literal["field", "instrument"] = "field"
 
     def places(self, study: Study) -> Sequence[Place]:
         return [Place()] if study.array.is_uniform and study.dimension in self.dimensions else []
@@ -76,7 +78,6 @@ class MoveRow(Effect):
     relative_odds: float = 1.0
     moves_all: bool = False
     few: int = 0
-    kind: Literal["field", "instrument"] = "field"
 
     def places(self, study: Study) -> Sequence[Place]:
         return self.where(study)
@@ -137,6 +138,22 @@ def _ovals_of(study: Study, place: Place, values: Sequence[float]) -> list[Block
         ring=None if alike else block.ring, slot=block.slot,
         displacement_m=(float(np.dot(values, _oval(block.angle_deg))), 0.0, 0.0))
         for block in build_magnet(study).blocks if block.ring == 1 or not alike]
+
+
+def _own_axes(nominal: NominalFields, number: int) -> Floats:
+    """Return the radial, azimuthal and axial direction (3, 3) of a block, by rows."""
+    return rotation_matrix((0.0, 0.0, np.radians(nominal.blocks[number].angle_deg))).T
+
+
+def _along_its_axes(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that moves along its own axes."""
+    return _along(*_own_axes(nominal, number))(nominal, place, number)
+
+
+def _about_its_axes(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
+    """Return what a block changes that turns about its own axes through its centre."""
+    return [nominal.block_rotation_derivative(number, axis, nominal.blocks[number].middle)
+            for axis in _own_axes(nominal, number)]
 
 
 def _about_z(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
@@ -227,7 +244,19 @@ def _halves_of(study: Study, place: Place, values: Sequence[float]) -> list[Bloc
                                else [(None, next(iter(rings.values())))])]
 
 
+BLOCK_DISPLACED = MoveRow(
+    "block_displaced", "displacement of a block", tuple(
+        Parameter(name, "m", 2e-4) for name in OWN_AXES), each_block, _along_its_axes,
+    lambda study, place, values: [BlockException(
+        ring=place.ring, slot=place.slot, displacement_m=(values[0], values[1], values[2]))])
+
 EFFECTS = (
+    BLOCK_DISPLACED,
+    MoveRow("block_turned", "rotation of a block", tuple(
+        Parameter(name, "rad", 0.02) for name in OWN_AXES), each_block, _about_its_axes,
+            lambda study, place, values: [BlockException(
+                ring=place.ring, slot=place.slot,
+                rotation_deg=tuple(np.degrees(values).tolist()))]),
     ShapeRow("inner_radius", "inner radius of the blocks", (Parameter("difference", "m", 3e-4),),
              1e-4, lambda array, more: {"inner_radius_m": array.inner_radius_m + more}),
     ShapeRow("length", "length of the magnet", (Parameter("difference", "m", 1e-3),), 1e-3,

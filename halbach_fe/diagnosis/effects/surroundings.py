@@ -26,7 +26,6 @@ class BackgroundEffect(Effect):
 
     name = "background"
     title = "uniform background field"
-    kind = "field"
     is_divisible = False
     parameters = (
         Parameter("x", "T", 0.0001), Parameter("y", "T", 0.0001), Parameter("z", "T", 0.0001),)
@@ -39,8 +38,8 @@ class BackgroundEffect(Effect):
         return study.with_(external__background_T=total)
 
 
-STEP_M = 1e-4
-"""Step of the finite difference with respect to the distance."""
+STEP_M = 5e-4
+"""Step of finite differences with respect to places and sizes."""
 
 
 class NeighbourMagnetEffect(Effect):
@@ -52,7 +51,6 @@ class NeighbourMagnetEffect(Effect):
 
     name = "neighbour_magnet"
     title = "neighbouring magnet"
-    kind = "field"
     parameters = (Parameter("strength", "1", 1.0),)
     refinements = (Parameter("stronger", "1", 0.5), Parameter("farther", "m", 0.05))
     unique = True
@@ -96,9 +94,6 @@ def _centre(place: Place, farther: float) -> float:
     return float(place.at_m[0] + np.sign(place.at_m[0]) * farther)
 
 
-STEP_M = 1e-4
-"""Step of the finite differences with respect to the position."""
-
 NEAREST_M = 1e-3
 """Distance in m from the object below which a reading shows nothing of it: a place of the grid may
 be one where the probe was, and the field of a point dipole is infinite there."""
@@ -113,7 +108,6 @@ class FerromagneticObjectEffect(Effect):
 
     name = "ferromagnetic_object"
     title = "ferromagnetic object near the bore"
-    kind = "field"
     is_divisible = False
     parameters = (
         Parameter("x", "A m2", 3.0), Parameter("y", "A m2", 3.0), Parameter("z", "A m2", 3.0),)
@@ -196,10 +190,6 @@ it, 98 % would be wrong in the next round. Around the magnet of studies/diagnosi
 of 0.5 mm has 0.5 of the strength of one of 10 mm, one of 25 mm 1.02; a ring 0.1 m off the
 blocks has 0.19, and one 0.2 m off 0.05: that one is no candidate."""
 
-STEP_M = 5e-4
-"""Step of the finite differences with respect to the refinements."""
-
-
 class IronRingEffect(Effect):
     """A coaxial tube of soft iron as long as the magnet surrounds it.
 
@@ -210,7 +200,6 @@ class IronRingEffect(Effect):
 
     name = "iron_ring"
     title = "iron ring around the magnet"
-    kind = "field"
     is_solved = True
     parameters = (Parameter("strength", "1", 1.0, minimum=WEAKEST),)
     refinements = (Parameter("farther_out", "m", 0.01), Parameter("thicker", "m", 0.005))
@@ -272,7 +261,6 @@ class IronSaturationEffect(Effect):
 
     name = "iron_saturation"
     title = "saturation of the iron ring"
-    kind = "field"
     is_solved = True
     parameters = (Parameter("strength", "1", 1.0),)
     is_binary = True
@@ -321,7 +309,6 @@ class CoilCurrentEffect(Effect):
 
     name = "coil_current"
     title = "current of a coil"
-    kind = "field"
     parameters = (Parameter("fraction", "1", 0.05),)
 
     def places(self, study: Study) -> Sequence[Place]:
@@ -373,7 +360,6 @@ class IronPermeabilityEffect(Effect):
 
     name = "iron_permeability"
     title = "permeability of iron"
-    kind = "field"
     is_solved = True
     parameters = (Parameter("fraction", "1", 0.3, minimum=-0.99),)
 
@@ -416,7 +402,6 @@ class IronDisplacedEffect(Effect):
 
     name = "iron_displaced"
     title = "body of iron displaced"
-    kind = "field"
     is_solved = True
     parameters = tuple(Parameter(axis, "m", 3e-4) for axis in "xyz")
 

@@ -152,6 +152,17 @@ class HiddenParameter:
                 largest if self.most is None else self.most)
 
 
+def parameters(
+    text: str, **limits: tuple[float | None] | tuple[float | None, float]
+) -> tuple[HiddenParameter, ...]:
+    """Return parameters that are stated as ``name unit, ...``.
+
+    Some have a smallest value, or a smallest and a largest one, other than that of their unit.
+    """
+    names = [one.partition(" ")[::2] for one in text.split(", ") if one]
+    return tuple(HiddenParameter(name, unit, *limits.get(name, ())) for name, unit in names)
+
+
 Draw = Callable[[Site, np.random.Generator], tuple[float, ...]]
 """Function that draws the values of an effect's parameters."""
 
@@ -241,5 +252,3 @@ def draw_length(low: float, high: float, either_sign: bool = True) -> Draw:
     """Return a function that draws one length in m, scaled to the size of the magnet."""
     return lambda site, generator: (
         site.scale * (signed_log_uniform if either_sign else log_uniform)(generator, low, high),)
-
-

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.hidden_effects.effect_types import (
+    Draw,
     HiddenEffect,
-    HiddenParameter,
+    Need,
     Site,
     draw_direction,
     draw_length,
     draw_number,
     draw_place,
     log_uniform,
+    parameters,
     signed_log_uniform,
 )
 from halbach_fe.synthetic.iron import FroehlichLaw, TrueIron, Tube
@@ -32,11 +35,12 @@ from halbach_fe.synthetic.true_magnet import (
     vector,
 )
 
-BLOCK = (HiddenParameter("ring"), HiddenParameter("slot"))
 SMCO = -3.5e-4
 """Temperature coefficient of the remanence of Sm2Co17 in 1/K."""
 
 Change = Callable[[Body], Body]
+Apply = Callable[..., TrueMagnet]
+"""Function of a magnet, the site and the values that returns the magnet with the effect."""
 
 
 def _bodies(magnet: TrueMagnet, change: Change,
@@ -168,14 +172,19 @@ def ring_gap(magnet: TrueMagnet, site: Site, seam: float, distance: float) -> Tr
 
 def ring_twisted(magnet: TrueMagnet, site: Site, ring: float, angle: float) -> TrueMagnet:
     """Turn one ring about the z axis."""
-    turn = Rotation.from_euler("z", angle)
+    return _ring_turned(magnet, ring, Rotation.from_euler("z", angle))
 
-    def twisted(body: Body) -> Body:
+
+def _ring_turned(magnet: TrueMagnet, ring: float, turn: Rotation) -> TrueMagnet:
+    """Turn one ring about its middle."""
+    def turned(body: Body) -> Body:
+        centre = np.array([0.0, 0.0, body.centre[2]])
         return replace(
-            body, displacement=vector(turn.apply(body.position) - body.centre),
+            body, displacement=vector(
+                turn.apply(body.position - centre) + centre - np.array(body.centre)),
             rotation=vector((turn * Rotation.from_rotvec(body.rotation)).as_rotvec()))
 
-    return _bodies(magnet, twisted, _of_ring(ring))
+    return _bodies(magnet, turned, _of_ring(ring))
 
 
 def ring_shifted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float) -> TrueMagnet:
@@ -190,16 +199,7 @@ def ring_shifted_along(magnet: TrueMagnet, site: Site, ring: float, z: float) ->
 
 def ring_tilted(magnet: TrueMagnet, site: Site, ring: float, x: float, y: float) -> TrueMagnet:
     """Turn one ring about its middle by a rotation vector across the axis."""
-    turn = Rotation.from_rotvec([x, y, 0.0])
-
-    def tilted(body: Body) -> Body:
-        centre = np.array([0.0, 0.0, body.centre[2]])
-        return replace(
-            body, displacement=vector(
-                turn.apply(body.position - centre) + centre - np.array(body.centre)),
-            rotation=vector((turn * Rotation.from_rotvec(body.rotation)).as_rotvec()))
-
-    return _bodies(magnet, tilted, _of_ring(ring))
+    return _ring_turned(magnet, ring, Rotation.from_rotvec([x, y, 0.0]))
 
 
 def halves_apart(magnet: TrueMagnet, site: Site, slot: float, apart: float, sideways: float,
@@ -431,9 +431,8 @@ def _draw_swap(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
     return ring, slot, ring, float(slots[(slots.index(int(slot)) + step) % len(slots)])
 
 
-def _draw_two(count: int, generator: np.random.Generator) -> tuple[float, ...]:
-    """Draw two different numbers from 1."""
-    first, second = 1 + generator.choice(count, 2, replace=False)
+def _draw_two_rings(site: Site, generator: np.random.Generator) -> tuple[float, ...]:
+    first, second = 1 + generator.choice(site.rings, 2, replace=False)
     return float(first), float(second)
 
 
@@ -443,120 +442,89 @@ def _draw_shift(site: Site, generator: np.random.Generator) -> tuple[float, ...]
     return ring, *(amount * value for value in draw_direction(generator, 2)[:2])
 
 
-M, RAD, PER_K = "m", "rad", "1/K"
-OWN_AXES = ("radial", "azimuthal", "z")
-LOST = HiddenParameter("fraction", least=0.0, most=1.0)
-PERMEABILITY = HiddenParameter("change", least=-0.5, most=10.0)
+def _draw_ring(draw: Callable[[Site, np.random.Generator], float]) -> Draw:
+    """Return a function that draws a ring, and a number by another function."""
+    return lambda site, generator: (draw_place(site, generator)[0], draw(site, generator))
+
+
+def _effect(name: str, stated: str, draw: Draw, apply: Apply, *needs: Need,
+            of_blocks: bool = False, **limits: Any) -> HiddenEffect:
+    """Return an effect of the magnet, whose parameters are stated as in `parameters`."""
+    return HiddenEffect(name, "field", parameters(stated, **limits), draw, apply, needs=needs,
+                        of_blocks=of_blocks)
+
+
+RADIUS, LOST, PERMEABILITY = (1e-4, 100.0), (0.0, 1.0), (-0.5, 10.0)
 
 EFFECTS = (
-    HiddenEffect("iron_ring", "field",
-                 (HiddenParameter("inner_radius", M, 1e-4, 100.0),
-                  HiddenParameter("outer_radius", M, 1e-4, 100.0),
-                  HiddenParameter("relative_permeability", least=1.0, most=1e6),
-                  HiddenParameter("saturation_polarization", "T", 0.0, 3.0)),
-                 _draw_iron, iron_ring,
-                 needs=("no iron",)),
-    HiddenEffect("recoil_permeability", "field", (PERMEABILITY,), _draw_recoil,
-                 recoil_permeability, of_blocks=True),
-    HiddenEffect("recoil_permeability_across", "field", (PERMEABILITY,),
-                 draw_number(0.03, 0.15, False), recoil_permeability_across, of_blocks=True),
-    HiddenEffect("block_displaced", "field",
-                 (*BLOCK, *(HiddenParameter(name, M) for name in OWN_AXES)), _draw_displacement,
-                 block_displaced),
-    HiddenEffect("block_turned", "field",
-                 (*BLOCK, *(HiddenParameter(name, RAD) for name in OWN_AXES)), _draw_turn,
-                 block_turned),
-    HiddenEffect("radial_gap", "field", (HiddenParameter("distance", M),),
-                 draw_length(5e-5, 4e-4, False), radial_gap),
-    HiddenEffect("azimuthal_gap", "field", (HiddenParameter("distance", M),),
-                 draw_length(5e-5, 4e-4, False), azimuthal_gap, needs=("equal rings",),
-                 of_blocks=True),
-    HiddenEffect("ring_gap", "field", (HiddenParameter("seam"), HiddenParameter("distance", M)),
-                 lambda site, generator: (float(generator.integers(1, site.rings)),
-                                          site.scale * log_uniform(generator, 5e-5, 5e-4)),
-                 ring_gap, needs=("3d", "rings", "equal rings")),
-    HiddenEffect("ring_twisted", "field", (HiddenParameter("ring"), HiddenParameter("angle", RAD)),
-                 lambda site, generator: (draw_place(site, generator)[0],
-                                          signed_log_uniform(generator, 1e-3, 1e-2)), ring_twisted,
-                 needs=("3d", "rings")),
-    HiddenEffect("ring_shifted", "field",
-                 (HiddenParameter("ring"), HiddenParameter("x", M), HiddenParameter("y", M)),
-                 _draw_shift, ring_shifted, needs=("3d", "rings")),
-    HiddenEffect("ring_shifted_along", "field",
-                 (HiddenParameter("ring"), HiddenParameter("z", M)),
-                 lambda site, generator: (draw_place(site, generator)[0],
-                                          site.scale * signed_log_uniform(generator, 2e-4, 1e-3)),
-                 ring_shifted_along, needs=("3d", "rings")),
-    HiddenEffect("ring_tilted", "field",
-                 (HiddenParameter("ring"), HiddenParameter("x", RAD), HiddenParameter("y", RAD)),
-                 lambda site, generator: (
-                     draw_place(site, generator)[0],
-                     *(log_uniform(generator, 1e-3, 5e-3) * value
-                       for value in draw_direction(generator, 2)[:2])),
-                 ring_tilted, needs=("3d", "rings")),
-    HiddenEffect("ring_demagnetized", "field", (HiddenParameter("ring"), LOST),
-                 lambda site, generator: (draw_place(site, generator)[0],
-                                          log_uniform(generator, 0.02, 0.08)),
-                 ring_demagnetized, needs=("3d", "rings")),
-    HiddenEffect("halves_apart", "field",
-                 (HiddenParameter("slot"), HiddenParameter("apart", M),
-                  HiddenParameter("sideways", M), HiddenParameter("z", M)),
-                 lambda site, generator: (
-                     draw_place(site, generator)[1],
-                     site.scale * log_uniform(generator, 2e-4, 1e-3), 0.0, 0.0),
-                 halves_apart, needs=("3d", "equal rings")),
-    HiddenEffect("blocks_swapped", "field",
-                 (*BLOCK, HiddenParameter("other_ring"), HiddenParameter("other_slot")), _draw_swap,
-                 blocks_swapped),
-    HiddenEffect("block_put_in_wrongly", "field",
-                 (*BLOCK, *(HiddenParameter(name, RAD) for name in OWN_AXES)),
-                 lambda site, generator: (*draw_place(site, generator), np.pi, 0.0, 0.0),
-                 block_put_in_wrongly),
-    HiddenEffect("rings_swapped", "field",
-                 (HiddenParameter("ring"), HiddenParameter("other_ring")),
-                 lambda site, generator: _draw_two(site.rings, generator), rings_swapped,
-                 needs=("3d", "rings", "equal rings")),
-    HiddenEffect("rings_turned", "field", (HiddenParameter("ring"), HiddenParameter("slots")),
-                 lambda site, generator: (draw_place(site, generator)[0], 1.0), rings_turned,
-                 needs=("3d", "rings")),
-    HiddenEffect("block_flipped", "field", BLOCK, draw_place, block_flipped),
-    HiddenEffect("block_missing", "field", BLOCK, draw_place, block_missing),
-    HiddenEffect("block_demagnetized", "field", (*BLOCK, LOST),
-                 lambda site, generator: (*draw_place(site, generator),
-                                          log_uniform(generator, 0.04, 0.3)),
-                 block_demagnetized),
-    HiddenEffect("corners_demagnetized", "field", (LOST,),
-                 draw_number(0.03, 0.3, False), corners_demagnetized, needs=("four edges",)),
-    HiddenEffect("magnetization_gradient", "field",
-                 (*BLOCK, HiddenParameter("fraction", least=-1.0, most=1.0)),
-                 _draw_gradient, magnetization_gradient, needs=("four edges",), of_blocks=True),
-    HiddenEffect("temperature", "field",  # from room temperature, not below absolute zero
-                 (HiddenParameter("change", "K", least=-293.0),
-                  HiddenParameter("coefficient", PER_K)),
-                 lambda site, generator: (signed_log_uniform(generator, 2, 15), SMCO), temperature),
-    HiddenEffect("temperature_gradient", "field",
-                 (HiddenParameter("change", "K"), HiddenParameter("coefficient", PER_K)),
-                 lambda site, generator: (signed_log_uniform(generator, 3, 15), SMCO),
-                 temperature_gradient),
-    HiddenEffect("inner_radius", "field", (HiddenParameter("change", M),), draw_length(1e-4, 6e-4),
-                 inner_radius, needs=("equal rings",), of_blocks=True),
-    HiddenEffect("length", "field", (HiddenParameter("fraction", least=-0.5, most=0.5),),
-                 draw_number(5e-4, 4e-3),
-                 magnet_length, needs=("3d", "equal rings"), of_blocks=True),
-    HiddenEffect("background", "field", tuple(HiddenParameter(name, "T") for name in "xyz"),
-                 lambda site, generator: tuple(
-                     float(value) for value in log_uniform(generator, 5e-5, 5e-4)
-                     * np.array(draw_direction(generator, site.dimension))), background),
-    HiddenEffect("neighbour_magnet", "field", (HiddenParameter("distance", M, -100.0, 100.0),),
-                 _draw_neighbour, neighbour_magnet, needs=("3d",)),
-    HiddenEffect("ferromagnetic_object", "field",
-                 (*(HiddenParameter(name, M) for name in "xyz"),
-                  HiddenParameter("volume", "m^3", 1e-12)),
-                 _draw_object, ferromagnetic_object, needs=("3d",)),
-    HiddenEffect("knee", "field",
-                 (HiddenParameter("coercivity", "A/m", 1.0),
-                  HiddenParameter("squareness", least=0.01, most=1.0)),
-                 lambda site, generator: (generator.uniform(5.0e5, 5.8e5),
-                                          generator.uniform(0.8, 0.9)),
-                 knee, needs=("3d", "vacuum", "few blocks", "four edges")),
-)
+    _effect("iron_ring", "inner_radius m, outer_radius m, relative_permeability, "
+            "saturation_polarization T", _draw_iron, iron_ring, "no iron", inner_radius=RADIUS,
+            outer_radius=RADIUS, relative_permeability=(1.0, 1e6),
+            saturation_polarization=(0.0, 3.0)),
+    _effect("recoil_permeability", "change", _draw_recoil, recoil_permeability, of_blocks=True,
+            change=PERMEABILITY),
+    _effect("recoil_permeability_across", "change", draw_number(0.03, 0.15, False),
+            recoil_permeability_across, of_blocks=True, change=PERMEABILITY),
+    _effect("block_displaced", "ring, slot, radial m, azimuthal m, z m", _draw_displacement,
+            block_displaced),
+    _effect("block_turned", "ring, slot, radial rad, azimuthal rad, z rad", _draw_turn,
+            block_turned),
+    _effect("radial_gap", "distance m", draw_length(5e-5, 4e-4, False), radial_gap),
+    _effect("azimuthal_gap", "distance m", draw_length(5e-5, 4e-4, False), azimuthal_gap,
+            "equal rings", of_blocks=True),
+    _effect("ring_gap", "seam, distance m", lambda site, generator: (
+        float(generator.integers(1, site.rings)), site.scale * log_uniform(generator, 5e-5, 5e-4)),
+        ring_gap, "3d", "rings", "equal rings"),
+    _effect("ring_twisted", "ring, angle rad", _draw_ring(
+        lambda site, generator: signed_log_uniform(generator, 1e-3, 1e-2)), ring_twisted, "3d",
+        "rings"),
+    _effect("ring_shifted", "ring, x m, y m", _draw_shift, ring_shifted, "3d", "rings"),
+    _effect("ring_shifted_along", "ring, z m", _draw_ring(
+        lambda site, generator: site.scale * signed_log_uniform(generator, 2e-4, 1e-3)),
+        ring_shifted_along, "3d", "rings"),
+    _effect("ring_tilted", "ring, x rad, y rad", lambda site, generator: (
+        draw_place(site, generator)[0], *(log_uniform(generator, 1e-3, 5e-3) * value
+                                          for value in draw_direction(generator, 2)[:2])),
+        ring_tilted, "3d", "rings"),
+    _effect("ring_demagnetized", "ring, fraction", _draw_ring(
+        lambda site, generator: log_uniform(generator, 0.02, 0.08)), ring_demagnetized, "3d",
+        "rings", fraction=LOST),
+    _effect("halves_apart", "slot, apart m, sideways m, z m", lambda site, generator: (
+        draw_place(site, generator)[1], site.scale * log_uniform(generator, 2e-4, 1e-3), 0.0, 0.0),
+        halves_apart, "3d", "equal rings"),
+    _effect("blocks_swapped", "ring, slot, other_ring, other_slot", _draw_swap, blocks_swapped),
+    _effect("block_put_in_wrongly", "ring, slot, radial rad, azimuthal rad, z rad",
+            lambda site, generator: (*draw_place(site, generator), np.pi, 0.0, 0.0),
+            block_put_in_wrongly),
+    _effect("rings_swapped", "ring, other_ring", _draw_two_rings, rings_swapped, "3d", "rings",
+            "equal rings"),
+    _effect("rings_turned", "ring, slots", _draw_ring(lambda site, generator: 1.0), rings_turned,
+            "3d", "rings"),
+    _effect("block_flipped", "ring, slot", draw_place, block_flipped),
+    _effect("block_missing", "ring, slot", draw_place, block_missing),
+    _effect("block_demagnetized", "ring, slot, fraction", lambda site, generator: (
+        *draw_place(site, generator), log_uniform(generator, 0.04, 0.3)), block_demagnetized,
+        fraction=LOST),
+    _effect("corners_demagnetized", "fraction", draw_number(0.03, 0.3, False),
+            corners_demagnetized, "four edges", fraction=LOST),
+    _effect("magnetization_gradient", "ring, slot, fraction", _draw_gradient,
+            magnetization_gradient, "four edges", of_blocks=True, fraction=(-1.0, 1.0)),
+    _effect("temperature", "change K, coefficient 1/K", lambda site, generator: (
+        signed_log_uniform(generator, 2, 15), SMCO), temperature,
+        change=(-293.0,)),  # from room temperature, not below absolute zero
+    _effect("temperature_gradient", "change K, coefficient 1/K", lambda site, generator: (
+        signed_log_uniform(generator, 3, 15), SMCO), temperature_gradient),
+    _effect("inner_radius", "change m", draw_length(1e-4, 6e-4), inner_radius, "equal rings",
+            of_blocks=True),
+    _effect("length", "fraction", draw_number(5e-4, 4e-3), magnet_length, "3d", "equal rings",
+            of_blocks=True, fraction=(-0.5, 0.5)),
+    _effect("background", "x T, y T, z T", lambda site, generator: tuple(
+        float(value) for value in log_uniform(generator, 5e-5, 5e-4)
+        * np.array(draw_direction(generator, site.dimension))), background),
+    _effect("neighbour_magnet", "distance m", _draw_neighbour, neighbour_magnet, "3d",
+            distance=(-100.0, 100.0)),
+    _effect("ferromagnetic_object", "x m, y m, z m, volume m^3", _draw_object,
+            ferromagnetic_object, "3d", volume=(1e-12,)),
+    _effect("knee", "coercivity A/m, squareness", lambda site, generator: (
+        generator.uniform(5.0e5, 5.8e5), generator.uniform(0.8, 0.9)), knee, "3d", "vacuum",
+        "few blocks", "four edges", coercivity=(1.0,), squareness=(0.01, 1.0)))
