@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 import shtab
 
+import halbach_fe as hf
 from halbach_fe.cli import common
-from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, option, parser, path, verb
-from halbach_fe.cli.streams import show
+from halbach_fe.cli.guard import show
+from halbach_fe.cli.options import CACHE_HELP, GETDP, JSON, choice, option, parser, path, verb
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import CheckFailedError, GetDPNotFoundError
 
@@ -33,9 +34,10 @@ such as openblas-pthread or blis-openmp."""
 
 
 @verb(
-    option("what", choices=("ls", "clear"), metavar="{ls,clear}",
-           help="list the entries, or remove all of them"),
-    option("--cache", type=path, metavar="DIR", help=f"folder of the cache {CACHE_HELP}"), JSON)
+    option("what", str, "{ls,clear}", "list the entries, or remove all of them",
+           choices=("ls", "clear")),
+    option("--cache", path, "DIR",
+           f"folder of the cache {CACHE_HELP}"), JSON)
 def cache(arguments: argparse.Namespace) -> int:
     """List the cache of GetDP's answers, or clear it.
 
@@ -129,10 +131,8 @@ def solve_error(getdp: GetDP, method: str) -> float:
     """Return the error of a 2D solve of a dipole with an iron ring, relative to its bore field."""
     import numpy as np
 
-    from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.solver.formulation_choice import solve_nominal
     from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
-    from halbach_fe.solver.session import Session
     from halbach_fe.study.reader import parse_study
 
     inner, outer, mu, iron = 0.1, 0.18, 1.05, (0.19, 0.21, 500.0)
@@ -149,21 +149,19 @@ def solve_error(getdp: GetDP, method: str) -> float:
     points = 0.07 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     exact = layered_bore_field(ideal_sectors(1, 16, 1.0), inner, outer, mu, points[:, :2], iron)
     with tempfile.TemporaryDirectory() as folder:
-        field = solve_nominal(build_magnet(study), points, Session(getdp, Path(folder)))[:, :2]
+        field = solve_nominal(hf.build_magnet(study), points,
+                              hf.Session(getdp, Path(folder)))[:, :2]
     return float(np.abs(field - exact).max() / np.abs(exact).max())
 
 
 @verb()
 def schema(arguments: argparse.Namespace) -> int:
     """Print the JSON schema of the study file."""
-    from halbach_fe.study.model import Study
-
-    common.print_json(Study.model_json_schema())
+    common.print_json(hf.Study.model_json_schema())
     return 0
 
 
-@verb(option("shell", choices=("bash", "zsh", "tcsh"),
-             help="shell for which the script is printed"))
+@verb(choice("shell", ("bash", "zsh", "tcsh"), "shell for which the script is printed"))
 def completion(arguments: argparse.Namespace) -> int:
     """Print a script that completes halbach-fe's commands and options in a shell.
 

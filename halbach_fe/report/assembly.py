@@ -21,7 +21,7 @@ from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_te
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.prism import Prism, circle, upright
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import Page, Section, Table, csv_file, page_of, rendered
+from halbach_fe.report.page import Page, Section, Table, csv_file, rendered
 from halbach_fe.report.words import counted
 
 FLAT = 0.1
@@ -553,7 +553,6 @@ def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
         "way_round": [one.way_round for one in blocks]}
 
 
-@page_of.register
 def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> Page:
     """Return the page of what is to be ordered and made; its files are the solids, too."""
     kinds, plates = _kind_rows(assembly), _plate_rows(assembly)

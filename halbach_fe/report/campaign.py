@@ -27,7 +27,6 @@ from halbach_fe.report.page import (
     Table,
     View,
     geometry_figure,
-    page_of,
     stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
@@ -67,7 +66,6 @@ def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, bloc
         + (" --held-out DIR/held-out.csv" if held_out is not None else "") + " -o DIR")
 
 
-@page_of.register
 def page(campaign: SimulatedCampaign) -> Page:
     """Return the page of a simulated campaign.
 

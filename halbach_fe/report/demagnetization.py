@@ -32,7 +32,6 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.words import place_of
 from halbach_fe.study.model import is_nonlinear
@@ -196,7 +195,6 @@ def _limit_in_words(found: DemagnetizationMap, share: float) -> str:
     return f"{part} never passes the knee" if share else "no cell ever passes the knee"
 
 
-@page_of.register
 def page(found: DemagnetizationMap) -> Page:
     """Return the page of the margins of the blocks."""
     summary, blocks, material = demagnetization_summary(found), found.by_block(), found.material

@@ -40,7 +40,7 @@ from halbach_fe.report.diagnosis_answer import (
 )
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.page import Drawn, Page, Section, Table, View, page_of
+from halbach_fe.report.page import Drawn, Page, Section, Table, View
 from halbach_fe.report.words import (
     BAYES_FACTOR_IN_WORDS,
     bayes_factor,
@@ -136,7 +136,6 @@ def _floor(diagnosis: Diagnosis, region: str, component: str) -> float:
     return float("nan") if own is None else float(own)
 
 
-@page_of.register
 def page(
     diagnosis: Diagnosis, separations: Sequence[Separation] = (), study: Study | None = None,
 ) -> Page:

@@ -26,7 +26,6 @@ from halbach_fe.report.page import (
     Table,
     csv_file,
     figure_of,
-    page_of,
 )
 from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_error
 from halbach_fe.study.types import COMPONENTS
@@ -319,7 +318,6 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
              ylim=(-reach, reach), title=f"ring {found.blocks[chosen[0]].ring}")
 
 
-@page_of.register
 def page(found: Forces) -> Page:
     """Return the page of the forces on the blocks."""
     iron, rows = bool(found.magnet.iron), _rows(found)

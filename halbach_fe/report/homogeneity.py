@@ -30,7 +30,6 @@ from halbach_fe.report.page import (
     Table,
     csv_file,
     figure_of,
-    page_of,
 )
 from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import decimals, flux_density, ppm, with_error
@@ -329,7 +328,6 @@ def harmonics_figure(known: Homogeneity) -> Figure:
     return figure
 
 
-@page_of.register
 def page(found: HomogeneityResult) -> Page:
     """Return the page of the homogeneity of a magnet's field."""
     name, best = list(found.by_name.items())[-1]

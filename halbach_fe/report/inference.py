@@ -32,7 +32,6 @@ from halbach_fe.report.page import (
     Text,
     View,
     figure_of,
-    page_of,
 )
 from halbach_fe.report.prediction import (
     has_profile,
@@ -295,7 +294,6 @@ def _by_readings(result: InferenceResult, directions: Floats, of: Floats) -> lis
             for value, bar in zip(mean.tolist(), (of * sd).tolist(), strict=True)]
 
 
-@page_of.register
 def page(result: InferenceResult) -> Page:
     """Return the page of an updated magnet."""
     known = distributions_of(result.magnet, result)

@@ -29,7 +29,6 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
     linearized,
-    page_of,
 )
 from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
 from halbach_fe.response.multipoles import (
@@ -340,7 +339,6 @@ def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
     return f"{with_error(1e3 * known.main, 1e3 * known.main_sd)}\u00a0m{model.unit}"
 
 
-@page_of.register
 def page(found: MultipoleTables) -> Page:
     """Return the page of the multipoles of a magnet."""
     study, tables = found.magnet.study, found.tables

@@ -30,7 +30,6 @@ from halbach_fe.report.page import (
     figure_of,
     label_logarithmic,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.words import counted, fraction, ppm
 from halbach_fe.study.model import Study, is_nonlinear
@@ -149,7 +148,6 @@ def _of_the_instrument(study: Study) -> str:
         "all readings share, is not in them, and leaves more of the blocks' common strength.")
 
 
-@page_of.register
 def page(plan: MeasurementPlan) -> Page:
     """Return the page of the positions to measure."""
     magnet, summary, rows = plan.magnet, plan_summary(plan), plan_table(plan)

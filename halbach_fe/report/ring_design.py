@@ -28,7 +28,6 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.words import PERCENT_FROM, counted, in_a_row, ppm, relative
 
@@ -191,7 +190,6 @@ def side_figure(found: Designed) -> Figure:
     return figure
 
 
-@page_of.register
 def page(found: Designed) -> Page:
     """Return the page of a search for rings, with the study of the best design."""
     settings, best, rows, rings = (

@@ -13,16 +13,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
-from halbach_fe.report.page import (
-    PUBLISHED,
-    Drawn,
-    Page,
-    Section,
-    Table,
-    csv_file,
-    figure_of,
-    page_of,
-)
+from halbach_fe.report.page import PUBLISHED, Drawn, Page, Section, Table, csv_file, figure_of
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
 
@@ -178,7 +169,6 @@ def _tray_figure(found: FilledTray) -> Figure:
     return figure
 
 
-@page_of.register
 def page(found: FilledTray) -> Page:
     """Return the page of a tray, with the table to fill it from."""
     tray = found.magnet.study.shim_tray

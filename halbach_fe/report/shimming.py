@@ -39,7 +39,6 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
     linearized,
-    page_of,
 )
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
@@ -326,7 +325,6 @@ def _unknown_part(shim: Shim) -> str:
             "blocks (--blocks) or a map at more places would tell more")
 
 
-@page_of.register
 def page(shim: Shim) -> Page:
     """Return the page of moves of blocks.
 

@@ -32,7 +32,6 @@ from halbach_fe.report.page import (
     geometry_figure,
     label_logarithmic,
     legend_above,
-    page_of,
     stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
@@ -122,7 +121,6 @@ def _smallest_noise(solution: Solution) -> float:
     return min((region.sigma_T for region in noise.regions), default=0.0) if noise else 0.0
 
 
-@page_of.register
 def page(solution: Solution) -> Page:
     """Return the page of a solved nominal magnet, with the multipoles of full circles."""
     magnet, study, rows = solution.magnet, solution.magnet.study, field_table(solution)

@@ -33,7 +33,6 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.shimming import aim_of, values_summary, values_table
 from halbach_fe.report.words import counted, in_a_row, ppm
@@ -215,7 +214,6 @@ def _uncertainty(found: SortedBlocks) -> float:
     return float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
 
 
-@page_of.register
 def page(found: SortedBlocks) -> Page:
     """Return the page of blocks that were assigned to slots."""
     aim = aim_of(found.model)

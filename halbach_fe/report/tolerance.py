@@ -34,7 +34,6 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
     linearized,
-    page_of,
 )
 from halbach_fe.report.words import decimals, ppm, share_in_words, whole
 from halbach_fe.response.multipoles import plain
@@ -159,7 +158,6 @@ def _made_by_tolerances(found: Tolerance) -> str:
             f"magnets, below {decimals(most[number])} in 95 %. With what the design makes: ")
 
 
-@page_of.register
 def page(found: Tolerance | HomogeneityTolerance) -> Page:
     """Return the page of magnets that were drawn at random."""
     if isinstance(found, HomogeneityTolerance):

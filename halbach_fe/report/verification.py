@@ -29,7 +29,6 @@ from halbach_fe.report.page import (
     geometry_figure,
     label_logarithmic,
     legend_above,
-    page_of,
     stacked_axes,
 )
 from halbach_fe.report.words import (
@@ -187,7 +186,6 @@ def _reading(found: Verification) -> str:
     return "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
 
 
-@page_of.register
 def page(found: Verification) -> Page:
     """Return the page of how far the computed field is off."""
     magnet, rows, change = found.magnet, difference_table(found), found.changes[STEPS - 1]
