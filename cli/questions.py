@@ -6,7 +6,7 @@ import argparse
 import time
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import halbach_fe as hf
 from halbach_fe.cli import common
@@ -42,8 +42,6 @@ from halbach_fe.core.errors import CommandLineError, StudyError, must_be
 from halbach_fe.core.numbers import ACROSS, DENSITY, DRAWS, HIGHEST_DEGREE
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from halbach_fe.core.arrays import Floats
 
 
@@ -134,6 +132,7 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     from halbach_fe.core.files import write_text
     from halbach_fe.core.numbers import csv_text
     from halbach_fe.inference.storage import disagreement_of
+    from halbach_fe.report.page import columns_by_axis
     from halbach_fe.report.words import with_error
     from halbach_fe.study.types import COMPONENTS
 
@@ -151,16 +150,14 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     with common.session(arguments, magnet.study) as session:
         found = hf.field(magnet, lines, session, read, arguments.inside)
     folder = arguments.output
-    write_text(folder / "field.csv", csv_text(_points(found)))
+    points: dict[str, Floats] = {}
+    for name, values in (("{}_m", lines.points), ("B{}_T", found.mean), ("sd_B{}_T", found.sd),
+                         *zip(("H{}_A_per_m", "sd_H{}_A_per_m"), found.strength, strict=True)):
+        points |= columns_by_axis(name, values)
+    write_text(folder / "field.csv", csv_text({**points, "in_block": found.in_block.ravel()}))
     hf.write_map(hf.field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
         "study": magnet.name}), folder / "field_map.csv")
-    grid = np.meshgrid(*offsets, indexing="ij")
-    columns: dict[str, Floats] = {"u_m": grid[0].ravel(), "v_m": grid[1].ravel()}
-    for order, unit in ((1, "T_m"), (2, "T_m2")):
-        mean, sd = found.integrals(order)
-        for axis, values, bars in zip(COMPONENTS, mean.T, sd.T, strict=True):
-            columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
-    columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
+    columns = _integrals(found, *np.meshgrid(*offsets, indexing="ij"))
     if min(map(len, offsets)) > 1:
         kicks = found.kicks()
         for across, (kick, sd) in zip("uv", kicks, strict=True):
@@ -193,18 +190,15 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     return 0
 
 
-def _points(found: hf.FieldOnLines) -> dict[str, NDArray[Any]]:
-    """Return the columns of the table of points."""
-    from halbach_fe.study.types import COMPONENTS
-
-    strength, strength_sd = found.strength
-    columns: dict[str, NDArray[Any]] = {}
-    for name, values in (("{}_m", found.lines.points), ("B{}_T", found.mean),
-                         ("sd_B{}_T", found.sd), ("H{}_A_per_m", strength),
-                         ("sd_H{}_A_per_m", strength_sd)):
-        columns |= {name.format(axis): values[..., number].ravel()
-                    for number, axis in enumerate(COMPONENTS)}
-    return columns | {"in_block": found.in_block.ravel()}
+def _integrals(found: hf.FieldOnLines, u_m: Floats, v_m: Floats) -> dict[str, Floats]:
+    """Return the columns of integrals.csv, a row for each line at the offsets u and v."""
+    columns = {"u_m": u_m.ravel(), "v_m": v_m.ravel()}
+    for order, unit in ((1, "T_m"), (2, "T_m2")):
+        mean, sd = found.integrals(order)
+        for axis, values, bars in zip("xyz", mean.T, sd.T, strict=True):
+            columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
+    columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
+    return columns
 
 
 def kick_map(length: float, offsets: tuple[Floats, ...], kicks: tuple[Floats, Floats]) -> str:

@@ -24,6 +24,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
@@ -46,7 +48,7 @@ AT_ROOM = "It loses magnetization at room temperature already."
 """Sentence about a magnet that does not keep its magnetization there."""
 
 
-def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
+def demagnetization_summary(found: DemagnetizationMap) -> Plain:
     """Return the content of demagnetization.json: margins, shares and limit temperatures."""
     material, worst = found.material, int(np.argmin(found.margin))
     block = found.blocks[found.cells.block[worst]]
@@ -243,7 +245,7 @@ def page(found: DemagnetizationMap) -> Page:
 _SCALED = ". At other temperatures the field of the iron is scaled with the remanence"
 
 
-def _worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+def _worst_block_table(rows: list[dict[str, Any]]) -> Rows:
     """Return the rows of the few blocks with the smallest margins, as text."""
     worst_rows = 12  # number of blocks in the page's table
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),

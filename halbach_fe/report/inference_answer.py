@@ -17,6 +17,7 @@ from halbach_fe.report.words import (
     flux_density,
     fraction,
     place_of,
+    rms,
     with_error,
 )
 from halbach_fe.solver.formulation_choice import finer_in_words
@@ -188,7 +189,7 @@ def _numbers(values: Floats, form: str) -> str:
 def _prediction(result: InferenceResult) -> str:
     """Say how far the predictions are from readings, if possible from ones that it has not seen."""
     part, chosen = _tested(result)
-    before, after = (_rms((result.readings - each.mean)[chosen])
+    before, after = (rms((result.readings - each.mean)[chosen])
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
         return (f"The updated magnet differs from the readings by {_field(after)} rms, "
@@ -217,12 +218,12 @@ def _tested(result: InferenceResult) -> tuple[str | None, NDArray[np.bool_]]:
 def _expected(result: InferenceResult) -> float:
     """Return the rms difference in T that error bars and noise allow."""
     _, chosen = _tested(result)
-    return _rms(np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen])
+    return rms(np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen])
 
 
 def distances(first: InferenceResult, last: InferenceResult) -> tuple[tuple[str, str], ...]:
     """Return how far the model is off before the first of two updates, and after the last one."""
-    off = [_rms((result.readings - prediction.mean)[_tested(result)[1]]) for result, prediction in (
+    off = [rms((result.readings - prediction.mean)[_tested(result)[1]]) for result, prediction in (
         (first, first.prediction_prior), (last, last.prediction_posterior))]
     return (("off before", _field(off[0])), ("after", _field(off[1])),
             ("noise and error bars", _field(_expected(last))))
@@ -247,7 +248,7 @@ def _blocks(result: InferenceResult, start: str = (
     row = np.zeros((1, len(result.posterior.mean)))
     result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
-    start = f"{start} by {fraction(_rms(mean))} rms, the most {place_of(block)}"
+    start = f"{start} by {fraction(rms(mean))} rms, the most {place_of(block)}"
     if result.disagreement:  # error bars that are not to be used are not stated
         sign = "" if mean[worst] < 0 else "+"
         return (f"{start}, which seems to be missing or reversed." if mean[worst] < -1 else
@@ -262,7 +263,3 @@ def _blocks(result: InferenceResult, start: str = (
 def _field(size: float) -> str:
     """Return a flux density in T as the table of the page has it."""
     return flux_density(size, zeros=True)
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -19,7 +19,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Edge, outline_contains
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.report.page import IRON, MEASURED, SECOND
+from halbach_fe.report.page import IRON, MEASURED, SECOND, Plain
 from halbach_fe.report.words import flux_density, place_of
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.types import COMPONENTS
@@ -34,6 +34,12 @@ MOST_SUMMED = 20_000
 """Largest number of blocks whose field is drawn in the plane: it takes 0.2 ms per block."""
 
 
+def _lines(starts: Floats, ends: Floats) -> dict[str, Floats]:
+    """Return the coordinates of lines between points (n, 3), which NaN separates."""
+    gap = np.full_like(ends, np.nan)
+    return dict(zip("xyz", np.stack([starts, ends, gap], axis=1).reshape(-1, 3).T, strict=True))
+
+
 def residuals_trace(positions: Floats, residual: Floats, bore_radius: float) -> go.Scatter3d:
     """Return arrows of what the model lacks, B (n, 3) in T at points (n, 3) in m."""
     most_arrows = 5000  # largest number of arrows that are drawn: those of the largest residuals
@@ -41,11 +47,9 @@ def residuals_trace(positions: Floats, residual: Floats, bore_radius: float) -> 
     kept = np.sort(np.argsort(-size)[:most_arrows])
     longest = float(size.max()) or 1.0
     ends = positions[kept] + LONGEST * bore_radius / longest * residual[kept]
-    gap = np.full_like(ends, np.nan)
-    x, y, z = np.stack([positions[kept], ends, gap], axis=1).reshape(-1, 3).T
     return go.Scatter3d(
-        x=x, y=y, z=z, mode="lines", line={"color": SECOND, "width": 3}, visible="legendonly",
-        name=f"residuals, up to {flux_density(longest, 2)}", hoverinfo="skip")
+        **_lines(positions[kept], ends), mode="lines", line={"color": SECOND, "width": 3},
+        visible="legendonly", name=f"residuals, up to {flux_density(longest, 2)}", hoverinfo="skip")
 
 
 def cut_trace(magnet: Magnet) -> go.Surface | None:
@@ -354,10 +358,9 @@ def _named_trace(blocks: Sequence[MagnetBlock], outer: float) -> go.Scatter3d:
     outside, radius = middles.copy(), np.hypot(*middles[:, :2].T)
     outside[radius < 1e-9 * outer, 0] = outer  # blocks on the axis
     outside[:, :2] *= OUTSIDE * outer / np.hypot(*outside[:, :2].T)[:, None]
-    x, y, z = np.stack([middles, outside, np.full_like(middles, np.nan)], axis=1).reshape(-1, 3).T
     texts = [text for block in blocks for text in ("", place_of(block), "")]
     return go.Scatter3d(
-        x=x, y=y, z=z, text=texts, mode="lines+text", name="found", hoverinfo="skip",
+        **_lines(middles, outside), text=texts, mode="lines+text", name="found", hoverinfo="skip",
         line={"color": MEASURED, "width": 5}, textposition="top center",
         textfont={"color": MEASURED, "size": 14})
 
@@ -420,10 +423,9 @@ def _merge_rings(
     if colours is not None:
         magnitude = np.abs(colours.values)
         worst = [group[int(np.argmax(magnitude[group]))] for group in groups]
-        where = [f"largest in ring {blocks[number].ring}: " if step > 1 else ""
-                 for number in worst]
         colours = replace(colours, values=colours.values[worst], words=[
-            text + colours.words[number] for text, number in zip(where, worst, strict=True)])
+            (f"largest in ring {blocks[number].ring}: " if step > 1 else "") + colours.words[number]
+            for number in worst])
     magnetization = np.array([values.magnetization[group].mean(axis=0) for group in groups])
     return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],
             BlockValues(magnetization, colours))
@@ -467,7 +469,7 @@ def _blocks_trace(
     more = _rings_per_prism(magnet) - 1
     texts = [_hover_text(block, min(more, magnet.array.rings - block.ring), values, number)
              for number, block in enumerate(blocks)]
-    look: dict[str, object] = {"color": "#BBBBBB"}
+    look: Plain = {"color": "#BBBBBB"}
     if (colours := values.colours) is not None:
         limit = float(np.abs(colours.values).max()) or 1.0
         low, high = colours.limits or (-limit, limit)
@@ -557,10 +559,9 @@ def _arrow_traces(
     vectors[:, :values.magnetization.shape[1]] = values.magnetization
     size = np.median([np.ptp(prism(block, 0.0)[0], axis=0).max() for block in blocks[:100]])
     vectors *= ARROW * size / (np.linalg.norm(vectors, axis=1).max() or 1.0)
-    gap = np.full_like(middles, np.nan)  # NaN separates the lines of consecutive arrows
-    x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
-    shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
-                          name="magnetization", legendgroup="arrows", hoverinfo="skip")
+    shafts = go.Scatter3d(**_lines(middles - vectors / 2, middles + vectors / 2), mode="lines",
+                          line={"color": MEASURED, "width": 4}, name="magnetization",
+                          legendgroup="arrows", hoverinfo="skip")
     if len(blocks) > most_cones:
         return [shafts]
     (x, y, z), (u, v, w) = (middles + vectors / 2).T, (HEAD * vectors).T

@@ -23,6 +23,8 @@ from halbach_fe.report.page import (
     SECOND,
     Drawn,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
@@ -55,7 +57,7 @@ COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
 
 
-def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, object]:
+def reference_summary(model: MultipoleModel, limit: float | None) -> Plain:
     """Return the reference of multipoles as entries of a JSON file."""
     return {"radius_m": model.radius, "z_m": model.z, "integrated_along_z": model.integrated,
             "main_order": model.main, "orders": list(model.orders),
@@ -189,7 +191,7 @@ def sections_of_circles(
 
 def _summary(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None
-) -> dict[str, object]:
+) -> Plain:
     """Return the content of multipoles.json."""
     return {"study": study.name, "tables": [
         {"reference": reference_summary(model, limit),
@@ -238,7 +240,7 @@ def answer(
         "halbach-fe shim STUDY --measurements MAP -o DIR")
 
 
-def multipole_rows(magnets: Mapping[str, Multipoles]) -> list[dict[str, str]]:
+def multipole_rows(magnets: Mapping[str, Multipoles]) -> Rows:
     """Return the rows of `text_table`, with |c_n| of the last magnet, which the answer states."""
     name, known = list(magnets.items())[-1]
     rows = text_table(**magnets)

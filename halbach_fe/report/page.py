@@ -24,6 +24,8 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.legend import Legend
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter
 from scipy.spatial import ConvexHull
@@ -75,6 +77,12 @@ own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
 
+
+Rows = list[dict[str, str]]
+"""Rows of text, each by the names of its columns."""
+
+Plain = dict[str, object]
+"""Plain data, the content of a JSON file."""
 
 Figures = Mapping[str, tuple[Callable[[], Figure], str]]
 """How figures are drawn, and their captions, by file name."""
@@ -227,6 +235,11 @@ def csv_file(
             write_csv(columns, attributes, temporary)
 
     return write
+
+
+def columns_by_axis(name: str, values: Floats) -> dict[str, Floats]:
+    """Return the components of vectors (..., 3) as columns; {} in ``name`` stands for the axis."""
+    return {name.format(axis): values[..., number].ravel() for number, axis in enumerate("xyz")}
 
 
 @own_style
@@ -411,15 +424,36 @@ def chart(height_in: float, width_in: float = WIDEST_IN) -> tuple[Figure, Axes]:
     return figure, axis
 
 
-def legend_above(figure: Figure, *axes: Axes, columns: int = 2) -> None:
-    """Put the names of what is drawn above a figure, where they hide nothing.
+def legend_above(
+    figure: Figure, *axes: Axes, columns: int = 2, markerscale: float | None = None
+) -> Legend:
+    """Put the names of what is drawn above a figure, where they hide nothing; return them.
 
     What several axes name alike is named once.
     """
     named = {name: shown for axis in axes for shown, name in zip(
         *axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(named.values(), named.keys(), loc="outside upper center", frameon=False,
-                  ncols=min(columns, len(named)))
+    return figure.legend(named.values(), named.keys(), loc="outside upper center", frameon=False,
+                         ncols=min(columns, len(named)), markerscale=markerscale)
+
+
+def magnet_panels(what: str) -> tuple[Figure, Axes, Axes]:
+    """Return a figure, and its axes for points along the magnet, over ``what``, and across it."""
+    figure = figure_of(3.6)
+    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    along.set(xlabel="z in the magnet in mm", ylabel=what)
+    across.set(xlabel="x in the magnet in mm", ylabel="y in the magnet in mm")
+    across.set_aspect("equal", adjustable="datalim")
+    for axis in (along, across):
+        axis.grid(alpha=0.3)
+    return figure, along, across
+
+
+def draw_by_slot(axis: Axes, values: Floats, **colours: Any) -> AxesImage:
+    """Draw values (rings, slots) of blocks as the colours of a grid."""
+    rings, slots = values.shape
+    return axis.imshow(values, aspect="auto", origin="lower",
+                       extent=(0.5, slots + 0.5, 0.5, rings + 0.5), **colours)
 
 
 def stacked_axes(

@@ -21,6 +21,8 @@ from halbach_fe.report.page import (
     SMALL,
     Drawn,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
@@ -93,7 +95,7 @@ def _count(design: RingDesign) -> str:
     return f"{rings} rings"
 
 
-def _design_rows(found: Designed) -> list[dict[str, str]]:
+def _design_rows(found: Designed) -> Rows:
     """Return a row of text for every design, by its field."""
     return [{
         "design": f"best: {smallest(found)}" if one is found.best else "",
@@ -102,7 +104,7 @@ def _design_rows(found: Designed) -> list[dict[str, str]]:
         "blocks": str(one.blocks), "mass": f"{one.mass_kg:.4g} kg"} for one in found.front]
 
 
-def _ring_rows(found: Designed) -> list[dict[str, str]]:
+def _ring_rows(found: Designed) -> Rows:
     """Return a row of text for every place of the best design, from the middle upwards."""
     best = found.best
     rows = []
@@ -117,9 +119,9 @@ def _ring_rows(found: Designed) -> list[dict[str, str]]:
     return rows
 
 
-def _summary(found: Designed) -> dict[str, object]:
+def _summary(found: Designed) -> Plain:
     """Return the content of design.json."""
-    def plain(one: RingDesign) -> dict[str, object]:
+    def plain(one: RingDesign) -> Plain:
         values = {"mean_T": one.mean_T, "rms_ppm": one.rms_ppm,
                   "peak_to_peak_ppm": one.peak_to_peak_ppm, "mass_kg": one.mass_kg,
                   "blocks": one.blocks}

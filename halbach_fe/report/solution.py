@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import (
     MultipoleTable,
@@ -26,6 +27,7 @@ from halbach_fe.report.page import (
     Drawn,
     Figures,
     Page,
+    Rows,
     Section,
     Table,
     View,
@@ -35,7 +37,6 @@ from halbach_fe.report.page import (
     stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
-from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import (
     ROUNDING,
     counted,
@@ -162,7 +163,7 @@ def page(solution: Solution) -> Page:
                     "points, readings": f"{len(solution.points)}, {len(solution.readings)}"})
 
 
-def field_table(solution: Solution) -> list[dict[str, str]]:
+def field_table(solution: Solution) -> Rows:
     """Return rows of text: where the field is strongest and weakest, and the means of B and |B|.
 
     That of the vector B is 0 on a circle of a multipole, whose |B| is not.

@@ -27,6 +27,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     begin_at_zero,
@@ -49,7 +51,7 @@ magnets have at most, from which on the answer says that it is the design's. (To
 squares: a tenth of a deviation is half of it.)"""
 
 
-def _multipole_summary(found: Tolerance) -> dict[str, object]:
+def _multipole_summary(found: Tolerance) -> Plain:
     """Return the content of tolerance.json."""
     shares = found.shares
     return {
@@ -69,7 +71,7 @@ def _by_quantile(values: Floats) -> dict[str, float]:
     return dict(zip(map(str, QUANTILES), values.tolist(), strict=True))
 
 
-def _multipole_quantiles(found: Tolerance) -> list[dict[str, str]]:
+def _multipole_quantiles(found: Tolerance) -> Rows:
     """Return a row of text for each order n."""
     size, sd = len(found.model.orders), found.known.sd
     rows = []
@@ -237,7 +239,7 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     return figure
 
 
-def _homogeneity_summary(found: HomogeneityTolerance) -> dict[str, object]:
+def _homogeneity_summary(found: HomogeneityTolerance) -> Plain:
     """Return the content of tolerance.json."""
     return {
         "study": found.study.name, "region": asdict(found.model.region),
@@ -251,7 +253,7 @@ def _homogeneity_summary(found: HomogeneityTolerance) -> dict[str, object]:
     }
 
 
-def _homogeneity_quantiles(found: HomogeneityTolerance) -> list[dict[str, str]]:
+def _homogeneity_quantiles(found: HomogeneityTolerance) -> Rows:
     """Return a row of text for the rms deviation, the one peak to peak, and the mean field."""
     def row(name: str, ordered: str, texts: list[str]) -> dict[str, str]:
         return {"": name, "as ordered": ordered} | {

@@ -19,11 +19,13 @@ from halbach_fe.report.page import (
     THIRD,
     Drawn,
     Page,
+    Rows,
     Section,
     Table,
     Text,
     View,
     axis_of_points,
+    columns_by_axis,
     csv_file,
     figure_of,
     geometry_figure,
@@ -64,7 +66,7 @@ def _coarsest(found: Verification) -> int:
     return min([*changed, STEPS - 1])
 
 
-def difference_table(found: Verification) -> list[dict[str, str]]:
+def difference_table(found: Verification) -> Rows:
     """Return rows of text: the change of the field for each change of the model, and the error, in
     ppm of the largest field; none if the field is exact.
     """
@@ -177,13 +179,9 @@ def error_basis(found: Verification) -> str:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
                  "concerned. The difference between the two formulations is no part of the "
                  "estimate.")
+    reading = "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
     return (f"{text} The error bars of readings, which halbach-fe solve states, are an estimate "
-            f"apart from this one: the change of {_reading(found)} by one other discretization.")
-
-
-def _reading(found: Verification) -> str:
-    """Say what a reading of the study is."""
-    return "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
+            f"apart from this one: the change of {reading} by one other discretization.")
 
 
 def page(found: Verification) -> Page:
@@ -219,7 +217,6 @@ def page(found: Verification) -> Page:
             (float(size.min()), float(size.max())))),
         "positions of the study by the change of B that a finer mesh makes" if rows else
         "positions of the study by the magnitude of the field")
-    columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
         [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
@@ -227,8 +224,9 @@ def page(found: Verification) -> Page:
                  "Model")],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
         files={"verification.csv": csv_file(
-            columns | {f"{difference.what} in T": column for difference, column in zip(
-                found.differences, found.changes, strict=True)}, {"study": magnet.name})},
+            columns_by_axis("{}_m", found.points) | {
+                f"{difference.what} in T": column for difference, column in zip(
+                    found.differences, found.changes, strict=True)}, {"study": magnet.name})},
         stem="verification")
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
@@ -15,6 +16,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import Study, iron_of
+from halbach_fe.study.types import COMPONENTS
 
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
@@ -58,6 +60,26 @@ def with_error(value: float, sd: float) -> str:
     places = int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))
     rounded = round(value, places) + 0.0  # without a sign where it is 0
     return f"{rounded:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
+
+
+def by_axis(
+    name: str, values: Iterable[float], sd: Iterable[float], factor: float = 1e3
+) -> dict[str, str]:
+    """Return components along x, y and z with their standard deviations, all times a factor; {} in
+    ``name`` stands for the axis.
+    """
+    return {name.format(axis): with_error(factor * value, factor * bar)
+            for axis, value, bar in zip(COMPONENTS, values, sd, strict=True)}
+
+
+def point_mm(values: Iterable[float], sd: Iterable[float]) -> str:
+    """Return a point in m, with its standard deviations, in mm."""
+    return f"({', '.join(by_axis('{}', values, sd).values())})"
+
+
+def rms(values: Floats) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def ppm(value: float) -> str:
