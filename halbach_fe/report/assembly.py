@@ -27,6 +27,7 @@ from halbach_fe.report.page import (
     Rows,
     Section,
     Table,
+    attributes,
     columns_by_axis,
     csv_file,
     rendered,
@@ -527,16 +528,14 @@ def _summary(assembly: Assembly) -> Plain:
     return {
         "study": assembly.magnet.name, "blocks": len(assembly.blocks),
         "left_over": assembly.left_over, "frame": FRAME, "unit_of_solids": "mm",
-        "kinds": [{"kind": kind.number, "shape": kind.shape, "magnetized": kind.magnetized,
-                   "remanence_T": kind.remanence_T, "material": kind.material,
-                   "count": kind.count} for kind in assembly.kinds],
+        "kinds": [{"kind": kind.number, **attributes(
+            kind, "shape", "magnetized", "remanence_T", "material", "count")}
+            for kind in assembly.kinds],
         "holder": assembly.holder.model_dump(mode="json"),
         "plates": [{"holder": plate.number, "file": f"{holder_name(plate)}.step",
                     "lower_faces_z_m": list(plate.heights_m), "pockets": len(plate.blocks[0]),
-                    "inner_radius_m": plate.inner_radius_m,
-                    "outer_radius_m": plate.outer_radius_m,
-                    "thickness_m": plate.thickness_m, "floor_m": plate.floor_m,
-                    "thinnest_wall_m": plate.wall_m}
+                    **attributes(plate, "inner_radius_m", "outer_radius_m", "thickness_m",
+                                 "floor_m"), "thinnest_wall_m": plate.wall_m}
                    for plate in assembly.plates],
         "without_holder": list(assembly.reasons), "files": solid_names(assembly)}
 

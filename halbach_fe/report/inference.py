@@ -49,6 +49,7 @@ from halbach_fe.report.point_maps import (
 from halbach_fe.report.words import (
     decimals,
     flux_density,
+    listed,
     magnet_rows,
     place_of,
     ppm,
@@ -452,19 +453,19 @@ def _model_table(result: InferenceResult) -> Rows:
     moved = "" if not positions else (
         f"; sd of positions {', '.join(f'{1e3 * sd:.3g}' for sd in positions)} mm")
     blocks = result.measured_blocks
-    return [{"quantity": name, "value": value} for name, value in (
-        ("method of inference", result.kind), *magnet_rows(result.magnet),
-        ("finite-element method", study.solver.method),
-        ("unknown magnetizations, readings",
-         f"{len(result.response.parameters)}, {len(result.readings)}"),
-        ("prior", "the study's" if blocks is None else f"{len(blocks)} measured blocks"),
-        ("contraction of the blocks", _contraction_in_words(result, _contraction(result))),
-        ("noise of the readings", f"{' to '.join(sizes)}, "
-         f"{'independent' if noise.independent else 'correlated'}{moved}"),
-        ("error of the finite elements", _solver_error(result)),
-        ("superposition of the blocks",
-         f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what permeable "
-         "blocks and iron add to their fields"))]
+    return listed({
+        "method of inference": result.kind, **magnet_rows(result.magnet),
+        "finite-element method": study.solver.method,
+        "unknown magnetizations, readings":
+            f"{len(result.response.parameters)}, {len(result.readings)}",
+        "prior": "the study's" if blocks is None else f"{len(blocks)} measured blocks",
+        "contraction of the blocks": _contraction_in_words(result, _contraction(result)),
+        "noise of the readings": f"{' to '.join(sizes)}, "
+        f"{'independent' if noise.independent else 'correlated'}{moved}",
+        "error of the finite elements": _solver_error(result),
+        "superposition of the blocks":
+            f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what "
+            "permeable blocks and iron add to their fields"})
 
 
 def _contraction(result: InferenceResult) -> Floats:

@@ -202,20 +202,6 @@ class ViewPoints:
     limits: tuple[float, float]
 
 
-def residual_points(positions: Floats, standardized: Floats) -> ViewPoints:
-    """Return measured points that are coloured by their residuals.
-
-    Parameters
-    ----------
-    positions : ndarray, shape (n, 3), in m
-    standardized : ndarray, shape (n,)
-        Residuals divided by their standard deviations.
-    """
-    return ViewPoints(positions, standardized, "measured points",
-                      "largest standardized<br>residual in sd",
-                      "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
-
-
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
     """Return points (n, 3) in m that are coloured by the magnitude of a field B (n, 3) in T."""
     magnitude = np.linalg.norm(flux_density, axis=1)
@@ -255,7 +241,7 @@ def view_of_inference(
         f"{percent:+.2f} ± {error:.2f} % along the easy axis" if magnetized else "missing"
         for percent, error, magnetized in zip(change, sd, there, strict=True)]))
     scores = result.standardized(result.prediction_posterior)
-    points = (_worst_residuals(result.observation.positions, scores)
+    points = (residual_points(result.observation.positions, scores)
               if any(result.observation.components) else None)
     return magnet_view(result.magnet, values, points, _residual_vectors(result), named)
 
@@ -286,7 +272,7 @@ def _residual_vectors(result: InferenceResult) -> tuple[Floats, Floats] | None:
     return points, lacking
 
 
-def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
+def residual_points(positions: Floats, scores: Floats) -> ViewPoints:
     """Return each measured point with the largest standardized residual of its readings.
 
     If there are more than `MOST_POINTS` points, half of the points drawn are those with the
@@ -301,7 +287,8 @@ def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
         evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
         chosen = np.union1d(kept, evenly)
         points, worst = points[chosen], worst[chosen]
-    return residual_points(points, worst)
+    return ViewPoints(points, worst, "measured points", "largest standardized<br>residual in sd",
+                      "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
 
 
 def magnet_view(

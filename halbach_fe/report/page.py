@@ -237,6 +237,11 @@ def csv_file(
     return write
 
 
+def attributes(of: object, *names: str) -> Plain:
+    """Return some attributes of an object as plain data."""
+    return {name: getattr(of, name) for name in names}
+
+
 def columns_by_axis(name: str, values: Floats) -> dict[str, Floats]:
     """Return the components of vectors (..., 3) as columns; {} in ``name`` stands for the axis."""
     return {name.format(axis): values[..., number].ravel() for number, axis in enumerate("xyz")}

@@ -544,11 +544,9 @@ def registration_summary(found: Sequence[Registration]) -> Plain:
                       for key, (value, sd) in each.open_keys.items()},
         "magnet_on_stage_m": numbers(magnet_on_stage(each)[0]),
         "magnet_on_stage_sd_m": numbers(magnet_on_stage(each)[1]),
-        "middle_m": numbers(each.middle_m), "translation_sd_m": numbers(each.translation_sd_m),
-        "rotation_sd_rad": numbers(each.rotation_sd_rad),
-        "rms_T": numbers(each.rms_T), "nominal_rms_T": numbers(each.nominal_rms_T),
-        "held_out_rms_T": numbers(each.held_out_rms_T),
-        "held_out_nominal_rms_T": numbers(each.held_out_nominal_rms_T),
+        **{name: numbers(getattr(each, name)) for name in (
+            "middle_m", "translation_sd_m", "rotation_sd_rad", "rms_T", "nominal_rms_T",
+            "held_out_rms_T", "held_out_nominal_rms_T")},
         "log_evidence": each.log_evidence,
     } for each, probability in zip(found, stated_odds(found), strict=True)]}
 

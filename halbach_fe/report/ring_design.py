@@ -26,6 +26,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
+    attributes,
     chart,
     csv_file,
     figure_of,
@@ -122,12 +123,10 @@ def _ring_rows(found: Designed) -> Rows:
 def _summary(found: Designed) -> Plain:
     """Return the content of design.json."""
     def plain(one: RingDesign) -> Plain:
-        values = {"mean_T": one.mean_T, "rms_ppm": one.rms_ppm,
-                  "peak_to_peak_ppm": one.peak_to_peak_ppm, "mass_kg": one.mass_kg,
-                  "blocks": one.blocks}
         places = [{"z_m": float(z), "rings": [ring and asdict(ring) for ring in option]}
                   for z, option in zip(one.z_m, one.rings, strict=True)]
-        return values | {"places": places}
+        return {**attributes(one, "mean_T", "rms_ppm", "peak_to_peak_ppm", "mass_kg", "blocks"),
+                "places": places}
 
     return {"study": found.study.name, "region": asdict(found.region), "reached": found.reached,
             "best": plain(found.best), "designs": [plain(one) for one in found.front]}

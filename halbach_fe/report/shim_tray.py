@@ -21,6 +21,7 @@ from halbach_fe.report.page import (
     Rows,
     Section,
     Table,
+    attributes,
     columns_by_axis,
     csv_file,
     figure_of,
@@ -129,9 +130,9 @@ def _summary(found: FilledTray) -> Plain:
     return {"study": found.magnet.name, "region": asdict(found.model.region),
             "places": len(found.places_m), "magnets": len(found.filled), "left": found.left,
             "before": plain_homogeneity(found.before), "after": plain_homogeneity(found.after),
-            "filled": [{"place": one.place, "position_m": one.position_m,
-                        "magnet": one.magnet.name, "from_radius_deg": one.from_radius_deg,
-                        "direction_deg": one.direction_deg} for one in found.filled]}
+            "filled": [{**attributes(one, "place", "position_m"), "magnet": one.magnet.name,
+                        **attributes(one, "from_radius_deg", "direction_deg")}
+                       for one in found.filled]}
 
 
 def _columns(found: FilledTray) -> dict[str, Iterable[object]]:

@@ -43,6 +43,7 @@ from halbach_fe.report.words import (
     decimals,
     flux_density,
     is_fourier,
+    listed,
     magnet_rows,
     relative,
 )
@@ -154,8 +155,7 @@ def page(solution: Solution) -> Page:
                 "make it in vacuum.", "" if not solution.errors.any() else
                 " ± is the standard deviation that the solver's error allows."),
             Section([*map(Drawn, [*figures][1:])], "Pictures"),
-            Section([Table([{"quantity": name, "value": value}
-                            for name, value in magnet_rows(magnet)])], "Model")],
+            Section([Table(listed(magnet_rows(magnet)))], "Model")],
         {"The field at the study's positions": rows,
          "Outside of the magnet": stray_rows(solution.stray_field)},
         figures=figures, shown=("field.png",), files=files, stored=False, stem="report",

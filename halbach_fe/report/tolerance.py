@@ -31,6 +31,7 @@ from halbach_fe.report.page import (
     Rows,
     Section,
     Table,
+    attributes,
     begin_at_zero,
     chart,
     figure_of,
@@ -244,8 +245,7 @@ def _homogeneity_summary(found: HomogeneityTolerance) -> Plain:
     return {
         "study": found.study.name, "region": asdict(found.model.region),
         "draws": len(found.rms_ppm), "limit_ppm": found.limit,
-        "as_ordered": {"mean_T": found.ordered.mean_T, "rms_ppm": found.ordered.rms_ppm,
-                       "peak_to_peak_ppm": found.ordered.peak_to_peak_ppm},
+        "as_ordered": attributes(found.ordered, "mean_T", "rms_ppm", "peak_to_peak_ppm"),
         **{f"{name}_quantiles": _by_quantile(np.quantile(getattr(found, name), QUANTILES))
            for name in ("mean_T", "rms_ppm", "peak_to_peak_ppm")},
         "solver_error_ppm": found.model.solver_error_ppm,

@@ -39,6 +39,7 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     is_fourier,
+    listed,
     magnet_rows,
     ppm,
     relative,
@@ -208,7 +209,7 @@ def page(found: Verification) -> Page:
         "Changes of the model, and how much they change the field")] if rows else []
     model = {"route": found.route.replace("_", " "), "method": magnet.study.solver.method,
              "elements at the magnet": f"{1e3 * found.element_size_m:.3g} mm; finer by a factor of "
-             f"{REFINEMENT}, coarser by it and by its square", **dict(magnet_rows(magnet))}
+             f"{REFINEMENT}, coarser by it and by its square", **magnet_rows(magnet)}
     size = 1e6 * change
     view = View(lambda: view_of_nominal_magnet(
         magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
@@ -220,8 +221,7 @@ def page(found: Verification) -> Page:
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
         [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
-         Section([Table([{"quantity": name, "value": value} for name, value in model.items()])],
-                 "Model")],
+         Section([Table(listed(model))], "Model")],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
         files={"verification.csv": csv_file(
             columns_by_axis("{}_m", found.points) | {

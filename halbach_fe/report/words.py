@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -62,13 +62,11 @@ def with_error(value: float, sd: float) -> str:
     return f"{rounded:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
 
 
-def by_axis(
-    name: str, values: Iterable[float], sd: Iterable[float], factor: float = 1e3
-) -> dict[str, str]:
-    """Return components along x, y and z with their standard deviations, all times a factor; {} in
-    ``name`` stands for the axis.
+def by_axis(name: str, values: Iterable[float], sd: Iterable[float]) -> dict[str, str]:
+    """Return components along x, y and z with their standard deviations, from m in mm or from rad
+    in mrad; {} in ``name`` stands for the axis.
     """
-    return {name.format(axis): with_error(factor * value, factor * bar)
+    return {name.format(axis): with_error(1e3 * value, 1e3 * bar)
             for axis, value, bar in zip(COMPONENTS, values, sd, strict=True)}
 
 
@@ -178,8 +176,13 @@ def fraction(value: float) -> str:
     return f"{100 * value:.1f}\u00a0%"
 
 
-def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
-    """Return name and value of the properties of a magnet that its pages list."""
+def listed(values: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return a row of text for each quantity."""
+    return [{"quantity": name, "value": value} for name, value in values.items()]
+
+
+def magnet_rows(magnet: Magnet) -> dict[str, str]:
+    """Return the properties of a magnet that its pages list, by name."""
     array, blocks = magnet.array, magnet.blocks
     outer = f"{1e3 * magnet.array_outer_radius:.6g} mm"
     rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
@@ -193,7 +196,7 @@ def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
             ("main multipole", str(array.multipole_order))]
     if magnet.dimension == 3:
         rows.insert(3, ("length", f"{2e3 * magnet.array_half_length:.6g} mm"))
-    return [*rows, ("iron", iron_description(magnet))]
+    return dict([*rows, ("iron", iron_description(magnet))])
 
 
 def in_one_line(magnet: Magnet) -> str:

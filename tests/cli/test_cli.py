@@ -226,7 +226,7 @@ def test_doctor(capsys):
 
 
 def test_doctor_can_fail(monkeypatch, capsys):
-    monkeypatch.setattr("halbach_fe.cli.shell.TOLERANCE", {"reaction": 1e-9})
+    monkeypatch.setattr("halbach_fe.cli.verbs.TOLERANCE", {"reaction": 1e-9})
     assert main(["doctor"]) == 9
     assert "differs from the closed form" in capsys.readouterr().err
 
