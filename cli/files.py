@@ -131,21 +131,16 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
     ------
     CommandLineError
     """
-    if "inner_radii_m" in given and "ring_length_m" not in given:
-        raise CommandLineError(must_be(
-            "--ring-length-m", "the command line", "given with --inner-radii-m", "nothing",
-            "Rings that follow each other along z have a length."))
-    rings = given.get("rings")
-    if isinstance(rings, int) and rings > 1 and not given.keys() & {
-            "ring_length_m", "cube_m", "free_blocks"}:
-        raise CommandLineError(must_be(
-            "--ring-length-m", "the command line", "given with --rings", "nothing",
-            "Rings that follow each other along z have a length."))
-    if "dsv_m" in given and not given.keys() & {"ring_length_m", "cube_m", "free_blocks"}:
-        raise CommandLineError(must_be(
-            "--ring-length-m", "the command line", "given with --dsv-m", "nothing",
-            "A cross-section has no volume."))
-    edge = given.get("cube_m")
+    long = bool(given.keys() & {"ring_length_m", "cube_m", "free_blocks"})
+    rings, edge = given.get("rings"), given.get("cube_m")
+    follow = "Rings that follow each other along z have a length."
+    for without, beside, why in (
+            ("inner_radii_m" in given and "ring_length_m" not in given, "--inner-radii-m", follow),
+            (isinstance(rings, int) and rings > 1 and not long, "--rings", follow),
+            ("dsv_m" in given and not long, "--dsv-m", "A cross-section has no volume.")):
+        if without:
+            raise CommandLineError(must_be("--ring-length-m", "the command line",
+                                           f"given with {beside}", "nothing", why))
     if isinstance(edge, float) and radius_m is not None and not edge < 2 * radius_m:
         raise CommandLineError(must_be(
             "--cube-m", "the command line", f"less than twice --radius-m, {radius_m:g}, at which "
