@@ -15,7 +15,7 @@ from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.inference_answer import answer
+from halbach_fe.report.inference_answer import answer, easy_axes
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
 from halbach_fe.report.page import (
@@ -247,10 +247,7 @@ def block_table(result: InferenceResult) -> Rows:
     deviations of its prior.
     """
     ranked = 8  # number of the blocks that a page lists: those that deviate most
-    nominal = result.by_block(result.response.nominal)
-    size = np.linalg.norm(nominal, axis=1)
-    there = np.flatnonzero(size)  # without the places of missing blocks
-    axes = nominal[there] / size[there, None]
+    there, axes, size = easy_axes(result)
     change = result.by_block(result.posterior.mean - result.response.nominal)[there]
     along = np.einsum("ij,ij->i", change, axes)
     across = np.linalg.norm(change - along[:, None] * axes, axis=1)
@@ -260,9 +257,9 @@ def block_table(result: InferenceResult) -> Rows:
     directions = np.zeros((len(chosen), len(result.posterior.mean)))
     for row, one in zip(directions, chosen, strict=True):
         result.by_block(row)[there[one]] = axes[one]
-    of, sds = 100 / size[there[chosen]], result.posterior.sd_of(directions)
+    of, sds = 100 / size[chosen], result.posterior.sd_of(directions)
     alone = _by_readings(result, directions, of)
-    turns = np.degrees(np.arctan2(across, size[there] + along))[chosen].tolist()
+    turns = np.degrees(np.arctan2(across, size + along))[chosen].tolist()
     return [{
         "block": place_of(result.magnet.blocks[there[one]]),
         "along the easy axis": f"{with_error(of[row] * along[one], of[row] * sds[row])}\u00a0%",

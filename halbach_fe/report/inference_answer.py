@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
@@ -235,18 +235,25 @@ def _before(result: InferenceResult) -> str:
             else "the magnet of the measured blocks")
 
 
+def easy_axes(result: InferenceResult) -> tuple[Ints, Floats, Floats]:
+    """Return the numbers (n,) of the blocks that are not missing, the unit vectors (n, D) of their
+    nominal magnetizations, and the sizes (n,) of these in A/m.
+    """
+    nominal = result.by_block(result.response.nominal)
+    size = np.linalg.norm(nominal, axis=1)
+    there = np.flatnonzero(size)
+    return there, nominal[there] / size[there, None], size[there]
+
+
 def _blocks(result: InferenceResult, start: str = (
         "Along their easy axes the blocks deviate from the study")) -> str:
     """Say how the magnetizations along the easy axes deviate from the nominal ones."""
-    nominal = result.by_block(result.response.nominal)
-    size = np.linalg.norm(nominal, axis=1)
-    there = np.flatnonzero(size)  # without the places of missing blocks
-    axes = nominal[there] / size[there, None]
-    mean = np.einsum("ij,ij->i", result.by_block(result.posterior.mean)[there] - nominal[there],
-                     axes) / size[there]
+    there, axes, size = easy_axes(result)
+    mean = np.einsum("ij,ij->i", result.by_block(
+        result.posterior.mean - result.response.nominal)[there], axes) / size
     worst = int(np.argmax(np.abs(mean)))
     row = np.zeros((1, len(result.posterior.mean)))
-    result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
+    result.by_block(row[0])[there[worst]] = axes[worst] / size[worst]
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
     start = f"{start} by {fraction(rms(mean))} rms, the most {place_of(block)}"
     if result.disagreement:  # error bars that are not to be used are not stated

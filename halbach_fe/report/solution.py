@@ -66,18 +66,18 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
     size = np.linalg.norm(solution.flux_density, axis=1)
     low, high, error = float(size.min()), float(size.max()), float(solution.errors.max())
     equal = flux_density(low, 4) == flux_density(high, 4)
-    main = main_field_in_words(tables)
+    question, main = "How strong is the field?", main_field_in_words(tables)
     said = (f"{main} At the study's {counted(len(size), 'position')} the nominal magnet makes "
             f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.").lstrip()
     of_blocks = ("It is the field of the magnet as the study states it; a magnet that is built has "
                  "the tolerances of its blocks besides.")
     if far := solution.magnet.surroundings(solution.points).far_away():
-        return Answer("How strong is the field?", said,
+        return Answer(question, said,
                       f"Not before the positions are checked. {far} {of_blocks}",
                       "Correct the positions, or go on if they are meant to be there.",
                       "halbach-fe solve STUDY -o DIR", False)
     if error <= ROUNDING * high:
-        return Answer("How strong is the field?", said,
+        return Answer(question, said,
                       "Yes: that is exact. The study's blocks have a recoil permeability of 1 and "
                       f"there is no iron, so that it is a closed form, without a mesh. {of_blocks}",
                       *_after_an_exact_field(solution))
@@ -91,7 +91,7 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
                 f"Yes, to that error. It is {decimals(error / sigma, 2)} times the noise of the "
                 f"readings, {flux_density(sigma)}; error bars of what follows include it. ")
     return Answer(
-        "How strong is the field?",
+        question,
         f"{said} By comparison with one other mesh and boundary, {reading} is off by up to "
         f"{flux_density(error)}, {relative(error / high)} of the largest |B|; halbach-fe verify "
         "estimates it from several meshes.",
