@@ -74,7 +74,7 @@ def verb(*options: Options) -> Callable[[Run], Run]:
 
 
 def option(
-    names: str, kind: Callable[[str], Any], metavar: str | tuple[str, ...], text: str,
+    names: str, kind: Callable[[str], Any], metavar: str | tuple[str, ...] | None, text: str,
     **settings: Any,
 ) -> Options:
     """Return an option with a value: its names, how that is parsed and called, and its help."""

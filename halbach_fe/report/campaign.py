@@ -1,11 +1,10 @@
-"""Pages of a simulated campaign, and of how near an update came to its truth.
+"""Figures and page of a simulated campaign.
 
-The former shows only what a measurement would give.
+They show only what a measurement would give, and nothing of the hidden truth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -13,14 +12,13 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import TOTAL_COLUMN, is_total_field, points_of
 from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
 from halbach_fe.report.page import (
-    MEASURED,
     POSTERIOR,
     PRIOR,
     SECOND,
@@ -28,14 +26,11 @@ from halbach_fe.report.page import (
     Section,
     Table,
     View,
-    figure_of,
     geometry_figure,
-    legend_above,
     stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
-from halbach_fe.report.words import counted, decimals, flux_density, fraction, rms
-from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
 from halbach_fe.synthetic.simulate import (
@@ -162,120 +157,4 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
         axis.set_xlabel(label)
     axis.set_ylabel("reading in mT")
     figure.legend(loc="outside upper center", ncols=2 * len(maps), markerscale=2)
-    return figure
-
-
-def error_summary(magnetizations: Gaussian, truth: Floats) -> dict[str, float]:
-    """Return errors of the mean in A/m, and the rms of error over standard deviation."""
-    error, sd = magnetizations.mean - truth, magnetizations.sd
-    free = sd > 0  # a missing block has no uncertainty
-    return {"largest_error_A_per_m": float(np.abs(error).max()),
-            "rms_error_A_per_m": rms(error), "z_rms": rms(error[free] / sd[free])}
-
-
-def expected_spread(magnetizations: Gaussian) -> float:
-    """Return the standard deviation of the rms of error over sd that the posterior foretells.
-
-    It is larger than that of independent errors, 1 / sqrt(2 n), because what readings leave open
-    are few combinations of magnetizations.
-    """
-    free = magnetizations.sd > 0
-    sd = magnetizations.sd[free]
-    correlation = magnetizations.covariance[np.ix_(free, free)] / np.outer(sd, sd)
-    return float(np.linalg.norm(correlation) / np.sqrt(2) / free.sum())
-
-
-def answer_beside_truth(
-    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats
-) -> Answer:
-    """Say how near the inferred magnetizations are to the true ones; the last of ``known`` counts.
-
-    Error bars hold if the rms of error over standard deviation is within three of its standard
-    deviations of 1.
-    """
-    (before, *_), (name, best) = known.values(), list(known.items())[-1]
-    size = float(np.sqrt(np.mean(truth**2) * magnet.dimension))
-    _, left, ratio = error_summary(best, truth).values()
-    first = error_summary(before, truth)["rms_error_A_per_m"]
-    spread = expected_spread(best)
-    sound = abs(ratio - 1) <= 3 * spread
-    return Answer(
-        "How near are the inferred magnetizations to the true ones?",
-        f"{name[0].upper()}{name[1:]}: {1e-3 * left:.2g} kA/m rms in each component, "
-        f"{fraction(left / size)} of a block's magnetization. Before the readings it was "
-        f"{1e-3 * first:.2g} kA/m.",
-        ("Yes: the" if sound else "No: the") + f" errors are {decimals(ratio, 2)} times the stated "
-        f"standard deviations, where 1 ± {decimals(spread, 2)} is expected. The field of the truth "
-        "was computed by another program than the one that is tested.",
-        "Update a magnet of your own with its map." if sound else
-        "Find out what the model lacks before its error bars are believed.",
-        f"halbach-fe {'infer' if sound else 'diagnose'} STUDY --measurements MAP -o DIR", sound)
-
-
-def page_beside_truth(
-    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, what: str,
-    figures: Mapping[str, float] | None = None, ring: int = 1,
-) -> Page:
-    """Return the page of magnetizations.html, which compares those of a ring with the truth.
-
-    Parameters
-    ----------
-    known : mapping
-        Distributions of the magnetizations in A/m by name; at most three are drawn, the first of
-        them (the prior) in orange.
-    truth : ndarray, shape (parameters,), in A/m
-    what : str
-        The page's title.
-    figures : mapping, optional
-        Further numbers to list, by name.
-    ring : int
-        The ring that is drawn, counted from 1.
-    """
-    rows = []
-    for name, distribution in known.items():
-        largest, rms, ratio = error_summary(distribution, truth).values()
-        rows.append({"": name, "largest error in kA/m": decimals(1e-3 * largest),
-                     "rms error in kA/m": decimals(1e-3 * rms),
-                     "rms of error / sd": f"{ratio:.2f}"})
-    further = [{"": key.replace("_", " "), "value": f"{value:.4g}"}
-               for key, value in (figures or {}).items()]
-    said = answer_beside_truth(magnet, known, truth)
-    return Page("magnetizations", what, magnet.study, said, {}, [
-        Section([Table(rows, "numbers")]),
-        Section([Table(further, "numbers")] if further else [], "Further numbers")], rows=rows,
-        figures={"magnetizations.png": (
-            partial(_magnetizations_figure, magnet, known, truth, ring), f"Deviation of the "
-            f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are "
-            "standard deviations")}, stored=False)
-
-
-def _magnetizations_figure(
-    magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats, ring: int
-) -> Figure:
-    """Draw deviations of a ring's magnetizations from nominal, a panel for each component."""
-    size = magnet.dimension
-    first, slots = sum(magnet.blocks_by_ring[:ring - 1]), magnet.blocks_by_ring[ring - 1]
-    part = slice(first * size, (first + slots) * size)
-    blocks = magnet.blocks[first:first + slots]
-    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
-    figure = figure_of(1 + 2.4 * size)
-    axes = figure.subplots(size, 1, sharex=True)
-    places = np.arange(1, slots + 1)
-    shifts = 0.3 * np.linspace(-0.5, 0.5, len(known))
-    for axis, component in zip(axes, range(size), strict=True):
-        def in_kiloamperes_per_m(values: Floats, component: int = component) -> Floats:
-            return np.asarray(1e-3 * values[component::size])
-
-        for (name, distribution), colour, shift in zip(
-                known.items(), (PRIOR, POSTERIOR, SECOND), shifts, strict=False):
-            axis.errorbar(places + shift, in_kiloamperes_per_m(distribution.mean[part] - nominal),
-                          in_kiloamperes_per_m(distribution.sd[part]), color=colour, fmt="o", ms=4,
-                          capsize=2, label=name)
-        axis.plot(places, in_kiloamperes_per_m(truth[part] - nominal), "_", color=MEASURED, ms=14,
-                  mew=2, label="truth", zorder=3)
-        axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
-        axis.grid(alpha=0.3)
-    legend_above(figure, axes[0], columns=4)
-    axes[-1].set_xlabel("slot")
-    axes[-1].set_xticks(places)
     return figure

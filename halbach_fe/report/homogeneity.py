@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -445,8 +446,9 @@ def stray_figure(stray: StrayField) -> Figure:
         first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
         size = np.log(np.maximum(plane.size_T, min(*others_t, stray.limit_T) / 10))  # may be 0
         sides = [1e3 * reach.distance_m if reach else 0.0 for reach in (stray.radial, stray.axial)]
-        for (out, up), look in (((radius, half), {"color": "#cccccc", "lw": 0}),
-                                (sides, {"fill": False, "ls": "--", "lw": 0.8, "color": SECOND})):
+        looks: tuple[dict[str, Any], ...] = (
+            {"color": "#cccccc", "lw": 0}, {"fill": False, "ls": "--", "lw": 0.8, "color": SECOND})
+        for (out, up), look in zip(((radius, half), sides), looks, strict=True):
             if out and plane.across == "z":
                 axis.add_patch(Circle((0, 0), out, **look))
             elif out and up:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -133,8 +134,9 @@ def maps_figure(result: InferenceResult) -> Figure:
     places, maps = 1e3 * result.observation.places, np.array(result.maps)
     for number, name in enumerate(dict.fromkeys(result.maps)):
         mine = maps == name
-        style = {"ls": "none", "marker": ".ox+d"[number % 5], "mfc": "none",
-                 "ms": 2 if number == 0 else 4, "color": COLOURS[number % len(COLOURS)]}
+        style: dict[str, Any] = {"ls": "none", "marker": ".ox+d"[number % 5], "mfc": "none",
+                                 "ms": 2 if number == 0 else 4,
+                                 "color": COLOURS[number % len(COLOURS)]}
         along.plot(places[mine, 2], np.hypot(*places[mine, :2].T), label=name, **style)
         across.plot(places[mine, 0], places[mine, 1], **style)
     legend_above(figure, along, columns=4, markerscale=3)

@@ -22,7 +22,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.report.campaign import error_summary, expected_spread, page_beside_truth
+from halbach_fe.report.magnetizations import error_summary, expected_spread, page
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.measurement import FourierCoefficients
@@ -127,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
                    f"{update.parameters_learnt:.0f} parameters learnt")
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)
                + "\n")
-    write_files(page_beside_truth(
+    write_files(page(
         build_magnet(study), known, truth, "576 magnetizations from a map of the bore",
         {f"{whose}, q_{reading}, {name}": value for whose, one in results.items()
          for reading, row in one.items() for name, value in row.items()}, ring=RING),

@@ -24,7 +24,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import sample_posterior, sampled_summary, with_samples, write_sampled
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.report.campaign import error_summary, page_beside_truth
+from halbach_fe.report.magnetizations import error_summary, page
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.model import Study
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         results[f"{what}: prior"] = dict(error_summary(prior, truth))
         results[f"{what}: posterior"] = error_summary(
             updated.posterior, truth) | sampled_summary(found)
-        write_files(page_beside_truth(
+        write_files(page(
             build_magnet(study), {"prior": prior, "posterior": updated.posterior}, truth,
             f"the magnetizations of {what}", sampled_summary(found)), folder)
     write_text(arguments.output / "results.json", json.dumps(results, indent=1, allow_nan=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report import campaign
+from halbach_fe.report import magnetizations
 from halbach_fe.report.page import write_files
 from halbach_fe.stats.gaussian import Gaussian
 from studies.calibration import calibration_page as calibration
@@ -83,14 +83,14 @@ def test_magnetizations_whose_error_bars_are_too_small_are_a_warning(tmp_path, w
     after = Gaussian(nominal, 500.0 * np.eye(len(nominal)))
     truth = nominal + wrong_by * 500.0 * np.where(np.arange(len(nominal)) % 2, 1, -1)
     known = {"prior": Gaussian(nominal, 1e4 * np.eye(len(nominal))), "posterior": after}
-    write_files(campaign.page_beside_truth(magnet, known, truth, "test"), tmp_path)
+    write_files(magnetizations.page(magnet, known, truth, "test"), tmp_path)
     found = answer_of(tmp_path / "magnetizations.html")
     assert found["trust"].startswith("Yes: " if sound else "No: ")
     assert f"{0.5 * wrong_by:.2g}\u00a0kA/m" in found["said"]
     # independent errors spread by 1 / sqrt(2 n); common ones, which the mean of few has, by more
-    assert campaign.expected_spread(after) == pytest.approx((2 * len(nominal)) ** -0.5)
+    assert magnetizations.expected_spread(after) == pytest.approx((2 * len(nominal)) ** -0.5)
     common = Gaussian(nominal, np.ones((len(nominal), 1)))
-    assert campaign.expected_spread(common) == pytest.approx(0.5**0.5)
+    assert magnetizations.expected_spread(common) == pytest.approx(0.5**0.5)
 
 
 def test_sensitivity_says_what_a_block_changes_and_where_to_measure(tmp_path):
