@@ -20,7 +20,9 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from halbach_fe.cli.guard import claim_buffers, guarded
+import halbach_fe as hf
+from halbach_fe.cli.guard import claim_buffers, guarded, show
+from halbach_fe.cli.guard import say as say
 from halbach_fe.cli.options import (
     SOLVER,
     Options,
@@ -28,12 +30,11 @@ from halbach_fe.cli.options import (
     declared,
     describes_a_format,
     format_words,
+    option,
     path,
     together,
     verb,
 )
-from halbach_fe.cli.streams import say as say
-from halbach_fe.cli.streams import show
 from halbach_fe.core.errors import (
     MAX_QUOTED,
     MeasurementError,
@@ -49,31 +50,22 @@ from halbach_fe.measurement.formats.declared import DeclaredFormat
 if TYPE_CHECKING:
     import xarray as xr
 
-    from halbach_fe.geometry.magnet import Magnet
     from halbach_fe.inference.storage import StoredPosterior
-    from halbach_fe.measurement.block_table import BlockTable
     from halbach_fe.report.answer import Answer
     from halbach_fe.report.page import Page
-    from halbach_fe.response.homogeneity import Region
-    from halbach_fe.response.multipoles import MultipoleReference
     from halbach_fe.response.resource_estimate import Estimate
     from halbach_fe.solver.getdp_cache import Cache
-    from halbach_fe.solver.session import Session
-    from halbach_fe.study.model import Study
 
-def question(
-    *options: Options,
-) -> Callable[[Callable[[Magnet, argparse.Namespace], Page | int]], Run]:
+
+def question(*options: Options) -> Callable[
+        [Callable[[hf.Magnet, argparse.Namespace], object]], Run]:
     """Declare a verb that asks something of the magnet of STUDY: its function gets the magnet, and
-    returns the page of the answer, or an exit code if there is none.
+    returns the result or its page, or an exit code if all has been said.
     """
-    def declared(ask: Callable[[Magnet, argparse.Namespace], Page | int]) -> Run:
+    def declared(ask: Callable[[hf.Magnet, argparse.Namespace], object]) -> Run:
         @wraps(ask)
         def run(arguments: argparse.Namespace) -> int:
-            from halbach_fe.geometry.magnet import build_magnet
-            from halbach_fe.study.reader import read_study
-
-            answer = ask(build_magnet(read_study(arguments.study)), arguments)
+            answer = ask(hf.build_magnet(hf.read_study(arguments.study)), arguments)
             return answer if isinstance(answer, int) else finish(arguments, answer)
 
         return verb(*options)(run)
@@ -119,8 +111,8 @@ def run_study(
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.set_defaults(study=InputFile(study))
-    parser.add_argument("-o", "--output", type=path, default=Path("results", output),
-                        metavar="DIR", help="folder for results (default: %(default)s)")
+    option("-o --output", path, "DIR", "folder for results (default: %(default)s)",
+           default=Path("results", output))(parser)
     together(SOLVER, *options)(parser)
     arguments = parser.parse_args()
 
@@ -239,18 +231,18 @@ def _if_simulated(path: Path) -> str:
     return ""
 
 
-def reference(arguments: argparse.Namespace) -> MultipoleReference | None:
+def reference(arguments: argparse.Namespace) -> hf.MultipoleReference | None:
     """Return the reference that options `MULTIPOLES` describe, if any is given."""
-    from halbach_fe.response.multipoles import DEFAULT_ORDERS, MultipoleReference
+    from halbach_fe.response.multipoles import DEFAULT_ORDERS
 
     given = (arguments.reference_radius_m, arguments.orders, arguments.at_z_m)
     if all(option is None for option in given):
         return None
-    return MultipoleReference(arguments.reference_radius_m, arguments.orders or DEFAULT_ORDERS,
-                              arguments.at_z_m)
+    return hf.MultipoleReference(arguments.reference_radius_m, arguments.orders or DEFAULT_ORDERS,
+                                 arguments.at_z_m)
 
 
-def region_of(arguments: argparse.Namespace) -> Region | None:
+def region_of(arguments: argparse.Namespace) -> hf.Region | None:
     """Return the region that the options describe; None for the default one.
 
     Raises
@@ -258,10 +250,8 @@ def region_of(arguments: argparse.Namespace) -> Region | None:
     StudyError
         If only its centre is given.
     """
-    from halbach_fe.response.homogeneity import Region
-
-    region = Region.of(arguments.sphere_m, arguments.ellipsoid_m, arguments.cylinder_m,
-                       arguments.centre_m)
+    region = hf.Region.of(arguments.sphere_m, arguments.ellipsoid_m, arguments.cylinder_m,
+                          arguments.centre_m)
     if region is None and any(arguments.centre_m):
         raise StudyError(must_be("--centre-m", "the command line", "beside a region",
                                  "given alone", "Add --sphere-m R."))
@@ -270,20 +260,18 @@ def region_of(arguments: argparse.Namespace) -> Region | None:
 
 def blocks_and_held_out(
     arguments: argparse.Namespace,
-) -> tuple[BlockTable | None, xr.Dataset | None]:
+) -> tuple[hf.BlockTable | None, xr.Dataset | None]:
     """Read the block table and the held-out map; None stands for a file not given."""
     return (blocks_of(arguments.blocks),
             read_one(arguments, arguments.held_out) if arguments.held_out else None)
 
 
-def blocks_of(path: Path | None) -> BlockTable | None:
+def blocks_of(path: Path | None) -> hf.BlockTable | None:
     """Read a table of measured blocks, if it is given."""
-    from halbach_fe.measurement.block_table import read_blocks
-
-    return read_blocks(path) if path else None
+    return hf.read_blocks(path) if path else None
 
 
-def posterior_of(arguments: argparse.Namespace, magnet: Magnet) -> StoredPosterior | None:
+def posterior_of(arguments: argparse.Namespace, magnet: hf.Magnet) -> StoredPosterior | None:
     """Read the posterior of the magnet, if it is given."""
     from halbach_fe.inference.storage import read_posterior
 
@@ -291,7 +279,7 @@ def posterior_of(arguments: argparse.Namespace, magnet: Magnet) -> StoredPosteri
 
 
 def read_measurements(
-    arguments: argparse.Namespace, study: Study
+    arguments: argparse.Namespace, study: hf.Study
 ) -> xr.Dataset | dict[str, xr.Dataset]:
     """Read the map of --measurements, or all maps that the study lists, by name.
 
@@ -321,14 +309,14 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     """Read a map in halbach-fe's own columns, as the options of `import-map` describe it, or as
     the file itself says.
     """
-    from halbach_fe.measurement.field_map import FOREIGN, read_map
+    from halbach_fe.measurement.field_map import FOREIGN
     from halbach_fe.measurement.formats.files import import_map
 
     if describes_a_format(arguments):
         imported = import_map(path, declared(arguments, DeclaredFormat), arguments.format)
     else:
         try:
-            return read_map(path)
+            return hf.read_map(path)
         except MeasurementError as refused:
             if FOREIGN not in str(refused):  # it is our own, and has a fault
                 raise
@@ -345,7 +333,7 @@ def read_one(arguments: argparse.Namespace, path: Path) -> xr.Dataset:
     return data
 
 
-def _listed(arguments: argparse.Namespace, study: Study) -> dict[str, InputFile]:
+def _listed(arguments: argparse.Namespace, study: hf.Study) -> dict[str, InputFile]:
     """Return the files of the maps that the study lists, the same objects whenever it is called."""
     if not hasattr(arguments, "listed_maps"):
         arguments.listed_maps = {
@@ -354,7 +342,9 @@ def _listed(arguments: argparse.Namespace, study: Study) -> dict[str, InputFile]
 
 
 @contextmanager
-def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterator[Session]:
+def session(
+    arguments: argparse.Namespace, study: hf.Study | None = None
+) -> Iterator[hf.Session]:
     """Open a session in the output folder; show its progress on stderr if that is a terminal.
 
     The folder becomes that of this verb and ``study``; shipped studies own theirs already.
@@ -362,14 +352,13 @@ def session(arguments: argparse.Namespace, study: Study | None = None) -> Iterat
     from halbach_fe.report.answer import inputs_of_command, known_inputs
     from halbach_fe.solver.dask_cluster import connected
     from halbach_fe.solver.getdp import getdp_or_none
-    from halbach_fe.solver.session import Session
 
     getdp = getdp_or_none(arguments.getdp)
     if study is not None:
         own_folder(arguments, study.name, solving=True)
     arguments.at_end.enter_context(known_inputs({"GetDP": getdp.version, **inputs_of_command()}))
     with progress_bar("solving") as show, ExitStack() as stack:
-        opened = Session(
+        opened = hf.Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
             time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
             processes=arguments.mpi)
@@ -456,13 +445,15 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
-def finish(arguments: argparse.Namespace, page: Page) -> int:
-    """Write the files of a result, and print it as JSON, or its tables and its answer; return 0.
+def finish(arguments: argparse.Namespace, result: object) -> int:
+    """Write the files of a result, or of its page, and print it as JSON, or its tables and its
+    answer; return 0.
 
     A verb that has not taken its folder yet does so now, by `own_folder`.
     """
-    from halbach_fe.report.page import write_files
+    from halbach_fe.report.page import Page, page_of, write_files
 
+    page = result if isinstance(result, Page) else page_of(result)
     if arguments.output is not None and not getattr(arguments, "owns_folder", False):
         own_folder(arguments, page.study.name if page.study is not None else "")
     path = None if arguments.output is None else write_files(

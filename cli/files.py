@@ -11,13 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import halbach_fe as hf
 from halbach_fe.cli import common
 from halbach_fe.cli.options import (
     AXES,
     JSON,
     MAP_FORMAT,
     TABLE_FORMAT,
+    choice,
     declared,
+    flag,
     input_file,
     names,
     option,
@@ -38,7 +41,7 @@ def _template(parser: argparse.ArgumentParser) -> None:
     from halbach_fe.study.study_file import MagnetTemplate
 
     template = MagnetTemplate()
-    parser.add_argument("study", type=path, metavar="STUDY", help="file to write (TOML)")
+    option("study", path, "STUDY", "file to write (TOML)")(parser)
     strength = parser.add_mutually_exclusive_group()
     rings = parser.add_mutually_exclusive_group()
     groups = {"remanence-T": strength, "inner-radius-m": rings}
@@ -53,32 +56,29 @@ def _template(parser: argparse.ArgumentParser) -> None:
              "study is a cross-section"),
             ("remanence-T", positive_number, "remanence of the blocks")):
         default = getattr(template, name.replace("-", "_"))
-        groups.get(name, parser).add_argument(
-                            f"--{name}", type=kind, metavar="N" if kind is positive else "X",
-                            help=text if "default" in text or default is None
-                            else f"{text} (default: {default})")
-    parser.add_argument("--shape", choices=("sector", "trapezoid", "cuboid"),
-                        help=f"shape of the blocks (default: {template.shape})")
-    strength.add_argument("--material", metavar="GRADE",
-                        help="grade of the blocks, such as N42, in place of the remanence")
-    rings.add_argument("--inner-radii-m", type=_radii, metavar="X,X,...", default=(),
-                       help="inner radii of rings that differ, in the order of z; needs "
-                       "--ring-length-m")
-    rings.add_argument("--free-blocks", type=path, metavar="TABLE",
-                       help="table of the blocks (CSV or HDF5), in place of rings")
-    rings.add_argument("--cube-m", type=positive_number, metavar="X",
-                       help="edge of cubes in rings on --radius-m; sets shape, radii and length")
-    parser.add_argument("--radius-m", type=positive_number, metavar="X",
-                        help="radius of the middles of the cubes of --cube-m")
-    parser.add_argument("--iron-ring", action="store_true",
-                        help="add an iron tube around the blocks")
-    parser.add_argument("--steel", metavar="NAME",
-                        help="steel of the iron tube, whose magnetization curve is known, such as "
-                        "aisi_1010; adds the tube")
-    parser.add_argument("--dsv-m", type=positive_number, metavar="X",
-                        help="diameter of a spherical volume in the middle, on whose surface the "
-                        "field is measured, and in which that of a dipole is to be homogeneous "
-                        "(default: circles along the magnet)")
+        option(f"--{name}", kind, "N" if kind is positive else "X",
+               text if "default" in text or default is None
+               else f"{text} (default: {default})")(groups.get(name, parser))
+    choice("--shape", ("sector", "trapezoid", "cuboid"),
+           f"shape of the blocks (default: {template.shape})")(parser)
+    option("--material", str, "GRADE",
+           "grade of the blocks, such as N42, in place of the remanence")(strength)
+    option("--inner-radii-m", _radii, "X,X,...",
+           "inner radii of rings that differ, in the order of z; needs --ring-length-m",
+           default=())(rings)
+    option("--free-blocks", path, "TABLE",
+           "table of the blocks (CSV or HDF5), in place of rings")(rings)
+    option("--cube-m", positive_number, "X",
+           "edge of cubes in rings on --radius-m; sets shape, radii and length")(rings)
+    option("--radius-m", positive_number, "X",
+           "radius of the middles of the cubes of --cube-m")(parser)
+    flag("--iron-ring", "add an iron tube around the blocks")(parser)
+    option("--steel", str, "NAME", "steel of the iron tube, whose magnetization curve is known, "
+           "such as aisi_1010; adds the tube")(parser)
+    option("--dsv-m", positive_number, "X",
+           "diameter of a spherical volume in the middle, on whose surface the field is measured, "
+           "and in which that of a dipole is to be homogeneous (default: circles along the "
+           "magnet)")(parser)
 
 
 def _radii(text: str) -> tuple[float, ...]:
@@ -113,9 +113,10 @@ def new(arguments: argparse.Namespace) -> int:
         given["free_blocks"] = os.path.relpath(given["free_blocks"], folder)
     magnet, template = new_magnet(MagnetTemplate(**given), path.stem, folder)
     if template.dsv_m is not None:
-        from halbach_fe.response.homogeneity import Region, region_points
+        from halbach_fe.response.homogeneity import region_points
 
-        region_points(magnet, Region.sphere(template.dsv_m / 2))  # refuses one that is not in air
+        # refuses one that is not in air
+        region_points(magnet, hf.Region.sphere(template.dsv_m / 2))
     write_new_study(path, template)
     name = str(path) if not str(path).startswith("-") else f"./{path}"
     common.say(f"Wrote {path}. Its noise suits the field of the magnet: "
@@ -131,21 +132,16 @@ def _check(given: Mapping[str, object], radius_m: float | None) -> None:
     ------
     CommandLineError
     """
-    if "inner_radii_m" in given and "ring_length_m" not in given:
-        raise CommandLineError(must_be(
-            "--ring-length-m", "the command line", "given with --inner-radii-m", "nothing",
-            "Rings that follow each other along z have a length."))
-    rings = given.get("rings")
-    if isinstance(rings, int) and rings > 1 and not given.keys() & {
-            "ring_length_m", "cube_m", "free_blocks"}:
-        raise CommandLineError(must_be(
-            "--ring-length-m", "the command line", "given with --rings", "nothing",
-            "Rings that follow each other along z have a length."))
-    if "dsv_m" in given and not given.keys() & {"ring_length_m", "cube_m", "free_blocks"}:
-        raise CommandLineError(must_be(
-            "--ring-length-m", "the command line", "given with --dsv-m", "nothing",
-            "A cross-section has no volume."))
-    edge = given.get("cube_m")
+    long = bool(given.keys() & {"ring_length_m", "cube_m", "free_blocks"})
+    rings, edge = given.get("rings"), given.get("cube_m")
+    follow = "Rings that follow each other along z have a length."
+    for without, beside, why in (
+            ("inner_radii_m" in given and "ring_length_m" not in given, "--inner-radii-m", follow),
+            (isinstance(rings, int) and rings > 1 and not long, "--rings", follow),
+            ("dsv_m" in given and not long, "--dsv-m", "A cross-section has no volume.")):
+        if without:
+            raise CommandLineError(must_be("--ring-length-m", "the command line",
+                                           f"given with {beside}", "nothing", why))
     if isinstance(edge, float) and radius_m is not None and not edge < 2 * radius_m:
         raise CommandLineError(must_be(
             "--cube-m", "the command line", f"less than twice --radius-m, {radius_m:g}, at which "
@@ -170,16 +166,15 @@ def _calibration(parser: argparse.ArgumentParser) -> None:
     """Add --calibration."""
     from halbach_fe.measurement.calibration import HEADER
 
-    parser.add_argument("--calibration", type=input_file, metavar="TABLE",
-                        help="CSV file with the errors of the probe's sensors against a reference, "
-                        "by which the readings are corrected; its header is like "
-                        f"{HEADER.replace('%', '%%')}")
+    option("--calibration", input_file, "TABLE",
+           "CSV file with the errors of the probe's sensors against a reference, "
+           "by which the readings are corrected; its header is like "
+           f"{HEADER.replace('%', '%%')}")(parser)
 
 
 @verb(
-    option("file", type=input_file, metavar="FILE", help="map as it was delivered"),
-    option("-o", "--output", type=path, required=True, metavar="MAP",
-           help="map to write: .csv, .h5 or .vtu"),
+    option("file", input_file, "FILE", "map as it was delivered"),
+    option("-o --output", path, "MAP", "map to write: .csv, .h5 or .vtu", required=True),
     MAP_FORMAT, _calibration, JSON)
 def import_map(arguments: argparse.Namespace) -> int:
     """Convert a measured map from another file format, to metres, tesla and columns of halbach-fe.
@@ -192,7 +187,7 @@ def import_map(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from halbach_fe.measurement.calibration import read_calibration
-    from halbach_fe.measurement.field_map import refuse_total_field, write_map
+    from halbach_fe.measurement.field_map import refuse_total_field
     from halbach_fe.measurement.formats.declared import DeclaredFormat
     from halbach_fe.measurement.formats.files import import_map
 
@@ -210,7 +205,7 @@ def import_map(arguments: argparse.Namespace) -> int:
                 imported.data, arguments.file.name))
         corrections["largest_correction_T"] = float(
             np.nanmax(np.abs(imported.data["B_T"].values - before)))
-    write_map(imported.data, arguments.output)
+    hf.write_map(imported.data, arguments.output)
     properties = _properties(imported) | corrections
     if arguments.json:
         common.print_json(properties | {"map": str(arguments.output)})
@@ -274,12 +269,11 @@ def _block_columns(parser: argparse.ArgumentParser) -> None:
             raise argparse.ArgumentTypeError(f"must give {twice} once, not {text!r}")
         return {name.strip(): value.strip() for name, _, value in pairs}
 
-    parser.add_argument("--columns", type=names, default=(), metavar="NAME,NAME...",
-                        help=f"content of each column: {', '.join(QUANTITIES)}, or - for one that "
-                        "is ignored; a unit may follow, as in moment_x[mA m^2], volume[mm^3]")
-    parser.add_argument("--fixed", type=fixed, default={}, metavar="NAME=VALUE,...",
-                        help="what all blocks share and the table does not say, as in "
-                        "'volume=12 cm^3,sigma=0.2 %%,type=1,shape=cuboid'")
+    option("--columns", names, "NAME,NAME...",
+           f"content of each column: {', '.join(QUANTITIES)}, or - for one that is ignored; a "
+           "unit may follow, as in moment_x[mA m^2], volume[mm^3]", default=())(parser)
+    option("--fixed", fixed, "NAME=VALUE,...", "what all blocks share and the table does not say, "
+           "as in 'volume=12 cm^3,sigma=0.2 %%,type=1,shape=cuboid'", default={})(parser)
 
 
 def _axes(text: str) -> tuple[str, ...]:
@@ -290,15 +284,13 @@ def _axes(text: str) -> tuple[str, ...]:
 
 
 @verb(
-    option("file", type=input_file, metavar="FILE", help="table as it is: text or .xlsx"),
-    option("-o", "--output", type=path, required=True, metavar="TABLE",
-           help="table to write (CSV)"),
+    option("file", input_file, "FILE", "table as it is: text or .xlsx"),
+    option("-o --output", path, "TABLE", "table to write (CSV)", required=True),
     TABLE_FORMAT, _block_columns,
-    option("--axes", type=_axes, default=AXES, metavar="AXIS,AXIS,AXIS",
-           help="axis along which each component of the strength lies, as z,-y,x; for measured "
-           "blocks x is radial, y azimuthal, z that of the magnet"),
-    option("--along-block", action="store_true",
-           help="components of the strength of free blocks are along their own axes"),
+    option("--axes", _axes, "AXIS,AXIS,AXIS", "axis along which each component of the strength "
+           "lies, as z,-y,x; for measured blocks x is radial, y azimuthal, z that of the magnet",
+           default=AXES),
+    flag("--along-block", "components of the strength of free blocks are along their own axes"),
     JSON)
 def import_blocks(arguments: argparse.Namespace) -> int:
     """Convert a table of blocks from own columns and units to one that halbach-fe reads.
@@ -307,14 +299,14 @@ def import_blocks(arguments: argparse.Namespace) -> int:
     other one becomes one of measured blocks, for prior, sort and infer. FILE is text or a workbook
     (.xlsx). What the table does not say must be given as options; nothing is guessed.
     """
-    from halbach_fe.measurement.block_table import BlockTable, write_blocks
+    from halbach_fe.measurement.block_table import write_blocks
     from halbach_fe.measurement.formats.blocks import DeclaredBlocks, import_blocks
     from halbach_fe.study.free_blocks_file import write_free_blocks
 
     common.own_file(arguments, arguments.file)
     table = import_blocks(arguments.file, declared(arguments, DeclaredBlocks))
-    kind = "measured blocks" if isinstance(table, BlockTable) else "free blocks"
-    if isinstance(table, BlockTable):
+    kind = "measured blocks" if isinstance(table, hf.BlockTable) else "free blocks"
+    if isinstance(table, hf.BlockTable):
         write_blocks(table, arguments.output)
         after = f"halbach-fe prior STUDY {arguments.output} -o DIR"
     else:
@@ -331,15 +323,14 @@ def _export_format(parser: argparse.ArgumentParser) -> None:
     """Add --format."""
     from halbach_fe.measurement.formats.files import WRITERS
 
-    parser.add_argument("--format", choices=(*WRITERS, "blocks"), required=True,
-                        help="format of FILE")
+    choice("--format", (*WRITERS, "blocks"), "format of FILE", required=True)(parser)
 
 
 @verb(
-    option("input", type=input_file, metavar="MAP",
-           help="map in m and T (CSV, HDF5 or VTU); for the format blocks, a study"),
+    option("input", input_file, "MAP",
+           "map in m and T (CSV, HDF5 or VTU); for the format blocks, a study"),
     _export_format,
-    option("-o", "--output", type=path, required=True, metavar="FILE", help="file to write"))
+    option("-o --output", path, "FILE", "file to write", required=True))
 def export(arguments: argparse.Namespace) -> int:
     """Write a map, or the blocks of a magnet, in the file format of another program.
 
@@ -351,19 +342,16 @@ def export(arguments: argparse.Namespace) -> int:
     all blocks where and as they are, with their exceptions. A study reads it as array.free_blocks.
     """
     from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
-    from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.measurement.field_map import read_map
     from halbach_fe.measurement.formats.files import export_map
     from halbach_fe.study.free_blocks_file import write_free_blocks
-    from halbach_fe.study.reader import read_study
 
     if arguments.format != "blocks":
         common.own_file(arguments, arguments.input)
-        data = read_map(arguments.input)
+        data = hf.read_map(arguments.input)
         export_map(data, arguments.format, arguments.output)
         common.say(f"Wrote {data.sizes['point']} points: {arguments.output}")
         return 0
-    magnet = build_magnet(read_study(arguments.input))
+    magnet = hf.build_magnet(hf.read_study(arguments.input))
     columns, others = blocks_table(magnet), beside_blocks(magnet)
     common.own_file(arguments, arguments.input, *_free_blocks_files(arguments.input))
     write_free_blocks(columns, arguments.output)

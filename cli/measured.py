@@ -14,7 +14,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import halbach_fe as hf
 from halbach_fe.cli import common
+from halbach_fe.cli.common import question
 from halbach_fe.cli.options import (
     AXES,
     BLOCKS,
@@ -28,6 +30,7 @@ from halbach_fe.cli.options import (
     SOLVER_WITHOUT_LIMIT,
     STUDY,
     VERBS,
+    choice,
     dry_run,
     finite_number,
     input_file,
@@ -52,22 +55,20 @@ if TYPE_CHECKING:
     from halbach_fe.diagnosis.cost import DiagnosisEstimate
     from halbach_fe.diagnosis.effects.base import Effect
     from halbach_fe.diagnosis.result import Floor
-    from halbach_fe.geometry.magnet import Magnet
     from halbach_fe.inference.pose_result import OpenKey
     from halbach_fe.report.answer import Answer
     from halbach_fe.report.page import Page
-    from halbach_fe.study.model import Study
     from halbach_fe.synthetic.hidden_effects import RequestedEffect
 
 
 @verb(
-    option("map", type=input_file, metavar="MAP", help="field map (CSV, HDF5 or VTU)"),
-    option("others", type=input_file, metavar="MAP", nargs="*",
-           help="other maps of the same magnet, to be joined with the first one"),
-    option("-o", "--output", type=path, metavar="DIR", help="folder for the page and its files"),
-    option("--turn-rad", metavar="SD", type=within(positive_number, 0, math.pi / 2),
-           help="prior standard deviation of the turns of several maps against each other "
-           "(default: 0.05); of one stage that was only shifted it is some 0.001"),
+    option("map", input_file, "MAP", "field map (CSV, HDF5 or VTU)"),
+    option("others", input_file, "MAP",
+           "other maps of the same magnet, to be joined with the first one", nargs="*"),
+    option("-o --output", path, "DIR", "folder for the page and its files"),
+    option("--turn-rad", within(positive_number, 0, math.pi / 2), "SD",
+           "prior standard deviation of the turns of several maps against each other (default: "
+           "0.05); of one stage that was only shifted it is some 0.001"),
     JSON, map_format("MAP"))
 def check(arguments: argparse.Namespace) -> int:
     """Check a field map against Maxwell's equations, before any magnet.
@@ -106,19 +107,16 @@ def check(arguments: argparse.Namespace) -> int:
     with common.progress_bar("checking") as show:
         if arguments.others:
             from halbach_fe.measurement.joined_probe import TURN_RAD
-            from halbach_fe.measurement.map_join import join_maps
 
             named = dict(zip(arguments.listed_maps, maps, strict=True))
-            page = map_check.joined_page(named, join_maps(
+            page = map_check.joined_page(named, hf.join_maps(
                 named, say, show, arguments.turn_rad or TURN_RAD))
         elif is_total_field(maps[0]):
             from halbach_fe.measurement.total_check import check_total
 
             page = map_check.total_page(maps[0], check_total(maps[0]))
         else:
-            from halbach_fe.measurement.map_check import check_map
-
-            page = map_check.page(maps[0], check_map(maps[0], say, show))
+            page = map_check.page(maps[0], hf.check_map(maps[0], say, show))
     return common.finish(arguments, page)
 
 
@@ -171,29 +169,27 @@ class _DifferentKeys(argparse.Action):
         setattr(namespace, self.dest, [*before, values])
 
 
-@verb(
+@question(
     SOLVED, map_format("--measurements"), MAP_OR_LISTED,
-    option("--fit", type=_open_key, action=_DifferentKeys, default=[], metavar="KEY=SD",
-           help="a number of the study that is open, with its standard deviation, such as "
-           "array.remanence_T=0.02, or instrument.z_scale=0.02 for the step of the map; can be "
-           "given several times"),
-    option("--alternative", type=_open_keys, action="append", default=[], metavar="KEY=SD,...",
-           help="other numbers that may be open in place of those of --fit; their odds are "
-           "compared; can be given several times"),
-    option("--most", type=positive, metavar="N",
-           help="largest number of poses that are fitted with the blocks (default: 4, or 8 on a "
-           "line, of those that the search finds)"),
+    option("--fit", _open_key, "KEY=SD", "a number of the study that is open, with its standard "
+           "deviation, such as array.remanence_T=0.02, or instrument.z_scale=0.02 for the step of "
+           "the map; can be given several times", action=_DifferentKeys, default=[]),
+    option("--alternative", _open_keys, "KEY=SD,...", "other numbers that may be open in place of "
+           "those of --fit; their odds are compared; can be given several times", action="append",
+           default=[]),
+    option("--most", positive, "N", "largest number of poses that are fitted with the blocks "
+           "(default: 4, or 8 on a line, of those that the search finds)"),
     # as far as all lengths of a study
-    option("--across-m", metavar="SD", type=within(positive_number, 0, 10.0),
-           help="prior standard deviation of the map's distance from the axis, for a map that does "
-           "not determine it (default: the blocks' outer radius)"),
-    option("--turn-rad", metavar="SD", type=within(positive_number, 0, math.pi / 2),
-           help="prior standard deviation of the map's turns from right angles, for a map that "
-           "does not determine them (default: 0.1)"),
-    option("--joined", type=input_file, metavar="JSON",
-           help="joined.json of `halbach-fe check MAP MAP`: where overlaps of the maps that the "
-           "study lists have them without a magnet, which poses must not contradict"))
-def register(arguments: argparse.Namespace) -> int:
+    option("--across-m", within(positive_number, 0, 10.0), "SD",
+           "prior standard deviation of the map's distance from the axis, for a map that does not "
+           "determine it (default: the blocks' outer radius)"),
+    option("--turn-rad", within(positive_number, 0, math.pi / 2), "SD",
+           "prior standard deviation of the map's turns from right angles, for a map that does not "
+           "determine them (default: 0.1)"),
+    option("--joined", input_file, "JSON",
+           "joined.json of `halbach-fe check MAP MAP`: where overlaps of the maps that the study "
+           "lists have them without a magnet, which poses must not contradict"))
+def register(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Find where a field map lies in the magnet, and the probe's axes.
 
     Needs no first guess: every rotation by right angles and every place along the axis is tried,
@@ -207,13 +203,10 @@ def register(arguments: argparse.Namespace) -> int:
     gets a folder with its own page. With --joined a pose that contradicts the overlap of maps is
     said, and the overlap is a datum of the update by maps on one stage.
     """
-    from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.pose_result import PosePrior
-    from halbach_fe.inference.registration import register
     from halbach_fe.report.registration import page
-    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
+    study = magnet.study
     data = common.read_measurements(arguments, study)
     say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
     if isinstance(data, dict):
@@ -230,19 +223,18 @@ def register(arguments: argparse.Namespace) -> int:
             "List the maps that were joined in the study ([[maps]])."))
     pose = PosePrior(arguments.across_m, arguments.turn_rad or PosePrior.turn_rad)
     with common.session(arguments, study) as session:
-        found = register(build_magnet(study), data, session, open_keys=arguments.fit,
-                         alternatives=arguments.alternative, most=arguments.most, pose=pose,
-                         say=say)
-    return common.finish(arguments, page(study, data, found))
+        found = hf.register(magnet, data, session, open_keys=arguments.fit,
+                            alternatives=arguments.alternative, most=arguments.most, pose=pose,
+                            say=say)
+    return page(study, data, found)
 
 
 def _run_campaign(
-    arguments: argparse.Namespace, study: Study, data: dict[str, xr.Dataset],
+    arguments: argparse.Namespace, study: hf.Study, data: dict[str, xr.Dataset],
     say: Callable[[str], None],
 ) -> int:
     """Register all maps that the study lists, each with a page in a folder of its own."""
     from halbach_fe.core.files import make_folder
-    from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.inference.campaign_registration import register_maps, registered_study
     from halbach_fe.measurement.campaign import maps_of
     from halbach_fe.measurement.map_join import read_joined
@@ -251,8 +243,8 @@ def _run_campaign(
 
     maps, joined = maps_of(study, data), arguments.joined and read_joined(arguments.joined)
     with common.session(arguments, study) as session:
-        found = register_maps(build_magnet(study.with_(maps=())), maps, session, arguments.fit, say,
-                              joined)
+        found = register_maps(hf.build_magnet(study.with_(maps=())), maps, session, arguments.fit,
+                              say, joined)
     write_changed_study(arguments.output / STUDY_FILE,
                         [(registered_study(study, maps, found, joined), NOTE)], arguments.study)
     pages = pages_of_maps(maps, found)
@@ -267,32 +259,29 @@ def _run_campaign(
     return 0
 
 
-@common.question(STUDY, OUTPUT, option("blocks", type=input_file, metavar="BLOCKS",
-                                       help="table of measured blocks (CSV)"), JSON)
-def prior(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+@question(STUDY, OUTPUT, option("blocks", input_file, "BLOCKS", "table of measured blocks (CSV)"),
+          JSON)
+def prior(magnet: hf.Magnet, arguments: argparse.Namespace) -> Page:
     """Turn moments of single blocks, measured in a Helmholtz coil, into a prior.
 
     Writes prior.h5 (mean and covariance), prior.json, prior.html and its figure. `halbach-fe infer
     --blocks` uses the same prior directly.
     """
-    from halbach_fe.inference.block_prior import prior_from_blocks
-    from halbach_fe.measurement.block_table import read_blocks
     from halbach_fe.report.prior import page
 
-    table = read_blocks(arguments.blocks)
+    table = hf.read_blocks(arguments.blocks)
     common.own_folder(arguments, magnet.study.name)
-    return page(magnet, prior_from_blocks(magnet, table))
+    return page(magnet, hf.prior_from_blocks(magnet, table))
 
 
-@verb(
+@question(
     SOLVED, dry_run, MAP_OR_LISTED, BLOCKS, HELD_OUT,
     map_format("--measurements and --held-out"),
-    option("--samples", type=positive, metavar="N",
-           help="for iron with an H(B) curve: sample the non-linear posterior by four Markov "
-           "chains of N draws each, instead of linearizing"),
-    option("--seed", type=positive, metavar="N",
-           help="seed of the random numbers of the chains of --samples (default: 1)"))
-def infer(arguments: argparse.Namespace) -> int:
+    option("--samples", positive, "N", "for iron with an H(B) curve: sample the non-linear "
+           "posterior by four Markov chains of N draws each, instead of linearizing"),
+    option("--seed", positive, "N",
+           "seed of the random numbers of the chains of --samples (default: 1)"))
+def infer(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Update a study's block magnetizations with a measured field map.
 
     Writes posterior.h5, prediction.csv, summary.json, report.html and its figures, and, if the map
@@ -302,18 +291,12 @@ def infer(arguments: argparse.Namespace) -> int:
     deviation are estimated with the magnetizations; study.updated.toml, the study's own file, then
     has the instruments that were found.
     """
-    from halbach_fe.geometry.magnet import build_magnet
-    from halbach_fe.inference.infer import infer, observation_of
+    from halbach_fe.inference.infer import observation_of
     from halbach_fe.inference.storage import write_inference
     from halbach_fe.measurement.campaign import refuse_open_instruments, refuse_uncertain
     from halbach_fe.measurement.field_map import refuse_total_field
-    from halbach_fe.report.inference import page
-    from halbach_fe.response.magnetic_axis import magnetic_axis
-    from halbach_fe.response.stray_field import stray_field
-    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)
+    study = magnet.study
     data = common.read_measurements(arguments, study)
     blocks, validation_map = common.blocks_and_held_out(arguments)
     if arguments.samples and not magnet.is_nonlinear:
@@ -342,8 +325,8 @@ def infer(arguments: argparse.Namespace) -> int:
         return common.print_estimate(
             estimate_infer(magnet, observation, common.jobs(arguments)), arguments.json)
     with common.session(arguments, study) as session:
-        result = infer(magnet, data, session, blocks, linearized_only=bool(arguments.samples),
-                       validation_map=validation_map, say=common.say)
+        result = hf.infer(magnet, data, session, blocks, linearized_only=bool(arguments.samples),
+                          validation_map=validation_map, say=common.say)
         if arguments.samples:
             from halbach_fe.inference.mcmc import sample_posterior, with_samples, write_sampled
 
@@ -355,11 +338,11 @@ def infer(arguments: argparse.Namespace) -> int:
             result = with_samples(result, sampled)
             write_sampled(sampled, arguments.output)
         result = replace(
-            result, magnetic_axis=magnetic_axis(magnet, session, result.posterior),
-            stray_field=stray_field(magnet, session, result.posterior))
+            result, magnetic_axis=hf.magnetic_axis(magnet, session, result.posterior),
+            stray_field=hf.stray_field(magnet, session, result.posterior))
     if result.response.reused:
         common.say("The response matrix of an earlier run in this folder fits and was reused.")
-    return common.finish(arguments, page(result))
+    return result
 
 
 def effects_of(text: str) -> list[Effect]:
@@ -377,18 +360,18 @@ def effects_of(text: str) -> list[Effect]:
     return [effect_by_name[name] for name in dict.fromkeys(text.split(","))]
 
 
-@verb(
+@question(
     STUDY, OUTPUT, SOLVER_WITHOUT_LIMIT, JSON, dry_run, MAP_OR_LISTED, BLOCKS, HELD_OUT,
     map_format("--measurements and --held-out"),
-    option("--time-limit", dest="diagnosis_limit", type=positive_number, metavar="SECONDS",
-           help="time in s after which the search ends with what it has so far; the step under way "
-           "is finished (default: none)"),
-    option("--check", action="append", metavar="[MAP=]JSON",
-           help="check.json of halbach-fe check for this map, whose model-free floor is shown "
-           "beside the results; for each map that the study lists, with its name"),
-    option("--effects", type=effects_of, metavar="NAME,NAME...",
-           help="candidate effects (default: all effects of the catalogue)"))
-def diagnose(arguments: argparse.Namespace) -> int:
+    option("--time-limit", positive_number, "SECONDS", "time in s after which the search ends with "
+           "what it has so far; the step under way is finished (default: none)",
+           dest="diagnosis_limit"),
+    option("--check", str, "[MAP=]JSON",
+           "check.json of halbach-fe check for this map, whose model-free floor is shown beside "
+           "the results; for each map that the study lists, with its name", action="append"),
+    option("--effects", effects_of, "NAME,NAME...",
+           "candidate effects (default: all effects of the catalogue)"))
+def diagnose(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Find which effects a study lacks to explain measured field maps, and add them to the study.
 
     If the study lists maps, all of them are diagnosed together: an effect of the magnet must
@@ -399,12 +382,10 @@ def diagnose(arguments: argparse.Namespace) -> int:
     file with the identified effects added, which `halbach-fe solve` and `halbach-fe infer` can use
     without further changes.
     """
-    from halbach_fe.diagnosis.diagnose import diagnose
     from halbach_fe.diagnosis.discriminating_measurements import separations
     from halbach_fe.report.diagnosis import page
-    from halbach_fe.study.reader import read_study
 
-    study = read_study(arguments.study)
+    study = magnet.study
     data = common.read_measurements(arguments, study)
     blocks, validation_map = common.blocks_and_held_out(arguments)
     floor = floors_of(arguments.check, data)
@@ -417,10 +398,10 @@ def diagnose(arguments: argparse.Namespace) -> int:
     # no process may take longer than GetDP's own limit, unless the whole diagnosis may
     arguments.time_limit = max(GETDP_LIMIT_S, arguments.diagnosis_limit or 0.0)
     with common.session(arguments, study) as session:
-        diagnosis = diagnose(study, data, session, blocks, arguments.effects, validation_map,
-                             common.say, floor_T=floor, time_limit_s=arguments.diagnosis_limit)
+        diagnosis = hf.diagnose(magnet, data, session, blocks, arguments.effects, validation_map,
+                                common.say, floor, arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)
-    return common.finish(arguments, page(diagnosis, separating, study))
+    return page(diagnosis, separating, study)
 
 
 def floors_of(
@@ -578,10 +559,9 @@ class _Explanation:
 
 @verb(
     SOLVED,
-    option("map", type=input_file, metavar="MAP",
-           help="measured field map (CSV, HDF5, or any that import-map reads)"),
-    option("--blocks", type=input_file, metavar="CSV",
-           help="measured moments of the single blocks"),
+    option("map", input_file, "MAP",
+           "measured field map (CSV, HDF5, or any that import-map reads)"),
+    option("--blocks", input_file, "CSV", "measured moments of the single blocks"),
     HELD_OUT, map_format("MAP and --held-out"))
 def explain(arguments: argparse.Namespace) -> int:
     """Explain a field map: whether it is sound, where it lies, of what magnet, and what is missing.
@@ -594,9 +574,8 @@ def explain(arguments: argparse.Namespace) -> int:
     explained, as far as there are such, and explanation.html, which joins their pages.
     """
     from halbach_fe.explanation import follow
-    from halbach_fe.study.reader import read_study
 
-    if read_study(arguments.study).maps:
+    if hf.read_study(arguments.study).maps:
         raise StudyError(must_be(
             "`maps`", f"study {arguments.study}", "left out for explain, which takes one map",
             "a list of maps", "Of maps that a study lists, run halbach-fe check, register, infer "
@@ -609,10 +588,10 @@ def explain(arguments: argparse.Namespace) -> int:
 
 
 @verb(
-    option("folders", type=path, nargs="+", metavar="DIR",
-           help="folder of results, of solve, infer, diagnose and so on"),
-    option("-o", "--output", type=path, required=True, metavar="PAGE",
-           help="page to write (.html), or a folder for report.html"),
+    option("folders", path, "DIR", "folder of results, of solve, infer, diagnose and so on",
+           nargs="+"),
+    option("-o --output", path, "PAGE", "page to write (.html), or a folder for report.html",
+           required=True),
     JSON)
 def report(arguments: argparse.Namespace) -> int:
     """Join the results of one magnet into one page: the answer of every command, with links.
@@ -651,33 +630,30 @@ def _hidden_effects(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "effects to hide:\n" + "\n".join(
         f"  {name}" + (f"={signature(effect)}" if effect.parameters else "")
         for name, effect in EFFECTS.items())
-    parser.add_argument("--coil-sd", type=within(finite_number, 1e-9, 0.3), default=COIL_SD,
-                        metavar="F", help="noise of the measured moment of a block, relative to "
-                        "the moment (default: %(default)g)")
-    parser.add_argument("--hide", type=effect, action="append", default=[],
-                        metavar="NAME[=VALUE,...]",
-                        help="hide an effect: the simulated magnet has it, the study does not; its "
-                        "size is random unless VALUE is given; may be repeated")
+    option("--coil-sd", within(finite_number, 1e-9, 0.3), "F",
+           "noise of the measured moment of a block, relative to the moment (default: %(default)g)",
+           default=COIL_SD)(parser)
+    option("--hide", effect, "NAME[=VALUE,...]", "hide an effect: the simulated magnet has it, the "
+           "study does not; its size is random unless VALUE is given; may be repeated",
+           action="append", default=[])(parser)
 
 
-@verb(
+@question(
     STUDY, OUTPUT, SEED, _hidden_effects,
-    option("--placed", type=input_file, metavar="CSV",
-           help="assemble the blocks of this seed in the places of this table: the "
-           "blocks.sorted.csv that halbach-fe sort made of the blocks.csv of an earlier simulation "
-           "with the same seed"),
-    option("--hide-random", type=positive, default=0, metavar="K",
-           help="hide K effects of the field or the instrument that are drawn at random"),
-    option("--component", choices=("abs",),
-           help="make maps of |B| alone, as of an NMR teslameter; the components of B are those of "
-           "observation.components in the study"),
-    option("--element-size", type=within(finite_number, 1e-5, 10), metavar="M",
-           help="size in m of the largest elements of NGSolve (default: a third of the blocks' "
+    option("--placed", input_file, "CSV", "assemble the blocks of this seed in the places of this "
+           "table: the blocks.sorted.csv that halbach-fe sort made of the blocks.csv of an earlier "
+           "simulation with the same seed"),
+    option("--hide-random", positive, "K",
+           "hide K effects of the field or the instrument that are drawn at random", default=0),
+    choice("--component", ("abs",), "make maps of |B| alone, as of an NMR teslameter; the "
+           "components of B are those of observation.components in the study"),
+    option("--element-size", within(finite_number, 1e-5, 10), "M",
+           "size in m of the largest elements of NGSolve (default: a third of the blocks' "
            "thickness, in 2D half of that)"),
-    option("--order", type=within(whole, 1, 10), metavar="N",
-           help="order of NGSolve's elements (default: 3 in 3D, 5 in 2D)"),
+    option("--order", within(whole, 1, 10), "N",
+           "order of NGSolve's elements (default: 3 in 3D, 5 in 2D)"),
     JSON)
-def simulate_measurement(arguments: argparse.Namespace) -> int:
+def simulate_measurement(magnet: hf.Magnet, arguments: argparse.Namespace) -> Page:
     """Simulate a measurement campaign of a magnet whose blocks deviate from their nominal values.
 
     Magnetizations are drawn from the study's prior. magpylib and NGSolve compute the field, never
@@ -686,15 +662,12 @@ def simulate_measurement(arguments: argparse.Namespace) -> int:
     its figures, which do not reveal the truth. The maps name the SHA-256 of truth.json, so that the
     truth cannot be changed afterwards.
     """
-    from halbach_fe.geometry.magnet import build_magnet
     from halbach_fe.measurement.instrument import check_total_field
     from halbach_fe.report.campaign import page
-    from halbach_fe.study.reader import read_study
     from halbach_fe.synthetic.ngsolve_reaction import Elements
     from halbach_fe.synthetic.simulate import simulate_campaign
 
-    study = read_study(arguments.study)
-    magnet = build_magnet(study)  # refuses, as every command does, what cannot be built
+    study = magnet.study
     if arguments.component == "abs":
         check_total_field(study.instrument)
     # before the simulation, which may take long; a refused study leaves no folder all the same
@@ -719,5 +692,5 @@ def simulate_measurement(arguments: argparse.Namespace) -> int:
                                      arguments.hide_random, elements, progress, placed,
                                      arguments.component == "abs")
     made = page(campaign)
-    return common.finish(arguments, replace(made, summary={**made.summary, "files": [
-        str(arguments.output / name) for name in made.files]}))
+    return replace(made, summary={**made.summary, "files": [
+        str(arguments.output / name) for name in made.files]})

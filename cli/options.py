@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from halbach_fe.cli.streams import say, show
+from halbach_fe.cli.guard import say, show
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import EXIT_CODES, MAX_QUOTED, printable
 from halbach_fe.core.files import InputFile
@@ -73,14 +73,33 @@ def verb(*options: Options) -> Callable[[Run], Run]:
     return declared
 
 
-def option(*names: str, **settings: Any) -> Options:
-    """Return an option, of which argparse is told all."""
-    return lambda parser: parser.add_argument(*names, **settings)
+def option(
+    names: str, kind: Callable[[str], Any], metavar: str | tuple[str, ...] | None, text: str,
+    **settings: Any,
+) -> Options:
+    """Return an option with a value: its names, how that is parsed and called, and its help."""
+    return lambda parser: parser.add_argument(*names.split(), type=kind, metavar=metavar, help=text,
+                                              **settings)
+
+
+def flag(name: str, text: str) -> Options:
+    """Return an option without a value, and its help."""
+    return lambda parser: parser.add_argument(name, action="store_true", help=text)
+
+
+def choice(name: str, words: Collection[str], text: str, **settings: Any) -> Options:
+    """Return an option whose value is one of some words, and its help."""
+    return lambda parser: parser.add_argument(name, choices=words, help=text, **settings)
 
 
 def together(*options: Options) -> Options:
     """Return several options as one."""
     return lambda parser: [each(parser) for each in options]
+
+
+def either(*options: Options) -> Options:
+    """Return several options of which one may be given."""
+    return lambda parser: together(*options)(parser.add_mutually_exclusive_group())
 
 
 class Once(argparse.Action):
@@ -271,91 +290,73 @@ def point(text: str) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-STUDY = option("study", type=input_file, metavar="STUDY", help="study file (TOML)")
-OUTPUT = option("-o", "--output", type=path, required=True, metavar="DIR",
-                help="folder for results; made if it does not exist")
-JSON = option("--json", action="store_true", help="print results as JSON")
-SEED = option("--seed", type=positive, default=1, metavar="N",
-              help="seed of the random numbers (default: %(default)s)")
-GETDP = option("--getdp", type=given, metavar="PATH",
-               help="GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
+STUDY = option("study", input_file, "STUDY", "study file (TOML)")
+OUTPUT = option("-o --output", path, "DIR", "folder for results; made if it does not exist",
+                required=True)
+JSON = flag("--json", "print results as JSON")
+SEED = option("--seed", positive, "N", "seed of the random numbers (default: %(default)s)",
+              default=1)
+GETDP = option("--getdp", given, "PATH", "GetDP executable (default: $HALBACH_FE_GETDP, then PATH)")
 CACHE_HELP = "(default: $HALBACH_FE_CACHE, then ~/.cache/halbach-fe)"
-TIME_LIMIT = option(
-    "--time-limit", type=positive_number, default=GETDP_LIMIT_S, metavar="SECONDS",
-    help="time limit of each GetDP process in s (default: %(default)g)")
-
-
-def _cache(parser: argparse.ArgumentParser) -> None:
-    """Add --cache and --no-cache."""
-    answers = parser.add_mutually_exclusive_group()
-    answers.add_argument("--cache", type=path, metavar="DIR",
-                         help=f"folder of the cache of GetDP's answers {CACHE_HELP}")
-    answers.add_argument("--no-cache", action="store_true",
-                         help="neither read nor write the cache of GetDP's answers")
-
-
+TIME_LIMIT = option("--time-limit", positive_number, "SECONDS",
+                    "time limit of each GetDP process in s (default: %(default)g)",
+                    default=GETDP_LIMIT_S)
 SOLVER_WITHOUT_LIMIT = together(
-    option("--jobs", type=positive, metavar="N",
-           help="number of GetDP runs at a time (default: 2, or with --scheduler the number of "
-           "cores of its workers)"),
-    option("--mpi", type=within(whole, 1, 1024), default=1, metavar="N",
-           help="number of MPI processes that share each run, for solves that are too large for a "
-           "single process (default: %(default)s)"),
-    option("--scheduler", metavar="ADDRESS",
-           help="Dask scheduler whose workers run GetDP instead of this machine"),
-    _cache, GETDP)
+    option("--jobs", positive, "N", "number of GetDP runs at a time (default: 2, or with "
+           "--scheduler the number of cores of its workers)"),
+    option("--mpi", within(whole, 1, 1024), "N", "number of MPI processes that share each run, for "
+           "solves that are too large for a single process (default: %(default)s)", default=1),
+    option("--scheduler", str, "ADDRESS",
+           "Dask scheduler whose workers run GetDP instead of this machine"),
+    either(option("--cache", path, "DIR", f"folder of the cache of GetDP's answers {CACHE_HELP}"),
+           flag("--no-cache", "neither read nor write the cache of GetDP's answers")),
+    GETDP)
 SOLVER = together(SOLVER_WITHOUT_LIMIT, TIME_LIMIT)
 """Options of GetDP's runs."""
 
 SOLVED = together(STUDY, OUTPUT, SOLVER, JSON)
 """Options of every verb that solves."""
 
-BLOCKS = option("--blocks", type=input_file, metavar="CSV",
-                help="measured moments of the single blocks, whose prior replaces the study's")
-MAP = option("--measurements", type=input_file, required=True, metavar="MAP",
-             help="measured field map (CSV or HDF5)")
-MAP_OR_LISTED = option("--measurements", type=input_file, metavar="MAP",
-                       help="measured field map (CSV or HDF5), unless the study lists maps")
-HELD_OUT = option("--held-out", type=input_file, metavar="MAP",
-                  help="another map at other positions, which is predicted but does not update the "
-                  "model")
-POSTERIOR = option("--posterior", type=input_file, metavar="H5",
-                   help="posterior.h5 that halbach-fe infer wrote for this study")
+BLOCKS = option("--blocks", input_file, "CSV",
+                "measured moments of the single blocks, whose prior replaces the study's")
+MAP = option("--measurements", input_file, "MAP", "measured field map (CSV or HDF5)",
+             required=True)
+MAP_OR_LISTED = option("--measurements", input_file, "MAP",
+                       "measured field map (CSV or HDF5), unless the study lists maps")
+HELD_OUT = option("--held-out", input_file, "MAP", "another map at other positions, which is "
+                  "predicted but does not update the model")
+POSTERIOR = option("--posterior", input_file, "H5",
+                   "posterior.h5 that halbach-fe infer wrote for this study")
 
 MULTIPOLES = together(
-    option("--reference-radius-m", type=positive_number, metavar="R",
-           help="reference radius of the multipoles in m (default: that of the study's circle, or "
-           "two thirds of the inner radius of the blocks)"),
-    option("--orders", type=orders, metavar="N..M",
-           help="orders of the unwanted multipoles, 1 for the dipole, for example 2..10 or 3,5,7; "
-           "the magnet's main order is ignored (default: 1..10)"),
-    option("--at-z-m", type=finite_number, metavar="Z",
-           help="in 3D: multipoles on the circle at Z in m, instead of those of the field "
-           "integrated along z"),
-    option("--limit-units", type=within(finite_number, *LIMIT_UNITS), metavar="U",
-           help="largest unwanted multipole that is allowed, in units of 1e-4 of the main "
-           "multipole"))
+    option("--reference-radius-m", positive_number, "R", "reference radius of the multipoles in m "
+           "(default: that of the study's circle, or two thirds of the inner radius of the "
+           "blocks)"),
+    option("--orders", orders, "N..M", "orders of the unwanted multipoles, 1 for the dipole, for "
+           "example 2..10 or 3,5,7; the magnet's main order is ignored (default: 1..10)"),
+    option("--at-z-m", finite_number, "Z", "in 3D: multipoles on the circle at Z in m, instead of "
+           "those of the field integrated along z"),
+    option("--limit-units", within(finite_number, *LIMIT_UNITS), "U",
+           "largest unwanted multipole that is allowed, in units of 1e-4 of the main multipole"))
 """Reference of the multipoles, and the limit of unwanted ones."""
 
 OBJECTIVE = together(MULTIPOLES, option(
-    "--limit-ppm", type=within(finite_number, *LIMIT_PPM), metavar="P",
-    help="if the study has a table [homogeneity]: largest rms deviation of |B| in its region that "
-    "is allowed, in ppm of the mean"))
+    "--limit-ppm", within(finite_number, *LIMIT_PPM), "P", "if the study has a table "
+    "[homogeneity]: largest rms deviation of |B| in its region that is allowed, in ppm of the "
+    "mean"))
 """Options of multipoles, and the limit of a study that asks for a homogeneous field."""
 
 
-def region(parser: argparse.ArgumentParser) -> None:
-    """Add the options that describe a region."""
-    shape = parser.add_mutually_exclusive_group()
-    shape.add_argument("--sphere-m", type=positive_number, metavar="R",
-                       help="radius of the sphere in m (default: the study's region, or half the "
-                       "radius of the bore)")
-    shape.add_argument("--ellipsoid-m", type=positive_number, nargs=3, metavar=("A", "B", "C"),
-                       help="half axes along x, y and z in m")
-    shape.add_argument("--cylinder-m", type=positive_number, nargs=2, metavar=("R", "LENGTH"),
-                       help="radius and length along z in m")
-    parser.add_argument("--centre-m", type=finite_number, nargs=3, metavar=("X", "Y", "Z"),
-                        default=(0.0, 0.0, 0.0), help="centre of the region in m (default: 0 0 0)")
+REGION = together(
+    either(option("--sphere-m", positive_number, "R", "radius of the sphere in m (default: the "
+                  "study's region, or half the radius of the bore)"),
+           option("--ellipsoid-m", positive_number, ("A", "B", "C"),
+                  "half axes along x, y and z in m", nargs=3),
+           option("--cylinder-m", positive_number, ("R", "LENGTH"),
+                  "radius and length along z in m", nargs=2)),
+    option("--centre-m", finite_number, ("X", "Y", "Z"),
+           "centre of the region in m (default: 0 0 0)", nargs=3, default=(0.0, 0.0, 0.0)))
+"""Options that describe a region."""
 
 
 def dry_run(parser: argparse.ArgumentParser) -> None:
@@ -369,50 +370,48 @@ def dry_run(parser: argparse.ArgumentParser) -> None:
             output.required = False
             namespace.dry_run = True
 
-    parser.add_argument("--dry-run", action=DryRun, nargs=0, default=False,
-                        help="estimate memory, time and disk; nothing is solved or written, and -o "
-                        "is not needed")
+    option("--dry-run", str, None,
+           "estimate memory, time and disk; nothing is solved or written, and -o is not needed",
+           action=DryRun, nargs=0, default=False)(parser)
 
 
 def _of_kind(kind: str, members: Collection[str], what: str) -> Options:
     """Return the option of the unit of a kind of quantity."""
-    return option(f"--{kind}-unit", type=partial(unit_of, kind), default="", metavar="UNIT",
-                  help=f"unit of {what}: {', '.join(members)}; a factor may precede it, as in "
-                  f"'10 {next(iter(members))}'")
+    return option(f"--{kind}-unit", partial(unit_of, kind), "UNIT",
+                  f"unit of {what}: {', '.join(members)}; a factor may precede it, as in "
+                  f"'10 {next(iter(members))}'", default="")
 
 
 TABLE_FORMAT = together(
     _of_kind("length", LENGTHS, "the positions"), _of_kind("field", FIELDS, "B"),
-    option("--angle-unit", choices=ANGLES, default="", help="unit of phi"),
-    option("--skip-lines", type=count, default=0, metavar="N",
-           help="number of lines at the beginning of FILE that are not read"),
-    option("--delimiter", choices=DELIMITERS, default="",
-           help="what separates columns; spaces are any number of spaces and tabs (default: "
-           "recognized)"),
-    option("--decimal-comma", action="store_true",
-           help="numbers have a decimal comma, as in 0,5"),
-    option("--encoding", default=DeclaredFormat.encoding,
-           help="encoding of a text file (default: UTF-8)"))
+    choice("--angle-unit", ANGLES, "unit of phi", default=""),
+    option("--skip-lines", count, "N", "number of lines at the beginning of FILE that are not read",
+           default=0),
+    choice("--delimiter", DELIMITERS,
+           "what separates columns; spaces are any number of spaces and tabs (default: recognized)",
+           default=""),
+    flag("--decimal-comma", "numbers have a decimal comma, as in 0,5"),
+    option("--encoding", str, None, "encoding of a text file (default: UTF-8)",
+           default=DeclaredFormat.encoding))
 """Options that describe any table, of a map or of blocks."""
 
 MAP_FORMAT = together(
-    option("--format", choices=FORMATS, default="",
-           help="format of FILE (default: recognized from its beginning)"),
-    option("--columns", type=names, default=(), metavar="NAME,NAME...",
-           help="content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, Babs (|B|), dx, "
-           "dy, dz (moves of a stage from reading to reading), t (time), scan, sigma or sigma_Bx "
-           "... (noise), or - for a column that is ignored; a unit may follow, as in Bx[mT], t[s], "
-           "t[hhmmss], Bx[1e-7 T]. They take the place of the file's header"),
-    option("--positions", type=Path, metavar="TABLE",
-           help="table of x, y and z with a row for each reading of a FILE without positions"),
-    option("--component", choices=(*AXES, "abs", UNKNOWN), default="",
-           help="component of the field in a column B; abs if it is |B|, as of an NMR teslameter; "
-           "unknown, if nobody knows it, for halbach-fe register to find"),
-    option("--at", type=coordinates, default={}, metavar="AXIS=M,...",
-           help="constant coordinates in m that the file does not contain, for example x=0,y=0 or "
-           "r=0.01,z=0"),
-    option("--origin-m", type=point, metavar="X,Y,Z",
-           help="position in m of the file's origin, along the magnet's axes"),
+    choice("--format", FORMATS, "format of FILE (default: recognized from its beginning)",
+           default=""),
+    option("--columns", names, "NAME,NAME...",
+           "content of each column: x, y, z, r, phi, Bx, By, Bz, Br, Bphi, B, Babs (|B|), dx, dy, "
+           "dz (moves of a stage from reading to reading), t (time), scan, sigma or sigma_Bx ... "
+           "(noise), or - for a column that is ignored; a unit may follow, as in Bx[mT], t[s], "
+           "t[hhmmss], Bx[1e-7 T]. They take the place of the file's header", default=()),
+    option("--positions", Path, "TABLE",
+           "table of x, y and z with a row for each reading of a FILE without positions"),
+    choice("--component", (*AXES, "abs", UNKNOWN),
+           "component of the field in a column B; abs if it is |B|, as of an NMR teslameter; "
+           "unknown, if nobody knows it, for halbach-fe register to find", default=""),
+    option("--at", coordinates, "AXIS=M,...", "constant coordinates in m that the file does not "
+           "contain, for example x=0,y=0 or r=0.01,z=0", default={}),
+    option("--origin-m", point, "X,Y,Z",
+           "position in m of the file's origin, along the magnet's axes"),
     TABLE_FORMAT)
 """Options that describe the file of a map."""
 

@@ -6,8 +6,9 @@ import argparse
 import time
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import halbach_fe as hf
 from halbach_fe.cli import common
 from halbach_fe.cli.common import question, say
 from halbach_fe.cli.options import (
@@ -18,6 +19,7 @@ from halbach_fe.cli.options import (
     OBJECTIVE,
     OUTPUT,
     POSTERIOR,
+    REGION,
     SEED,
     SOLVED,
     STUDY,
@@ -26,12 +28,12 @@ from halbach_fe.cli.options import (
     describes_a_format,
     dry_run,
     finite_number,
+    flag,
     input_file,
     map_format,
     option,
     positive,
     positive_number,
-    region,
     verb,
     whole,
     within,
@@ -40,16 +42,11 @@ from halbach_fe.core.errors import CommandLineError, StudyError, must_be
 from halbach_fe.core.numbers import ACROSS, DENSITY, DRAWS, HIGHEST_DEGREE
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from halbach_fe.core.arrays import Floats
-    from halbach_fe.geometry.magnet import Magnet
-    from halbach_fe.report.page import Page
-    from halbach_fe.response.field_on_lines import FieldOnLines
 
 
 @question(SOLVED, dry_run)
-def solve(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
+def solve(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Compute the field of a study's nominal magnet at the study's positions.
 
     Iron with an H(B) curve is solved by Newton's method. Writes field_map.h5, field_map.csv and
@@ -58,7 +55,7 @@ def solve(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
     hand.
     """
     from halbach_fe.core.pace import duration
-    from halbach_fe.response.solution import solve, study_observation
+    from halbach_fe.response.solution import study_observation
     from halbach_fe.solver.formulation_choice import choose_route
     from halbach_fe.solver.session import newton_history
 
@@ -76,22 +73,22 @@ def solve(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
     elif many:
         say(f"{len(magnet.blocks)} blocks: first their field at the positions and far outside.")
     with common.session(arguments, magnet.study) as session:
-        solution = solve(magnet, session)
+        solution = hf.solve(magnet, session)
     seconds = round(time.monotonic() - started, 2)
     if many:
         say(f"Solved in {seconds} s; now its files and the page, which draws a part of the blocks.")
-    from halbach_fe.report.solution import page
+    from halbach_fe.report.page import page_of
 
     summary: dict[str, object] = {"seconds": seconds, "output": str(arguments.output)}
     if magnet.is_nonlinear and choose_route(magnet, solution.points) != "moments":
         summary["newton_residuals"] = newton_history(arguments.output)
-    made = page(solution)
+    made = page_of(solution)
     return replace(made, summary={**made.summary, **summary},
                    provenance={**made.provenance, "solved in": f"{seconds} s"})
 
 
 @question(SOLVED, dry_run)
-def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
+def verify(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Estimate the error of a study's field: refinement, a farther boundary, the dual formulation.
 
     Solves the nominal array at the study's positions on two coarser meshes, the study's own and a
@@ -99,8 +96,6 @@ def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
     Writes verification.json, verification.csv (changes of the field at every point),
     verification.html and its figures.
     """
-    from halbach_fe.report.verification import page
-    from halbach_fe.response.discretization_error import verify
     from halbach_fe.response.resource_estimate import estimate_verify
 
     if arguments.dry_run:
@@ -108,24 +103,22 @@ def verify(magnet: Magnet, arguments: argparse.Namespace) -> Page | int:
                                      arguments.json)
     exact = magnet.is_vacuum and magnet.study.solver.method != "direct"
     with common.session(arguments, magnet.study) as session:
-        return page(verify(magnet, session, say=lambda purpose: (
-            None if exact else say(f"solving {purpose}"))))
+        return hf.verify(magnet, session, say=lambda purpose: (
+            None if exact else say(f"solving {purpose}")))
 
 
 @question(
     SOLVED,
-    *(option(f"--{end}-m", type=finite_number, nargs=3, required=True, metavar=("X", "Y", "Z"),
-             help=f"where the line goes {end}") for end in ("from", "to")),
-    option("--count", type=partial(at_least, 3), default=201, metavar="N",
-           help="number of points of a line (default: 201)"),
-    option("--across-m", type=within(finite_number, 0.0, 10.0), nargs=2, default=(0.0, 0.0),
-           metavar=("U", "V"),
-           help="half widths of a grid of parallel lines: of a line along z those along x and y"),
-    option("--lines", type=positive, metavar="N",
-           help="number of lines along each half width (default: 5)"),
-    POSTERIOR, option("--inside", action="store_true",
-                      help="points may lie inside blocks and iron"))
-def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
+    *(option(f"--{end}-m", finite_number, ("X", "Y", "Z"),
+             f"where the line goes {end}", nargs=3, required=True) for end in ("from", "to")),
+    option("--count", partial(at_least, 3), "N", "number of points of a line (default: 201)",
+           default=201),
+    option("--across-m", within(finite_number, 0.0, 10.0), ("U", "V"),
+           "half widths of a grid of parallel lines: of a line along z those along x and y",
+           nargs=2, default=(0.0, 0.0)),
+    option("--lines", positive, "N", "number of lines along each half width (default: 5)"),
+    POSTERIOR, flag("--inside", "points may lie inside blocks and iron"))
+def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Compute B and H on lines with error bars, their first and second integrals, and kick maps.
 
     The lines run from --from-m to --to-m, and beside it at the offsets of --across-m. With
@@ -136,13 +129,11 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     """
     import numpy as np
 
-    from halbach_fe.api import field
     from halbach_fe.core.files import write_text
     from halbach_fe.core.numbers import csv_text
     from halbach_fe.inference.storage import disagreement_of
-    from halbach_fe.measurement.field_map import field_map, write_map
+    from halbach_fe.report.page import columns_by_axis
     from halbach_fe.report.words import with_error
-    from halbach_fe.response.field_on_lines import Lines
     from halbach_fe.study.types import COMPONENTS
 
     fewest = 2  # along a half width
@@ -153,22 +144,20 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
                                  "Correct it, add --across-m U V, or leave it out."))
     offsets = tuple(np.linspace(-half, half, arguments.lines or 5) if half else np.zeros(1)
                     for half in arguments.across_m)
-    lines = Lines(np.array(arguments.from_m), np.array(arguments.to_m), (offsets[0], offsets[1]),
-                  arguments.count)
+    lines = hf.Lines(np.array(arguments.from_m), np.array(arguments.to_m),
+                     (offsets[0], offsets[1]), arguments.count)
     read = common.posterior_of(arguments, magnet)
     with common.session(arguments, magnet.study) as session:
-        found = field(magnet, lines, session, read, arguments.inside)
+        found = hf.field(magnet, lines, session, read, arguments.inside)
     folder = arguments.output
-    write_text(folder / "field.csv", csv_text(_points(found)))
-    write_map(field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
+    points: dict[str, Floats] = {}
+    for name, values in (("{}_m", lines.points), ("B{}_T", found.mean), ("sd_B{}_T", found.sd),
+                         *zip(("H{}_A_per_m", "sd_H{}_A_per_m"), found.strength, strict=True)):
+        points |= columns_by_axis(name, values)
+    write_text(folder / "field.csv", csv_text({**points, "in_block": found.in_block.ravel()}))
+    hf.write_map(hf.field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
         "study": magnet.name}), folder / "field_map.csv")
-    grid = np.meshgrid(*offsets, indexing="ij")
-    columns: dict[str, Floats] = {"u_m": grid[0].ravel(), "v_m": grid[1].ravel()}
-    for order, unit in ((1, "T_m"), (2, "T_m2")):
-        mean, sd = found.integrals(order)
-        for axis, values, bars in zip(COMPONENTS, mean.T, sd.T, strict=True):
-            columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
-    columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
+    columns = _integrals(found, *np.meshgrid(*offsets, indexing="ij"))
     if min(map(len, offsets)) > 1:
         kicks = found.kicks()
         for across, (kick, sd) in zip("uv", kicks, strict=True):
@@ -201,18 +190,15 @@ def field(magnet: Magnet, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _points(found: FieldOnLines) -> dict[str, NDArray[Any]]:
-    """Return the columns of the table of points."""
-    from halbach_fe.study.types import COMPONENTS
-
-    strength, strength_sd = found.strength
-    columns: dict[str, NDArray[Any]] = {}
-    for name, values in (("{}_m", found.lines.points), ("B{}_T", found.mean),
-                         ("sd_B{}_T", found.sd), ("H{}_A_per_m", strength),
-                         ("sd_H{}_A_per_m", strength_sd)):
-        columns |= {name.format(axis): values[..., number].ravel()
-                    for number, axis in enumerate(COMPONENTS)}
-    return columns | {"in_block": found.in_block.ravel()}
+def _integrals(found: hf.FieldOnLines, u_m: Floats, v_m: Floats) -> dict[str, Floats]:
+    """Return the columns of integrals.csv, a row for each line at the offsets u and v."""
+    columns = {"u_m": u_m.ravel(), "v_m": v_m.ravel()}
+    for order, unit in ((1, "T_m"), (2, "T_m2")):
+        mean, sd = found.integrals(order)
+        for axis, values, bars in zip("xyz", mean.T, sd.T, strict=True):
+            columns |= {f"I{order}{axis}_{unit}": values, f"sd_I{order}{axis}_{unit}": bars}
+    columns["Phi_T2_m3"], columns["sd_Phi_T2_m3"] = found.kick_potential()
+    return columns
 
 
 def kick_map(length: float, offsets: tuple[Floats, ...], kicks: tuple[Floats, Floats]) -> str:
@@ -229,7 +215,7 @@ def kick_map(length: float, offsets: tuple[Floats, ...], kicks: tuple[Floats, Fl
 
 
 @question(SOLVED, POSTERIOR, MULTIPOLES)
-def multipoles(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+def multipoles(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Compute the multipoles of a magnet, with their standard deviations.
 
     With --posterior they are those of the measured magnet, otherwise those that the study's prior
@@ -237,23 +223,21 @@ def multipoles(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     --at-z-m (default: the middle of the magnet). Writes multipoles.csv, multipoles.json,
     multipoles.html and its figures.
     """
-    from halbach_fe.api import multipoles
-    from halbach_fe.report.multipoles import page
-
     posterior = common.posterior_of(arguments, magnet)
     with common.session(arguments, magnet.study) as session:
-        return page(replace(multipoles(magnet, session, common.reference(arguments), posterior),
-                            limit=arguments.limit_units))
+        return replace(hf.multipoles(magnet, session, common.reference(arguments), posterior),
+                       limit=arguments.limit_units)
 
 
 @question(
     SOLVED, map_format("--measurements"), POSTERIOR,
-    option("--measurements", type=input_file, metavar="MAP",
-           help="measured map, whose own homogeneity is shown beside the magnet's"),
-    region,
-    option("--degrees", type=int, choices=range(1, HIGHEST_DEGREE + 1), metavar="L",
-           help=f"largest degree of the spherical harmonics, 1 to {HIGHEST_DEGREE} (default: 6)"))
-def homogeneity(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    option("--measurements", input_file, "MAP",
+           "measured map, whose own homogeneity is shown beside the magnet's"),
+    REGION,
+    option("--degrees", int, "L",
+           f"largest degree of the spherical harmonics, 1 to {HIGHEST_DEGREE} (default: 6)",
+           choices=range(1, HIGHEST_DEGREE + 1)))
+def homogeneity(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Compute how homogeneous the field of a magnet is in a region, in ppm and with error bars.
 
     The region is a sphere, an ellipsoid or a cylinder: by default that of the study's table
@@ -263,8 +247,6 @@ def homogeneity(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     readings. Writes homogeneity.json, harmonics.csv if the region is a sphere, homogeneity.html and
     its figures.
     """
-    from halbach_fe.api import homogeneity
-    from halbach_fe.report.homogeneity import page
     from halbach_fe.response.homogeneity import SHOWN_DEGREES
 
     within_it, posterior = common.region_of(arguments), common.posterior_of(arguments, magnet)
@@ -279,8 +261,8 @@ def homogeneity(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     data = (common.read_one(arguments, arguments.measurements) if arguments.measurements
             else None)
     with common.session(arguments, magnet.study) as session:
-        return page(homogeneity(magnet, session, within_it, posterior,
-                                arguments.degrees or SHOWN_DEGREES, data))
+        return hf.homogeneity(magnet, session, within_it, posterior,
+                              arguments.degrees or SHOWN_DEGREES, data)
 
 
 def _density(text: str) -> float:
@@ -293,49 +275,42 @@ def _density(text: str) -> float:
 
 @question(
     SOLVED,
-    option("--order", type=input_file, metavar="CSV",
-           help="table whose column block names the blocks in the order in which they are inserted "
-           "(default: ring by ring, slot by slot)"),
-    option("--density-kg-per-m3", type=_density, metavar="D",
-           help="density of the blocks (default: that of their grade, or 7500)"),
-    option("--price-per-kg", type=positive_number, metavar="P",
-           help="price of the blocks per kg, in any currency"))
-def forces(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    option("--order", input_file, "CSV", "table whose column block names the blocks in the order "
+           "in which they are inserted (default: ring by ring, slot by slot)"),
+    option("--density-kg-per-m3", _density, "D",
+           "density of the blocks (default: that of their grade, or 7500)"),
+    option("--price-per-kg", positive_number, "P", "price of the blocks per kg, in any currency"))
+def forces(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Compute forces and torques on every block, in place and while the magnet is assembled.
 
     Each block is looked at twice: with all others in place, and as the next one to be inserted,
     with the blocks before it in place (by default ring by ring, slot by slot). Writes forces.csv,
     forces.json, forces.html and its figure, with the mass of the magnet.
     """
-    from halbach_fe.design.forces import forces
     from halbach_fe.geometry.blocks import present_blocks
     from halbach_fe.measurement.block_table import read_order
-    from halbach_fe.report.forces import page
 
     names = [block.name for block in present_blocks(magnet.blocks)]
     order = read_order(arguments.order, names) if arguments.order else None
     with common.session(arguments, magnet.study) as session:
-        return page(forces(magnet, session, order, arguments.density_kg_per_m3,
-                           arguments.price_per_kg))
+        return hf.forces(magnet, session, order, arguments.density_kg_per_m3,
+                         arguments.price_per_kg)
 
 
-@question(SOLVED, option("--across", type=within(whole, *ACROSS), metavar="N",
-                         help="cells across the thickness of a block (default: 6)"))
-def demagnetization(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+@question(SOLVED, option("--across", within(whole, *ACROSS), "N",
+                         "cells across the thickness of a block (default: 6)"))
+def demagnetization(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Map how near the blocks are to the knee of their demagnetization curve when they are hot.
 
     The study's table `demagnetization` states coercivity, coefficients and temperature of the
     material. Writes demagnetization.html and its figures, demagnetization.json, demagnetization.csv
     (a row per block) and demagnetization.vtu (cells, for ParaView).
     """
-    from halbach_fe.design.demagnetization import ACROSS, demagnetization_map
-    from halbach_fe.report.demagnetization import page
-
     with common.session(arguments, magnet.study) as session:
-        return page(demagnetization_map(magnet, session, arguments.across or ACROSS))
+        return hf.demagnetization(magnet, session, *filter(None, [arguments.across]))
 
 
-@verb(SOLVED, region, SEED)
+@verb(SOLVED, REGION, SEED)
 def design(arguments: argparse.Namespace) -> int:
     """Search for the rings of a magnet whose field in a region is homogeneous.
 
@@ -343,23 +318,18 @@ def design(arguments: argparse.Namespace) -> int:
     are [design] of the study. Writes study.designed.toml, the study with the best rings, rings.csv,
     design.json, design.html with the designs of larger fields, and its figures.
     """
-    from halbach_fe.design.ring_design import design_rings
-    from halbach_fe.report.ring_design import page
-    from halbach_fe.study.reader import read_study
-
-    study = read_study(arguments.study)
+    study = hf.read_study(arguments.study)
     with common.session(arguments, study) as session:
-        found = design_rings(study, session, common.region_of(arguments), arguments.seed)
-    return common.finish(arguments, page(found))
+        found = hf.design_rings(study, session, common.region_of(arguments), arguments.seed)
+    return common.finish(arguments, found)
 
 
 @question(
     STUDY, OUTPUT,
-    option("--blocks", type=input_file, metavar="CSV",
-           help="table of measured blocks in their places, whose serial numbers name the blocks: "
-           "the blocks.sorted.csv of halbach-fe sort"),
+    option("--blocks", input_file, "CSV", "table of measured blocks in their places, whose serial "
+           "numbers name the blocks: the blocks.sorted.csv of halbach-fe sort"),
     JSON)
-def cad(magnet: Magnet, arguments: argparse.Namespace) -> int:
+def cad(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Write the blocks and a holder for them as STEP and STL files, and the plan to assemble them.
 
     The holder consists of plates with a pocket for every block; [holder] of the study says how they
@@ -367,19 +337,18 @@ def cad(magnet: Magnet, arguments: argparse.Namespace) -> int:
     magnet.step with everything in its place, assembly.csv, assembly.json and assembly.html, a sheet
     to print for every plate. Solids are in mm.
     """
-    from halbach_fe.design.assembly import cad
     from halbach_fe.report.assembly import page
 
     blocks = common.blocks_of(arguments.blocks)
     common.own_folder(arguments, magnet.name)
-    plan = cad(magnet, blocks)
+    plan = hf.cad(magnet, blocks)
     with common.progress_bar("solids") as show:  # until its files are written
         return common.finish(arguments, page(plan, show))
 
 
-@question(SOLVED, option("--points", type=positive, metavar="N",
-                         help="number of positions to choose (default: the study's plan.points)"))
-def plan(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+@question(SOLVED, option("--points", positive, "N",
+                         "number of positions to choose (default: the study's plan.points)"))
+def plan(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Choose the positions whose readings carry most information about the block magnetizations.
 
     If the study has a table [homogeneity], they tell most about the deviation of |B| in its region.
@@ -387,45 +356,37 @@ def plan(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     the study measures). Their information is compared with that of the study's positions. Writes
     plan.csv, plan.json, plan.html and its figures.
     """
-    from halbach_fe.design.measurement_plan import plan_measurement
-    from halbach_fe.report.plan import page
-
     with common.session(arguments, magnet.study) as session:
-        return page(plan_measurement(magnet, session, arguments.points))
+        return hf.plan(magnet, session, arguments.points)
 
 
 @question(
     SOLVED, BLOCKS, OBJECTIVE,
-    option("--draws", type=within(whole, *DRAWS), default=10_000, metavar="N",
-           help="number of magnets to draw (default: %(default)s)"),
+    option("--draws", within(whole, *DRAWS), "N",
+           "number of magnets to draw (default: %(default)s)", default=10_000),
     SEED)
-def tolerance(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+def tolerance(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Predict the multipoles, or the homogeneity, of magnets whose blocks are drawn from the prior.
 
     It is the homogeneity in the region of the study's table [homogeneity], if there is one. With a
     limit also the share of the magnets that meet it. Writes tolerance.json, tolerance.html and its
     figures.
     """
-    from halbach_fe.api import tolerance
-    from halbach_fe.report.tolerance import page
-
     blocks = common.blocks_of(arguments.blocks)
     with common.session(arguments, magnet.study) as session:
-        return page(tolerance(
-            magnet, session, blocks, common.reference(arguments), arguments.draws,
-            arguments.limit_units, arguments.seed, arguments.limit_ppm))
+        return hf.tolerance(magnet, session, blocks, common.reference(arguments), arguments.draws,
+                            arguments.limit_units, arguments.seed, arguments.limit_ppm)
 
 
 @question(
     SOLVED,
-    option("blocks", type=input_file, metavar="BLOCKS",
-           help="table of measured blocks (CSV); ring and slot may be missing"),
+    option("blocks", input_file, "BLOCKS",
+           "table of measured blocks (CSV); ring and slot may be missing"),
     OBJECTIVE,
-    option("--turns", action="store_true",
-           help="turn blocks in their slots too, where shape and nominal magnetization allow it: "
-           "cubes about their magnetization"),
+    flag("--turns", "turn blocks in their slots too, where shape and nominal magnetization allow "
+         "it: cubes about their magnetization"),
     SEED)
-def sort(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+def sort(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Assign measured blocks to slots: for small multipoles, or a homogeneous field.
 
     It is a homogeneous field if the study has a table [homogeneity] with its region.
@@ -433,36 +394,31 @@ def sort(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     may have more blocks than there are slots. Writes blocks.sorted.csv, sort.json, sort.html and
     its figures.
     """
-    from halbach_fe.api import sort
     from halbach_fe.design.objective import check_objective
-    from halbach_fe.measurement.block_table import read_blocks
-    from halbach_fe.report.sorting import page
 
-    table = read_blocks(arguments.blocks)
+    table = hf.read_blocks(arguments.blocks)
     with common.session(arguments, magnet.study) as session, common.progress_bar("sorting") as show:
         check_objective(magnet, common.reference(arguments), arguments.limit_units,
                         arguments.limit_ppm)
-        found = sort(magnet, table, session, common.reference(arguments), arguments.seed, show,
-                     arguments.turns)
-    return page(replace(found, limit=arguments.limit_units or arguments.limit_ppm))
+        found = hf.sort(magnet, table, session, common.reference(arguments), arguments.seed, show,
+                        arguments.turns)
+    return replace(found, limit=arguments.limit_units or arguments.limit_ppm)
 
 
 @question(
     SOLVED, map_format("--measurements"), MAP, BLOCKS, OBJECTIVE,
-    option("--swaps", type=count, default=8, metavar="N",
-           help="largest number of swaps of two blocks (default: %(default)s)"),
-    option("--cycles", type=count, default=0, metavar="N",
-           help="largest number of cyclic exchanges of three blocks (default: %(default)s)"),
-    option("--turns", type=count, default=8, metavar="N",
-           help="largest number of blocks turned in their slots (default: %(default)s)"),
-    option("--replace", type=count, default=0, metavar="N",
-           help="largest number of blocks replaced by blocks of the stock, or without --stock by "
-           "new ones (default: %(default)s)"),
-    option("--stock", type=input_file, metavar="CSV",
-           help="table of measured blocks that may replace others: blocks that are not in the "
-           "magnet, without ring and slot"),
+    option("--swaps", count, "N", "largest number of swaps of two blocks (default: %(default)s)",
+           default=8),
+    option("--cycles", count, "N",
+           "largest number of cyclic exchanges of three blocks (default: %(default)s)", default=0),
+    option("--turns", count, "N",
+           "largest number of blocks turned in their slots (default: %(default)s)", default=8),
+    option("--replace", count, "N", "largest number of blocks replaced by blocks of the stock, or "
+           "without --stock by new ones (default: %(default)s)", default=0),
+    option("--stock", input_file, "CSV", "table of measured blocks that may replace others: blocks "
+           "that are not in the magnet, without ring and slot"),
     SEED)
-def shim(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+def shim(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Choose blocks to swap, turn or replace: for small multipoles, or a homogeneous field.
 
     It is a homogeneous field if the study has a table [homogeneity] with its region. The moves are
@@ -470,12 +426,9 @@ def shim(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     infer`. Writes shim.json, shim.html and its figures, and study.shimmed.toml, the study with the
     blocks in their new places.
     """
-    from halbach_fe.api import shim
     from halbach_fe.design.objective import check_objective
     from halbach_fe.design.shimming import check_shimming, check_stock
-    from halbach_fe.inference.infer import infer
     from halbach_fe.measurement.campaign import refuse_several_maps
-    from halbach_fe.report.shimming import page
 
     if arguments.stock and not arguments.replace:
         raise StudyError("Input --stock must go with --replace N, the number of blocks that may be "
@@ -490,32 +443,30 @@ def shim(magnet: Magnet, arguments: argparse.Namespace) -> Page:
     if stock:
         check_stock(magnet, stock, blocks.serial if blocks else None)
     with common.session(arguments, magnet.study) as session:
-        result = infer(magnet, data, session, blocks)
-        moves = shim(result, session, common.reference(arguments), arguments.swaps,
-                     arguments.turns, arguments.replace, arguments.limit_units, stock,
-                     arguments.seed, arguments.limit_ppm, arguments.cycles)
+        result = hf.infer(magnet, data, session, blocks)
+        moves = hf.shim(result, session, common.reference(arguments), arguments.swaps,
+                        arguments.turns, arguments.replace, arguments.limit_units, stock,
+                        arguments.seed, arguments.limit_ppm, arguments.cycles)
     if result.disagreement:
         say(f"warning: Model and measurement disagree. {result.disagreement}")
-    return page(moves)
+    return moves
 
 
 @question(
     SOLVED,
-    option("--posterior", type=input_file, metavar="H5", required=True,
-           help="posterior.h5 that halbach-fe infer wrote for this magnet"),
-    region)
-def shim_tray(magnet: Magnet, arguments: argparse.Namespace) -> Page:
+    option("--posterior", input_file, "H5",
+           "posterior.h5 that halbach-fe infer wrote for this magnet", required=True),
+    REGION)
+def shim_tray(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """Choose small magnets for the places of a shim tray so that the field becomes homogeneous.
 
     The tray and its inventory are [shim_tray] of the study; the magnet is the measured one, whose
     posterior halbach-fe infer wrote. Writes shim_tray.csv, the table to fill the tray from,
     shim_tray.json, shim_tray.html and its figures.
     """
-    from halbach_fe.design.shim_tray import shim_tray
     from halbach_fe.inference.storage import read_posterior
-    from halbach_fe.report.shim_tray import page
 
     within_it, stored = common.region_of(arguments), read_posterior(magnet, arguments.posterior)
     with common.session(arguments, magnet.study) as session:
-        return page(replace(shim_tray(magnet, session, stored["posterior"], within_it),
-                            disagreement=stored.disagreement))
+        return replace(hf.shim_tray(magnet, session, stored["posterior"], within_it),
+                       disagreement=stored.disagreement)

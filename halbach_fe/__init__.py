@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from halbach_fe.measurement.map_join import JoinedMaps as JoinedMaps
     from halbach_fe.measurement.map_join import join_maps as join_maps
     from halbach_fe.report.campaign_report import campaign_report as campaign_report
-    from halbach_fe.report.result_files import write_report as write_report
+    from halbach_fe.report.page import write_report as write_report
     from halbach_fe.response.discretization_error import Verification as Verification
     from halbach_fe.response.discretization_error import verify as verify
     from halbach_fe.response.field_on_lines import FieldOnLines as FieldOnLines
@@ -121,7 +121,7 @@ _HOME = {
     "design_rings": "design.ring_design", "Designed": "design.ring_design",
     "cad": "design.assembly", "Assembly": "design.assembly",
     "sort": "api", "tolerance": "api", "demagnetization": "api", "simulate_measurement": "api",
-    "write_report": "report.result_files", "campaign_report": "report.campaign_report",
+    "write_report": "report.page", "campaign_report": "report.campaign_report",
     "Study": "study.model", "Magnet": "geometry.magnet", "BlockTable": "measurement.block_table",
     "MapCheck": "measurement.map_check", "Solution": "response.solution",
     "InferenceResult": "inference.result", "Diagnosis": "diagnosis.result",

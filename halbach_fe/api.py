@@ -358,19 +358,19 @@ def diagnose(
     if time_limit_s is not None:
         check_number("time_limit_s", "diagnose", time_limit_s, 0)
     effect_by_name = {effect.name: effect for effect in catalogue()}
+    chosen: dict[str, Effect] = {}
     for effect in effects or ():
-        name = effect if isinstance(effect, str) else effect.name
-        if not isinstance(effect, str):
-            effect_by_name[name] = effect
-        elif name not in effect_by_name:
-            near = difflib.get_close_matches(name, effect_by_name, 1, 0.5)
-            raise StudyError(must_be("effects", "diagnose", "names of the catalogue", f"'{name}'",
+        if not isinstance(effect, str):  # which comes before that of the catalogue
+            chosen[effect.name] = effect
+        elif effect in effect_by_name:
+            chosen.setdefault(effect, effect_by_name[effect])
+        elif effect not in chosen:
+            near = difflib.get_close_matches(effect, effect_by_name, 1, 0.5)
+            raise StudyError(must_be("effects", "diagnose", "names of the catalogue", f"'{effect}'",
                                      f"Did you mean {near[0]}?" if near else ""))
-    chosen = (None if effects is None
-              else [effect_by_name[name] for name in dict.fromkeys(
-                  effect if isinstance(effect, str) else effect.name for effect in effects)])
-    return diagnosis_room.diagnose(magnet.study, data, session, blocks, chosen, validation_map, say,
-                                   floor_T=floor_T, time_limit_s=time_limit_s)
+    return diagnosis_room.diagnose(
+        magnet.study, data, session, blocks, None if effects is None else list(chosen.values()),
+        validation_map, say, floor_T=floor_T, time_limit_s=time_limit_s)
 
 
 @typed

@@ -1,7 +1,7 @@
 """Results that show their main figure in a notebook, and one line elsewhere.
 
 A result knows nothing of figures: the report room draws them. So the drawing is looked up by the
-type of the result when a notebook asks for it, in `halbach_fe.report.result_files`.
+type of the result when a notebook asks for it, in `halbach_fe.report.page`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import importlib
 from dataclasses import fields
 from typing import Any
 
-DRAWN_BY = "halbach_fe.report.result_files"
+DRAWN_BY = "halbach_fe.report.page"
 
 LONGEST = 60
 """Length of a text that a line of a result still shows."""

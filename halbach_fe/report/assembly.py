@@ -21,8 +21,18 @@ from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_te
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.prism import Prism, circle, upright
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import Page, Section, Table, csv_file, page_of, rendered
-from halbach_fe.report.words import counted
+from halbach_fe.report.page import (
+    Page,
+    Plain,
+    Rows,
+    Section,
+    Table,
+    attributes,
+    columns_by_axis,
+    csv_file,
+    rendered,
+)
+from halbach_fe.report.words import counted, in_a_row
 
 FLAT = 0.1
 """Part of a magnetization in the plane of a drawing below which it has no arrow."""
@@ -87,10 +97,8 @@ def height_mm(z: float) -> str:
 
 def _rings(blocks: Sequence[AssembledBlock]) -> str:
     """Return the rings of blocks in words."""
-    numbers = sorted({one.block.ring for one in blocks})
-    if len(numbers) == 1:
-        return f"ring {numbers[0]}"
-    return f"rings {', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
+    numbers = [str(ring) for ring in sorted({one.block.ring for one in blocks})]
+    return f"ring{'s' * (len(numbers) > 1)} {in_a_row(numbers)}"
 
 
 @dataclass(frozen=True)
@@ -150,7 +158,7 @@ class Drawing:
     engraved: str
     number: int | None
     reach: float
-    tables: list[list[dict[str, str]]]
+    tables: list[Rows]
 
 
 def drawing(
@@ -274,7 +282,7 @@ def _arrow(
     return float(start[0]), -float(start[1]), float(end[0]), -float(end[1])
 
 
-def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[list[dict[str, str]]]:
+def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[Rows]:
     """Return the rows of the tables under a drawing, side by side."""
     # Number of tables side by side under a drawing, and of rows from which there is another one.
     most_tables, shortest = 3, 8
@@ -460,7 +468,7 @@ def answer(assembly: Assembly) -> Answer:
                   "halbach-fe forces STUDY -o DIR")
 
 
-def _kind_rows(assembly: Assembly) -> list[dict[str, str]]:
+def _kind_rows(assembly: Assembly) -> Rows:
     """Return a row of text for every kind of blocks."""
     graded = any(kind.material for kind in assembly.kinds)
     ordered_as = assembly.ordered_as
@@ -476,7 +484,7 @@ def _kind_rows(assembly: Assembly) -> list[dict[str, str]]:
             for kind, first in zip(assembly.kinds, ordered_as, strict=True)]
 
 
-def _plate_rows(assembly: Assembly) -> list[dict[str, str]]:
+def _plate_rows(assembly: Assembly) -> Rows:
     """Return a row of text for every plate."""
     return [{"holder": str(plate.number), "files": f"{holder_name(plate)}.step, .stl",
              "to make": str(len(plate.heights_m)), "pockets": str(len(plate.blocks[0])),
@@ -515,21 +523,19 @@ def spacers(assembly: Assembly) -> str:
     return f"The spacers between neighbouring plates are {length}\u00a0mm long."
 
 
-def _summary(assembly: Assembly) -> dict[str, object]:
+def _summary(assembly: Assembly) -> Plain:
     """Return the content of assembly.json."""
     return {
         "study": assembly.magnet.name, "blocks": len(assembly.blocks),
         "left_over": assembly.left_over, "frame": FRAME, "unit_of_solids": "mm",
-        "kinds": [{"kind": kind.number, "shape": kind.shape, "magnetized": kind.magnetized,
-                   "remanence_T": kind.remanence_T, "material": kind.material,
-                   "count": kind.count} for kind in assembly.kinds],
+        "kinds": [{"kind": kind.number, **attributes(
+            kind, "shape", "magnetized", "remanence_T", "material", "count")}
+            for kind in assembly.kinds],
         "holder": assembly.holder.model_dump(mode="json"),
         "plates": [{"holder": plate.number, "file": f"{holder_name(plate)}.step",
                     "lower_faces_z_m": list(plate.heights_m), "pockets": len(plate.blocks[0]),
-                    "inner_radius_m": plate.inner_radius_m,
-                    "outer_radius_m": plate.outer_radius_m,
-                    "thickness_m": plate.thickness_m, "floor_m": plate.floor_m,
-                    "thinnest_wall_m": plate.wall_m}
+                    **attributes(plate, "inner_radius_m", "outer_radius_m", "thickness_m",
+                                 "floor_m"), "thinnest_wall_m": plate.wall_m}
                    for plate in assembly.plates],
         "without_holder": list(assembly.reasons), "files": solid_names(assembly)}
 
@@ -537,23 +543,20 @@ def _summary(assembly: Assembly) -> dict[str, object]:
 def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
     """Return the columns of assembly.csv, with a row for every block."""
     blocks = assembly.blocks
-    middle = np.array([one.block.middle for one in blocks])
-    direction = np.array([one.direction for one in blocks])
     return {
         "ring": [one.block.ring for one in blocks], "slot": [one.block.slot for one in blocks],
         "name": [one.block.name for one in blocks], "serial": [one.serial for one in blocks],
         "kind": [one.kind.number for one in blocks],
         "holder": [one.plate.number if one.plate else "" for one in blocks],
-        **{f"{axis}_m": middle[:, number] for number, axis in enumerate("xyz")},
+        **columns_by_axis("{}_m", np.array([one.block.middle for one in blocks])),
         "angle_deg": [one.angle_deg for one in blocks],
-        **{f"magnetization_{axis}": direction[:, number] for number, axis in enumerate("xyz")},
+        **columns_by_axis("magnetization_{}", np.array([one.direction for one in blocks])),
         "magnetization_angle_deg": [one.magnetization_angle_deg for one in blocks],
         "from_radius_deg": [one.from_radius_deg for one in blocks],
         "elevation_deg": [one.elevation_deg for one in blocks],
         "way_round": [one.way_round for one in blocks]}
 
 
-@page_of.register
 def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> Page:
     """Return the page of what is to be ordered and made; its files are the solids, too."""
     kinds, plates = _kind_rows(assembly), _plate_rows(assembly)

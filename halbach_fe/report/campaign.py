@@ -27,7 +27,6 @@ from halbach_fe.report.page import (
     Table,
     View,
     geometry_figure,
-    page_of,
     stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
@@ -67,14 +66,16 @@ def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, bloc
         + (" --held-out DIR/held-out.csv" if held_out is not None else "") + " -o DIR")
 
 
-@page_of.register
 def page(campaign: SimulatedCampaign) -> Page:
     """Return the page of a simulated campaign.
 
     Its files are in the units and along the axes that the study states, the page is in m and T.
     """
     study, blocks = campaign.study, len(campaign.blocks)
-    readings, held_out = _as_read(campaign)
+    readings, held_out = (  # in m and T, as whoever reads them gets them
+        None if data is None else by_stated_units(study.instrument, data)
+        for data in (campaign.readings, campaign.held_out))
+    assert readings is not None
     maps = {"map": readings} | ({} if held_out is None else {"held out": held_out})
     magnet, points = build_magnet(study), points_of(readings)
     magnitude = 1e3 * np.linalg.norm(list(_columns(study, readings).values()), axis=0)
@@ -83,7 +84,8 @@ def page(campaign: SimulatedCampaign) -> Page:
         "magnitude of the readings %{customdata:.5g} mT",
         (float(magnitude.min()), float(magnitude.max())))),
         "points of the map by the magnitude of the readings")
-    rows, secret = campaign_table(study, readings, held_out), readings.attrs["truth_sha256"]
+    rows = [_map_row(study, name, data) for name, data in maps.items()]
+    secret = readings.attrs["truth_sha256"]
     return Page(
         "simulate-measurement", "a simulated measurement campaign", study,
         answer(study, readings, held_out, blocks), {
@@ -110,21 +112,6 @@ def page(campaign: SimulatedCampaign) -> Page:
                 "points")},
         files=campaign_files(campaign), stored=False, stem="campaign",
         provenance={"source": "simulated", "SHA-256 of the truth": secret})
-
-
-def _as_read(campaign: SimulatedCampaign) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Return the map and the held-out one in m and T, as whoever reads them gets them."""
-    convert = partial(by_stated_units, campaign.study.instrument)
-    return (convert(campaign.readings),
-            None if campaign.held_out is None else convert(campaign.held_out))
-
-
-def campaign_table(
-    study: Study, readings: xr.Dataset, held_out: xr.Dataset | None
-) -> list[dict[str, str]]:
-    """Return a row of text for the map, and one for the held-out points if there are any."""
-    maps = {"map": readings} | ({} if held_out is None else {"held out": held_out})
-    return [_map_row(study, name, data) for name, data in maps.items()]
 
 
 def _map_row(study: Study, name: str, data: xr.Dataset) -> dict[str, str]:

@@ -30,7 +30,15 @@ from halbach_fe.report.campaign_folders import (
     read_chapters,
     versions,
 )
-from halbach_fe.report.page import geometry_figure, own_style, png_of, programs, rendered
+from halbach_fe.report.page import (
+    Plain,
+    Rows,
+    geometry_figure,
+    own_style,
+    png_of,
+    programs,
+    rendered,
+)
 from halbach_fe.report.words import counted, in_a_row, in_one_line, within_a_sentence
 from halbach_fe.study.model import Study
 
@@ -312,7 +320,7 @@ class Campaign:
             "Put right what was not assembled as designed, and measure again. Or, if it stays, "
             f"{repeat[0].lower()}{repeat[1:]}"))
 
-    def plain(self) -> dict[str, object]:
+    def plain(self) -> Plain:
         """Return the answers and what does not fit as plain data."""
         return {"study": self.study.name, "answer": asdict(self.answer), "doubts": self.doubts,
                 "versions": self.versions, "results": [
@@ -433,7 +441,7 @@ def _html(campaign: Campaign, path: Path) -> str:
 
 def _parts(
     campaign: Campaign, output: Path, lead: Picture | None = None
-) -> list[dict[str, object]]:
+) -> list[Plain]:
     """Return what the template shows of every page; the picture ``lead`` stands at the top."""
     most_rows = 40  # largest number of rows of a folded table. All of them are on its page
     pages = [(chapter, page) for chapter in campaign.chapters for page in chapter.pages]
@@ -480,7 +488,7 @@ def _date(ended: str) -> str:
         return "an unknown time"
 
 
-def _folder_rows(campaign: Campaign) -> list[dict[str, str]]:
+def _folder_rows(campaign: Campaign) -> Rows:
     """Return rows of text: which command wrote each folder, and when; with which programs, if
     these are not those of the page itself.
     """
@@ -491,7 +499,7 @@ def _folder_rows(campaign: Campaign) -> list[dict[str, str]]:
             for one, used in zip(campaign.chapters, of, strict=True)]
 
 
-def _input_rows(campaign: Campaign) -> list[dict[str, str]]:
+def _input_rows(campaign: Campaign) -> Rows:
     """Return rows of text: which files the commands read, and which of them wrote these."""
     short_digest = 16  # digits of SHA-256 that the page shows
     rows: dict[str, dict[str, str]] = {}

@@ -24,6 +24,8 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
@@ -32,7 +34,6 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.words import place_of
 from halbach_fe.study.model import is_nonlinear
@@ -47,7 +48,7 @@ AT_ROOM = "It loses magnetization at room temperature already."
 """Sentence about a magnet that does not keep its magnetization there."""
 
 
-def demagnetization_summary(found: DemagnetizationMap) -> dict[str, object]:
+def demagnetization_summary(found: DemagnetizationMap) -> Plain:
     """Return the content of demagnetization.json: margins, shares and limit temperatures."""
     material, worst = found.material, int(np.argmin(found.margin))
     block = found.blocks[found.cells.block[worst]]
@@ -196,7 +197,6 @@ def _limit_in_words(found: DemagnetizationMap, share: float) -> str:
     return f"{part} never passes the knee" if share else "no cell ever passes the knee"
 
 
-@page_of.register
 def page(found: DemagnetizationMap) -> Page:
     """Return the page of the margins of the blocks."""
     summary, blocks, material = demagnetization_summary(found), found.by_block(), found.material
@@ -245,7 +245,7 @@ def page(found: DemagnetizationMap) -> Page:
 _SCALED = ". At other temperatures the field of the iron is scaled with the remanence"
 
 
-def _worst_block_table(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+def _worst_block_table(rows: list[dict[str, Any]]) -> Rows:
     """Return the rows of the few blocks with the smallest margins, as text."""
     worst_rows = 12  # number of blocks in the page's table
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),

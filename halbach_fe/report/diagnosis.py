@@ -40,7 +40,7 @@ from halbach_fe.report.diagnosis_answer import (
 )
 from halbach_fe.report.diagnosis_figures import states
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.page import Drawn, Page, Section, Table, View, page_of
+from halbach_fe.report.page import Drawn, Page, Rows, Section, Table, View
 from halbach_fe.report.words import (
     BAYES_FACTOR_IN_WORDS,
     bayes_factor,
@@ -77,7 +77,7 @@ SCATTERED = ("Measured less predicted over the map, before and after the diagnos
 """Caption of the profile of points that lie on no line or circle."""
 
 
-def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
+def found_table(diagnosis: Diagnosis) -> Rows:
     """Return the rows of a table of all findings, as text."""
     titles = catalogue_titles(diagnosis)
     found = [{"effect": finding.title, "place": finding.place, "amplitude": finding.amount,
@@ -93,7 +93,7 @@ def found_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
         for effect in diagnosis.identified]
 
 
-def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
+def change_table(diagnosis: Diagnosis) -> Rows:
     """Return the rows of a table of the model's fit before and after the diagnosis, as text."""
     found = [region_scores(state.update, state.loo_residuals) for state in states(diagnosis)]
     rows = []
@@ -106,7 +106,7 @@ def change_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
     return rows
 
 
-def residual_table(diagnosis: Diagnosis) -> list[dict[str, str]]:
+def residual_table(diagnosis: Diagnosis) -> Rows:
     """Return the rows of a table of rms differences of model and readings by component, as text.
 
     Training readings have been fitted, held-out readings have not.
@@ -136,7 +136,6 @@ def _floor(diagnosis: Diagnosis, region: str, component: str) -> float:
     return float("nan") if own is None else float(own)
 
 
-@page_of.register
 def page(
     diagnosis: Diagnosis, separations: Sequence[Separation] = (), study: Study | None = None,
 ) -> Page:

@@ -29,11 +29,17 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     SMALL,
+    Rows,
+    draw_by_slot,
     figure_of,
     legend_above,
 )
-from halbach_fe.report.point_maps import unit_for
-from halbach_fe.report.prediction import FEWEST_ON_A_LINE, axis_of_readings, residual_maps_figure
+from halbach_fe.report.point_maps import (
+    FEWEST_ON_A_LINE,
+    axis_of_readings,
+    residual_maps_figure,
+    unit_for,
+)
 
 NONE, UNKNOWN, OUTSIDE = "none", "unknown", "outside the catalogue"
 """Names of the probabilities that nothing is missing, and an unlisted cause, and that in words."""
@@ -88,7 +94,11 @@ def groups(diagnosis: Diagnosis) -> Figure:
     kinds = [group.kind for group in diagnosis.groups_before]
     sizes = {kind: kinds.count(kind) for kind in kinds}
     if not sizes:
-        return _empty("too few readings to group them")
+        figure = figure_of(1)
+        axis = figure.subplots()
+        axis.text(0.5, 0.5, "too few readings to group them", ha="center", transform=axis.transAxes)
+        axis.set_axis_off()
+        return figure
     first, *others = sorted(sizes, key=lambda kind: -sizes[kind])
     tallest = max(sizes[first], sum(sizes[kind] + 1.5 for kind in others))
     figure = figure_of(1.1 + 0.21 * tallest)
@@ -121,8 +131,7 @@ def groups(diagnosis: Diagnosis) -> Figure:
             axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set_xlim(*limits)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2,
-                  frameon=False)
+    legend_above(figure, axes[0])
     for axis in (axes[0], axes[-1]):
         axis.set_xlabel("chi² per reading (1 expected)")
     return figure
@@ -421,15 +430,13 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
     """Draw posterior less prior mean of every block's magnetization by ring and slot."""
     shown = states(diagnosis)
     found = [_deviations(state.update) for state in shown]
-    rings, slots = next(iter(found[0].values())).shape
+    rings = len(next(iter(found[0].values())))
     figure = figure_of(1.0 + len(found[0]) * (1.0 + 0.14 * min(rings, 40)))
     axes = figure.subplots(len(found[0]), len(shown), sharex=True, sharey=True, squeeze=False)
     for row, name in zip(axes, found[0], strict=True):
         limit = max(float(np.nanmax(np.abs(deviations[name]))) for deviations in found) or 1.0
         for axis, deviations in zip(row, found, strict=True):
-            axis.imshow(deviations[name], cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
-                        origin="lower",
-                        extent=(0.5, slots + 0.5, 0.5, rings + 0.5))
+            draw_by_slot(axis, deviations[name], cmap="RdBu_r", vmin=-limit, vmax=limit)
             axis.set_yticks(range(1, rings + 1, max(1, rings // 6)))
         figure.colorbar(_colours(limit), ax=list(row), label=name.replace(" in", "\nin"))
         row[0].set_ylabel("ring")
@@ -440,7 +447,7 @@ def magnetizations(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
+def structure(diagnosis: Diagnosis) -> Rows:
     """Return the rows of a table of rms changes of the magnetizations, and their prior."""
     found = [(state.when, _deviations(state.update)) for state in states(diagnosis)]
     prior = _parts(diagnosis.before, np.asarray(diagnosis.before.prior.root))
@@ -450,10 +457,3 @@ def structure(diagnosis: Diagnosis) -> list[dict[str, str]]:
         for name, values in prior.items()]
 
 
-def _empty(text: str) -> Figure:
-    """Return a figure that shows a text only."""
-    figure = figure_of(1)
-    axis = figure.subplots()
-    axis.text(0.5, 0.5, text, ha="center", transform=axis.transAxes)
-    axis.set_axis_off()
-    return figure

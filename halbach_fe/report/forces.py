@@ -22,11 +22,13 @@ from halbach_fe.report.page import (
     PRIOR,
     SMALL,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
+    columns_by_axis,
     csv_file,
     figure_of,
-    page_of,
 )
 from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_error
 from halbach_fe.study.types import COMPONENTS
@@ -161,7 +163,7 @@ def direction_in_words(block: MagnetBlock, vector: Floats) -> str:
     return f"{text} {_numbers(unit)}"
 
 
-def _rows(found: Forces) -> list[dict[str, str]]:
+def _rows(found: Forces) -> Rows:
     """Return a row of text for each of the largest forces in place."""
     rows = []
     for number in np.argsort(-found.in_place.magnitude, kind="stable")[:LISTED]:
@@ -178,7 +180,7 @@ def _rows(found: Forces) -> list[dict[str, str]]:
     return rows
 
 
-def _iron_rows(found: Forces) -> list[dict[str, str]]:
+def _iron_rows(found: Forces) -> Rows:
     """Return a row of text for the force on each body of iron."""
     if found.iron is None:
         return []
@@ -205,9 +207,9 @@ def _on_iron(found: Forces) -> list[Section]:
         "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron")]
 
 
-def _summary(found: Forces) -> dict[str, object]:
+def _summary(found: Forces) -> Plain:
     """Return the content of forces.json."""
-    def largest(loads: Loads) -> dict[str, object]:
+    def largest(loads: Loads) -> Plain:
         number = int(np.argmax(loads.magnitude))
         return {"block": found.blocks[number].name, "size_N": float(loads.magnitude[number]),
                 "error_N": float(loads.error_N[number]),
@@ -234,12 +236,10 @@ def _columns(found: Forces) -> dict[str, Iterable[object]]:
         "slot": [block.slot for block in found.blocks], "step": found.step,
         "mass_kg": found.mass_kg}
     for prefix, loads in (("", found.in_place), ("inserted_", found.inserted)):
-        for number, name in enumerate(COMPONENTS):
-            columns[f"{prefix}F{name}_N"] = loads.force_N[:, number]
-        columns[f"{prefix}error_N"] = loads.error_N
-        for number, name in enumerate(COMPONENTS):
-            columns[f"{prefix}T{name}_Nm"] = loads.torque_Nm[:, number]
-        columns[f"{prefix}error_Nm"] = loads.error_Nm
+        columns |= {**columns_by_axis(f"{prefix}F{{}}_N", loads.force_N),
+                    f"{prefix}error_N": loads.error_N,
+                    **columns_by_axis(f"{prefix}T{{}}_Nm", loads.torque_Nm),
+                    f"{prefix}error_Nm": loads.error_Nm}
     return columns
 
 
@@ -321,7 +321,6 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
              ylim=(-reach, reach), title=f"ring {found.blocks[chosen[0]].ring}")
 
 
-@page_of.register
 def page(found: Forces) -> Page:
     """Return the page of the forces on the blocks."""
     iron, rows = bool(found.magnet.iron), _rows(found)

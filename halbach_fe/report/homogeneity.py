@@ -1,17 +1,21 @@
-"""Table, figures and page of the homogeneity of a field."""
+"""Tables, figures and page of the homogeneity of a field, and what pages say of the field
+outside of the magnet.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -23,18 +27,21 @@ from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
     POSTERIOR,
     PUBLISHED,
+    SECOND,
     SMALL,
     Drawn,
+    Figures,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     csv_file,
     figure_of,
-    page_of,
 )
-from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import decimals, flux_density, ppm, with_error
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
+from halbach_fe.response.stray_field import NEAREST, StrayField
 from halbach_fe.study.model import Study
 
 CONVENTION = (
@@ -94,27 +101,19 @@ def answer(found: HomogeneityResult) -> Answer:
                ("rms deviation", f"{ppm(best.rms_ppm)}\u00a0ppm"))
     if name != "prior" and found.disagreement:
         return of_a_conflict(question, f"{text}.", found.disagreement)
-    better: tuple[str, str] | None = None
+    step = ("If that is too much, put [shim_tray] into the study and fill the tray with small "
+            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR")
+    reason = agreement(found.disagreement)
+    if name == "prior":
+        step = ("Measure it, and update its blocks with the map; then ask again with --posterior "
+                "and the posterior.h5 that this command writes into its DIR:",
+                "halbach-fe infer STUDY --measurements MAP -o DIR")
+        text += (f". Of magnets whose blocks vary as the study says, half have more than {middle} "
+                 f"ppm rms, and 95 % have {low} to {high} ppm")
+        reason = "Yes, as far as the study's tolerances are right: it is no measured magnet."
     if best.rms_ppm > too_large_for_a_tray:
-        better = _better_design(found.magnet.study, best.rms_ppm)
-    if name != "prior" and better:
-        return Answer(question, f"{text}.", f"{agreement(found.disagreement)} {trust}", *better,
-                      small, numbers=numbers)
-    if name != "prior":
-        return Answer(
-            question, f"{text}.",
-            f"{agreement(found.disagreement)} {trust}",
-            "If that is too much, put [shim_tray] into the study and fill the tray with small "
-            "magnets.", "halbach-fe shim-tray STUDY --posterior POSTERIOR -o DIR", small,
-            numbers=numbers)
-    measure = ("Measure it, and update its blocks with the map; then ask again with --posterior "
-               "and the posterior.h5 that this command writes into its DIR:",
-               "halbach-fe infer STUDY --measurements MAP -o DIR")
-    return Answer(
-        question, f"{text}. Of magnets whose blocks vary as the study "
-        f"says, half have more than {middle} ppm rms, and 95 % have {low} to {high} ppm.",
-        f"Yes, as far as the study's tolerances are right: it is no measured magnet. {trust}",
-        *(better or measure), small, numbers=numbers)
+        step = _better_design(found.magnet.study, best.rms_ppm)
+    return Answer(question, f"{text}.", f"{reason} {trust}", *step, small, numbers=numbers)
 
 
 def _better_design(study: Study, rms_ppm: float) -> tuple[str, str]:
@@ -193,7 +192,7 @@ def _cancels(known: Homogeneity) -> bool:
     return known.direction_sd_rad > no_direction_rad
 
 
-def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]:
+def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> Rows:
     """Return a row of text per distribution of the magnetizations."""
     rows = []
     for name, known in by_name.items():
@@ -212,7 +211,7 @@ def homogeneity_rows(by_name: Mapping[str, Homogeneity]) -> list[dict[str, str]]
     return rows
 
 
-def harmonic_rows(found: HomogeneityResult) -> list[dict[str, str]]:
+def harmonic_rows(found: HomogeneityResult) -> Rows:
     """Return a row of text for each of the largest harmonics; none if B has no direction."""
     names = list(found.by_name)
     best = () if _cancels(found.by_name[names[-1]]) else found.by_name[names[-1]].harmonics
@@ -241,12 +240,12 @@ def _ppm_with_sd(value: float, sd: float) -> str:
     return f"{sign}{rounded} ± {spread}"
 
 
-def plain_homogeneity(known: Homogeneity) -> dict[str, object]:
+def plain_homogeneity(known: Homogeneity) -> Plain:
     """Return a homogeneity as plain data for JSON."""
     return asdict(known) | {"direction": known.direction.tolist()}
 
 
-def homogeneity_summary(found: HomogeneityResult) -> dict[str, object]:
+def homogeneity_summary(found: HomogeneityResult) -> Plain:
     """Return the content of homogeneity.json."""
     return {
         "study": found.magnet.name, "region": asdict(found.model.region),
@@ -329,7 +328,6 @@ def harmonics_figure(known: Homogeneity) -> Figure:
     return figure
 
 
-@page_of.register
 def page(found: HomogeneityResult) -> Page:
     """Return the page of the homogeneity of a magnet's field."""
     name, best = list(found.by_name.items())[-1]
@@ -366,3 +364,119 @@ def page(found: HomogeneityResult) -> Page:
         {f"The field in {region}": rows, "Spherical harmonics in ppm of the mean field": harmonics,
          "Outside of the magnet": stray_rows(found.stray_field)},
         figures={**figures, **stray_pictures(found.stray_field)}, files=files)
+
+
+STRAY_FIGURE = "stray_field.png"
+
+
+def line_name(stray: StrayField) -> str:
+    """Return the name of the line at which |B| falls to the limit."""
+    return f"{decimals(1e3 * stray.limit_T)}\u00a0mT line"
+
+
+def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Section]:
+    """Return the section of a page about the field outside; none if there is nothing to say.
+
+    ``drawn`` tells whether the figure of `stray_pictures` is in it.
+    """
+    if stray is None:
+        return []
+    said = stray.unknown or (
+        f"The largest distances at which |B| reaches {decimals(1e3 * stray.limit_T)}\u00a0mT, the "
+        "usual limit of access to rooms of MRI magnets. The field is that of the magnet alone, "
+        "without shields or external fields." + ("" if not any(
+            reach.sd_m for reach in (stray.radial, stray.axial) if reach) else
+        " Without ± the standard deviation is below 0.5 mm."))
+    rows = stray_rows(stray)
+    return [Section([said, Table(rows), *([Drawn(STRAY_FIGURE)] if drawn and rows else [])],
+                    f"Outside of the magnet: the {line_name(stray)}")]
+
+
+def stray_rows(stray: StrayField | None) -> Rows:
+    """Return a row of text for the sides of the magnet and one for its ends; none if unknown."""
+    if stray is None or stray.unknown:
+        return []
+    rows = []
+    for name, whence, own, reach in (
+            ("beside the magnet", "the z axis", stray.radius_m, stray.radial),
+            ("beyond its ends", "the plane z = 0", stray.half_length_m, stray.axial)):
+        if reach is None:
+            near = 1e3 * NEAREST * stray.radius_m
+            rows.append({
+                line_name(stray): name, "farthest": f"less than {1e3 * own + near:.3g}\u00a0mm",
+                "from": whence, "from the magnet": f"less than {near:.2g}\u00a0mm", "at": ""})
+            continue
+        place = ", ".join(f"{1e3 * one:.0f}" for one in np.round(reach.at_m, 3) + 0.0)
+        rows.append({
+            line_name(stray): name, "farthest": f"{distance_text(reach.distance_m, reach.sd_m)}",
+            "from": whence, "from the magnet": f"{1e3 * (reach.distance_m - own):.0f}\u00a0mm",
+            "at": f"({place}) mm"})
+    return rows
+
+
+def distance_text(distance_m: float, sd_m: float) -> str:
+    """Return a distance in mm, with its standard deviation if it is 0.5 mm or more."""
+    text = with_error(round(1e3 * distance_m), 1e3 * sd_m) if sd_m >= 5e-4 else (
+        f"{1e3 * distance_m:.0f}")
+    return f"{text}\u00a0mm"
+
+
+def stray_pictures(stray: StrayField | None) -> Figures:
+    """Return figure and caption of the field outside by file name; none if it is unknown."""
+    if stray is None or stray.unknown:
+        return {}
+    return {STRAY_FIGURE: (partial(stray_figure, stray), (
+        f"|B| outside of the magnet in planes through its middle, in mT. Thick: the "
+        f"{line_name(stray)}; dashed: the largest distances"))}
+
+
+def stray_figure(stray: StrayField) -> Figure:
+    """Draw lines of equal |B| around the magnet in three planes, in mm and mT."""
+    others_t = (1e-4, 2e-4, 1e-3, 5e-3, 2e-2)  # flux densities of the thinner lines of the figure
+    figure = figure_of(6.6)
+    axes = figure.subplots(2, 2).ravel()
+    radius, half = 1e3 * stray.radius_m, 1e3 * stray.half_length_m
+    reached = [reach.distance_m for reach in (stray.radial, stray.axial) if reach]
+    # half width of the figure's planes, relative to the largest distance of the line
+    around = 1.15
+    widest = 1e3 * (around * max(reached) if reached else max(
+        float(np.abs(plane.first_m).max()) for plane in stray.planes))
+    for axis, plane in zip(axes[:-1], stray.planes, strict=True):
+        names = [name for name in "xyz" if name != plane.across]
+        first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
+        size = np.log(np.maximum(plane.size_T, min(*others_t, stray.limit_T) / 10))  # may be 0
+        sides = [1e3 * reach.distance_m if reach else 0.0 for reach in (stray.radial, stray.axial)]
+        looks: tuple[dict[str, Any], ...] = (
+            {"color": "#cccccc", "lw": 0}, {"fill": False, "ls": "--", "lw": 0.8, "color": SECOND})
+        for (out, up), look in zip(((radius, half), sides), looks, strict=True):
+            if out and plane.across == "z":
+                axis.add_patch(Circle((0, 0), out, **look))
+            elif out and up:
+                axis.add_patch(Rectangle((-out, -up), 2 * out, 2 * up, **look))
+        low, high = float(plane.size_T.min()), float(plane.size_T.max())
+        thin = [value for value in others_t if low < value < high and value != stray.limit_T]
+        if thin:
+            lines = axis.contour(first, second, size, np.log(thin), colors="#777777",
+                                 linewidths=0.6, linestyles="solid")
+            axis.clabel(lines, fmt=lambda level: decimals(1e3 * float(np.exp(level)), 2),
+                        fontsize=SMALL)
+        if low < stray.limit_T < high:
+            axis.contour(first, second, size, [np.log(stray.limit_T)], colors=POSTERIOR,
+                         linewidths=2, linestyles="solid")
+        axis.set(aspect="equal", xlabel=f"{names[0]} in mm", ylabel=f"{names[1]} in mm",
+                 xlim=(-widest, widest), ylim=(-widest, widest))
+        axis.grid(alpha=0.3)
+    _explain(axes[-1], stray)
+    return figure
+
+
+def _explain(axis: Axes, stray: StrayField) -> None:
+    """Say in an empty panel what is drawn in the others."""
+    axis.set_axis_off()
+    shown = [Patch(color="#cccccc", label="cylinder around the magnet"),
+             Line2D([], [], color=POSTERIOR, lw=2, label=line_name(stray)),
+             Line2D([], [], color="#777777", lw=0.6, label="other |B|, in mT")]
+    if stray.radial:
+        shown.append(Line2D([], [], color=SECOND, lw=0.8, ls="--",
+                            label="largest distances of\nthat line from the middle"))
+    axis.legend(handles=shown, loc="center", frameon=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,7 +15,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
-from halbach_fe.report.inference_answer import answer
+from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
+from halbach_fe.report.inference_answer import answer, easy_axes
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
 from halbach_fe.report.page import (
@@ -27,14 +29,17 @@ from halbach_fe.report.page import (
     Drawn,
     Figures,
     Page,
+    Rows,
     Section,
     Table,
     Text,
     View,
+    draw_by_slot,
     figure_of,
-    page_of,
+    legend_above,
+    magnet_panels,
 )
-from halbach_fe.report.prediction import (
+from halbach_fe.report.point_maps import (
     has_profile,
     has_residual_maps,
     prediction_profile_figure,
@@ -42,14 +47,15 @@ from halbach_fe.report.prediction import (
     standardized_residuals_figure,
     whitened_quantiles_figure,
 )
-from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import (
     decimals,
     flux_density,
+    listed,
     magnet_rows,
     place_of,
     ppm,
     relative,
+    rms,
     with_error,
 )
 from halbach_fe.response.homogeneity import PPM
@@ -67,7 +73,7 @@ UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3)}
 COLOURS = (POSTERIOR, SECOND, MEASURED, PUBLISHED, PRIOR)
 
 
-def term_table(result: InferenceResult) -> list[dict[str, str]]:
+def term_table(result: InferenceResult) -> Rows:
     """Return rows of text: what the update says about the instruments, and about uncertain
     amplitudes; none if all are known.
     """
@@ -85,7 +91,7 @@ def term_table(result: InferenceResult) -> list[dict[str, str]]:
     return rows
 
 
-def pose_table(result: InferenceResult) -> list[dict[str, str]]:
+def pose_table(result: InferenceResult) -> Rows:
     """Return rows of text: where the middles of the maps lie; none if that was known before."""
     return [{"map": pose.name} | {
         f"{axis} of its middle": f"{1e3 * value:.3f} ± {1e3 * sd:.3f} mm"
@@ -94,7 +100,7 @@ def pose_table(result: InferenceResult) -> list[dict[str, str]]:
         + " mrad"} for pose in (result.terms.poses if result.terms else ())]
 
 
-def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
+def overlap_table(result: InferenceResult) -> Rows:
     """Return rows of text: how maps agree where they overlap; none if they do not."""
     return [{
         "map": each.name, "as predicted by map": each.by,
@@ -104,7 +110,7 @@ def overlap_table(result: InferenceResult) -> list[dict[str, str]]:
         for each in result.overlaps]
 
 
-def left_out_table(result: InferenceResult) -> list[dict[str, str]]:
+def left_out_table(result: InferenceResult) -> Rows:
     """Return rows of text: how maps, or ends of the only one, are predicted that were left out."""
     return [{
         "left out": each.name or "ends of the map", "readings": str(each.readings),
@@ -113,7 +119,7 @@ def left_out_table(result: InferenceResult) -> list[dict[str, str]]:
         "chi²/reading": decimals(each.chi2)} for each in result.regions_left_out]
 
 
-def stretch_table(result: InferenceResult) -> list[dict[str, str]]:
+def stretch_table(result: InferenceResult) -> Rows:
     """Return rows of text: the same along what was left out."""
     return [{
         "left out": each.name or "ends of the map", "in the magnet": one.where,
@@ -124,49 +130,36 @@ def stretch_table(result: InferenceResult) -> list[dict[str, str]]:
 
 def maps_figure(result: InferenceResult) -> Figure:
     """Draw where the maps lie in the magnet."""
-    figure = figure_of(3.6)
-    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    figure, along, across = magnet_panels("distance from the axis in mm")
     places, maps = 1e3 * result.observation.places, np.array(result.maps)
     for number, name in enumerate(dict.fromkeys(result.maps)):
         mine = maps == name
-        style = {"ls": "none", "marker": ".ox+d"[number % 5], "mfc": "none",
-                 "ms": 2 if number == 0 else 4, "color": COLOURS[number % len(COLOURS)]}
+        style: dict[str, Any] = {"ls": "none", "marker": ".ox+d"[number % 5], "mfc": "none",
+                                 "ms": 2 if number == 0 else 4,
+                                 "color": COLOURS[number % len(COLOURS)]}
         along.plot(places[mine, 2], np.hypot(*places[mine, :2].T), label=name, **style)
         across.plot(places[mine, 0], places[mine, 1], **style)
-    along.set_xlabel("z in the magnet in mm")
-    along.set_ylabel("distance from the axis in mm")
-    figure.legend(*along.get_legend_handles_labels(), loc="outside upper center", ncols=4,
-                  frameon=False, markerscale=3)
-    across.set_aspect("equal", adjustable="datalim")
-    across.set_xlabel("x in the magnet in mm")
-    across.set_ylabel("y in the magnet in mm")
-    for axis in (along, across):
-        axis.grid(alpha=0.3)
+    legend_above(figure, along, columns=4, markerscale=3)
     return figure
 
 
 UNDEFINED = "not defined"
 
 
-def axis_rows(axis: MagneticAxis | None) -> list[dict[str, str]]:
+def axis_rows(axis: MagneticAxis | None) -> Rows:
     """Return a row of text for each of centre, slope of the axis, and roll; none without axis."""
     if axis is None:
         return []
-    rows = []
-    if axis.centre_m is None or axis.centre_sd_m is None:
-        rows.append({"of the updated magnet": "magnetic centre", "value": UNDEFINED})
-    else:
-        for name, value, sd in zip("xyz", axis.centre_m, axis.centre_sd_m, strict=False):
-            rows.append({"of the updated magnet": f"magnetic centre, {name}",
-                         "value": f"{with_error(1e3 * value, 1e3 * sd)}\u00a0mm"})
-    if axis.slope_rad is not None and axis.slope_sd_rad is not None:
-        for name, value, sd in zip("xy", axis.slope_rad, axis.slope_sd_rad, strict=True):
-            rows.append({"of the updated magnet": f"magnetic axis, d{name}/dz",
-                         "value": f"{with_error(1e3 * value, 1e3 * sd)}\u00a0mrad"})
+    found = {} if axis.centre_m is not None else {"magnetic centre": UNDEFINED}
     where = "" if axis.slope_rad is None else ", mean of the middle half"
-    rows.append({"of the updated magnet": f"roll about z{where}",
-                 "value": f"{with_error(1e3 * axis.roll_rad, 1e3 * axis.roll_sd_rad)}\u00a0mrad"})
-    return rows
+    for what, unit, names, values, bars in (
+            ("magnetic centre, {}", "mm", "xyz", axis.centre_m, axis.centre_sd_m),
+            ("magnetic axis, d{}/dz", "mrad", "xy", axis.slope_rad, axis.slope_sd_rad),
+            (f"roll about z{where}", "mrad", "z", [axis.roll_rad], [axis.roll_sd_rad])):
+        if values is not None and bars is not None:
+            found |= {what.format(name): f"{with_error(1e3 * value, 1e3 * sd)}\u00a0{unit}"
+                      for name, value, sd in zip(names, values, bars, strict=False)}
+    return [{"of the updated magnet": what, "value": value} for what, value in found.items()]
 
 
 def definition(axis: MagneticAxis) -> str:
@@ -207,7 +200,7 @@ ALIKE = 0.03
 """Range of the contractions of all blocks up to which they are said instead of drawn."""
 
 
-def score_table(result: InferenceResult) -> list[dict[str, str]]:
+def score_table(result: InferenceResult) -> Rows:
     """Return the rows, as text, of the table that compares predictions before and after.
 
     Regions have names if there are several. Before the update, chi² is that of all training
@@ -234,8 +227,7 @@ def score_table(result: InferenceResult) -> list[dict[str, str]]:
         }
         rows.append(row)
     if not alone:
-        off = [flux_density(float(np.sqrt(np.mean(
-            (result.readings - each.mean)[training] ** 2))), zeros=True)
+        off = [flux_density(rms((result.readings - each.mean)[training]), zeros=True)
                for each in (result.prediction_prior, result.prediction_posterior)]
         together = {"region": "together", "readings": f"{training.sum()} {TRAINING}".replace(
             " ", "\u00a0"), "before, rms": off[0], "after, rms": off[1],
@@ -250,17 +242,14 @@ def _chi2(value: float | None) -> str:
     return NOTHING if value is None else decimals(value)
 
 
-def block_table(result: InferenceResult) -> list[dict[str, str]]:
+def block_table(result: InferenceResult) -> Rows:
     """Return rows of text: the blocks that deviate most, the one that is least likely first.
 
     That is by the change of the magnetization along and across the easy axis, each in standard
     deviations of its prior.
     """
     ranked = 8  # number of the blocks that a page lists: those that deviate most
-    nominal = result.by_block(result.response.nominal)
-    size = np.linalg.norm(nominal, axis=1)
-    there = np.flatnonzero(size)  # without the places of missing blocks
-    axes = nominal[there] / size[there, None]
+    there, axes, size = easy_axes(result)
     change = result.by_block(result.posterior.mean - result.response.nominal)[there]
     along = np.einsum("ij,ij->i", change, axes)
     across = np.linalg.norm(change - along[:, None] * axes, axis=1)
@@ -270,9 +259,9 @@ def block_table(result: InferenceResult) -> list[dict[str, str]]:
     directions = np.zeros((len(chosen), len(result.posterior.mean)))
     for row, one in zip(directions, chosen, strict=True):
         result.by_block(row)[there[one]] = axes[one]
-    of, sds = 100 / size[there[chosen]], result.posterior.sd_of(directions)
+    of, sds = 100 / size[chosen], result.posterior.sd_of(directions)
     alone = _by_readings(result, directions, of)
-    turns = np.degrees(np.arctan2(across, size[there] + along))[chosen].tolist()
+    turns = np.degrees(np.arctan2(across, size + along))[chosen].tolist()
     return [{
         "block": place_of(result.magnet.blocks[there[one]]),
         "along the easy axis": f"{with_error(of[row] * along[one], of[row] * sds[row])}\u00a0%",
@@ -295,7 +284,6 @@ def _by_readings(result: InferenceResult, directions: Floats, of: Floats) -> lis
             for value, bar in zip(mean.tolist(), (of * sd).tolist(), strict=True)]
 
 
-@page_of.register
 def page(result: InferenceResult) -> Page:
     """Return the page of an updated magnet."""
     known = distributions_of(result.magnet, result)
@@ -456,7 +444,7 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
         Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]
 
 
-def _model_table(result: InferenceResult) -> list[dict[str, str]]:
+def _model_table(result: InferenceResult) -> Rows:
     """Return rows of text: how the update was made, and of what magnet."""
     study, noise = result.study, result.noise
     sizes = dict.fromkeys(flux_density(float(end), 2) for end in (noise.sd.min(), noise.sd.max()))
@@ -464,19 +452,19 @@ def _model_table(result: InferenceResult) -> list[dict[str, str]]:
     moved = "" if not positions else (
         f"; sd of positions {', '.join(f'{1e3 * sd:.3g}' for sd in positions)} mm")
     blocks = result.measured_blocks
-    return [{"quantity": name, "value": value} for name, value in (
-        ("method of inference", result.kind), *magnet_rows(result.magnet),
-        ("finite-element method", study.solver.method),
-        ("unknown magnetizations, readings",
-         f"{len(result.response.parameters)}, {len(result.readings)}"),
-        ("prior", "the study's" if blocks is None else f"{len(blocks)} measured blocks"),
-        ("contraction of the blocks", _contraction_in_words(result, _contraction(result))),
-        ("noise of the readings", f"{' to '.join(sizes)}, "
-         f"{'independent' if noise.independent else 'correlated'}{moved}"),
-        ("error of the finite elements", _solver_error(result)),
-        ("superposition of the blocks",
-         f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what permeable "
-         "blocks and iron add to their fields"))]
+    return listed({
+        "method of inference": result.kind, **magnet_rows(result.magnet),
+        "finite-element method": study.solver.method,
+        "unknown magnetizations, readings":
+            f"{len(result.response.parameters)}, {len(result.readings)}",
+        "prior": "the study's" if blocks is None else f"{len(blocks)} measured blocks",
+        "contraction of the blocks": _contraction_in_words(result, _contraction(result)),
+        "noise of the readings": f"{' to '.join(sizes)}, "
+        f"{'independent' if noise.independent else 'correlated'}{moved}",
+        "error of the finite elements": _solver_error(result),
+        "superposition of the blocks":
+            f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what "
+            "permeable blocks and iron add to their fields"})
 
 
 def _contraction(result: InferenceResult) -> Floats:
@@ -515,14 +503,10 @@ def _magnetization_change_figure(result: InferenceResult) -> Figure:
     figure = figure_of(_figure_height(rings))
     axis = figure.subplots()
     limit = float(np.nanmax(np.abs(picture), initial=0.0)) or 1.0
-    image = axis.imshow(picture, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto",
-                        origin="lower",
-                        extent=(0.5, slots + 0.5, 0.5, rings + 0.5))
+    image = draw_by_slot(axis, picture, cmap="RdBu_r", vmin=-limit, vmax=limit)
     axis.add_patch(Rectangle((0.5, 0.5), slots, rings, fill=False))
-    axis.set_xlabel("slot")
-    axis.set_ylabel("ring")
-    axis.set_xticks(range(1, slots + 1, max(1, slots // 24)))
-    axis.set_yticks(range(1, rings + 1, max(1, rings // 12)))
+    axis.set(xlabel="slot", ylabel="ring", xticks=range(1, slots + 1, max(1, slots // 24)),
+             yticks=range(1, rings + 1, max(1, rings // 12)))
     figure.colorbar(image, label="posterior change along\nthe easy axis in %")
     return figure
 
@@ -554,8 +538,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
             axis.bar_label(bars, fmt="%.0f", fontsize=SMALL)
         axis.set(ylabel="contraction in %", ylim=(0, 108), yticks=range(0, 101, 20))
         return figure
-    image = axis.imshow(percent, cmap="cividis", vmin=0, vmax=100, aspect="auto", origin="lower",
-                        extent=(0.5, len(slots) + 0.5, 0.5, rings + 0.5))
+    image = draw_by_slot(axis, percent, cmap="cividis", vmin=0, vmax=100)
     if len(slots) <= NUMBERED_SLOTS and rings <= NUMBERED_RINGS:
         for (ring, slot), value in np.ndenumerate(percent):
             if np.isnan(value):

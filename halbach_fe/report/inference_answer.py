@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
@@ -17,6 +17,7 @@ from halbach_fe.report.words import (
     flux_density,
     fraction,
     place_of,
+    rms,
     with_error,
 )
 from halbach_fe.solver.formulation_choice import finer_in_words
@@ -188,7 +189,7 @@ def _numbers(values: Floats, form: str) -> str:
 def _prediction(result: InferenceResult) -> str:
     """Say how far the predictions are from readings, if possible from ones that it has not seen."""
     part, chosen = _tested(result)
-    before, after = (_rms((result.readings - each.mean)[chosen])
+    before, after = (rms((result.readings - each.mean)[chosen])
                      for each in (result.prediction_prior, result.prediction_posterior))
     if part is None:
         return (f"The updated magnet differs from the readings by {_field(after)} rms, "
@@ -217,12 +218,12 @@ def _tested(result: InferenceResult) -> tuple[str | None, NDArray[np.bool_]]:
 def _expected(result: InferenceResult) -> float:
     """Return the rms difference in T that error bars and noise allow."""
     _, chosen = _tested(result)
-    return _rms(np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen])
+    return rms(np.hypot(result.prediction_posterior.sd, result.errors.sd)[chosen])
 
 
 def distances(first: InferenceResult, last: InferenceResult) -> tuple[tuple[str, str], ...]:
     """Return how far the model is off before the first of two updates, and after the last one."""
-    off = [_rms((result.readings - prediction.mean)[_tested(result)[1]]) for result, prediction in (
+    off = [rms((result.readings - prediction.mean)[_tested(result)[1]]) for result, prediction in (
         (first, first.prediction_prior), (last, last.prediction_posterior))]
     return (("off before", _field(off[0])), ("after", _field(off[1])),
             ("noise and error bars", _field(_expected(last))))
@@ -234,20 +235,27 @@ def _before(result: InferenceResult) -> str:
             else "the magnet of the measured blocks")
 
 
+def easy_axes(result: InferenceResult) -> tuple[Ints, Floats, Floats]:
+    """Return the numbers (n,) of the blocks that are not missing, the unit vectors (n, D) of their
+    nominal magnetizations, and the sizes (n,) of these in A/m.
+    """
+    nominal = result.by_block(result.response.nominal)
+    size = np.linalg.norm(nominal, axis=1)
+    there = np.flatnonzero(size)
+    return there, nominal[there] / size[there, None], size[there]
+
+
 def _blocks(result: InferenceResult, start: str = (
         "Along their easy axes the blocks deviate from the study")) -> str:
     """Say how the magnetizations along the easy axes deviate from the nominal ones."""
-    nominal = result.by_block(result.response.nominal)
-    size = np.linalg.norm(nominal, axis=1)
-    there = np.flatnonzero(size)  # without the places of missing blocks
-    axes = nominal[there] / size[there, None]
-    mean = np.einsum("ij,ij->i", result.by_block(result.posterior.mean)[there] - nominal[there],
-                     axes) / size[there]
+    there, axes, size = easy_axes(result)
+    mean = np.einsum("ij,ij->i", result.by_block(
+        result.posterior.mean - result.response.nominal)[there], axes) / size
     worst = int(np.argmax(np.abs(mean)))
     row = np.zeros((1, len(result.posterior.mean)))
-    result.by_block(row[0])[there[worst]] = axes[worst] / size[there[worst]]
+    result.by_block(row[0])[there[worst]] = axes[worst] / size[worst]
     sd, block = result.posterior.sd_of(row)[0], result.magnet.blocks[there[worst]]
-    start = f"{start} by {fraction(_rms(mean))} rms, the most {place_of(block)}"
+    start = f"{start} by {fraction(rms(mean))} rms, the most {place_of(block)}"
     if result.disagreement:  # error bars that are not to be used are not stated
         sign = "" if mean[worst] < 0 else "+"
         return (f"{start}, which seems to be missing or reversed." if mean[worst] < -1 else
@@ -262,7 +270,3 @@ def _blocks(result: InferenceResult, start: str = (
 def _field(size: float) -> str:
     """Return a flux density in T as the table of the page has it."""
     return flux_density(size, zeros=True)
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))

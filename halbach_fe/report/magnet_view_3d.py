@@ -19,7 +19,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Edge, outline_contains
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.report.page import IRON, MEASURED, SECOND
+from halbach_fe.report.page import IRON, MEASURED, SECOND, Plain
 from halbach_fe.report.words import flux_density, place_of
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.types import COMPONENTS
@@ -34,6 +34,12 @@ MOST_SUMMED = 20_000
 """Largest number of blocks whose field is drawn in the plane: it takes 0.2 ms per block."""
 
 
+def _lines(starts: Floats, ends: Floats) -> dict[str, Floats]:
+    """Return the coordinates of lines between points (n, 3), which NaN separates."""
+    gap = np.full_like(ends, np.nan)
+    return dict(zip("xyz", np.stack([starts, ends, gap], axis=1).reshape(-1, 3).T, strict=True))
+
+
 def residuals_trace(positions: Floats, residual: Floats, bore_radius: float) -> go.Scatter3d:
     """Return arrows of what the model lacks, B (n, 3) in T at points (n, 3) in m."""
     most_arrows = 5000  # largest number of arrows that are drawn: those of the largest residuals
@@ -41,11 +47,9 @@ def residuals_trace(positions: Floats, residual: Floats, bore_radius: float) -> 
     kept = np.sort(np.argsort(-size)[:most_arrows])
     longest = float(size.max()) or 1.0
     ends = positions[kept] + LONGEST * bore_radius / longest * residual[kept]
-    gap = np.full_like(ends, np.nan)
-    x, y, z = np.stack([positions[kept], ends, gap], axis=1).reshape(-1, 3).T
     return go.Scatter3d(
-        x=x, y=y, z=z, mode="lines", line={"color": SECOND, "width": 3}, visible="legendonly",
-        name=f"residuals, up to {flux_density(longest, 2)}", hoverinfo="skip")
+        **_lines(positions[kept], ends), mode="lines", line={"color": SECOND, "width": 3},
+        visible="legendonly", name=f"residuals, up to {flux_density(longest, 2)}", hoverinfo="skip")
 
 
 def cut_trace(magnet: Magnet) -> go.Surface | None:
@@ -198,20 +202,6 @@ class ViewPoints:
     limits: tuple[float, float]
 
 
-def residual_points(positions: Floats, standardized: Floats) -> ViewPoints:
-    """Return measured points that are coloured by their residuals.
-
-    Parameters
-    ----------
-    positions : ndarray, shape (n, 3), in m
-    standardized : ndarray, shape (n,)
-        Residuals divided by their standard deviations.
-    """
-    return ViewPoints(positions, standardized, "measured points",
-                      "largest standardized<br>residual in sd",
-                      "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
-
-
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
     """Return points (n, 3) in m that are coloured by the magnitude of a field B (n, 3) in T."""
     magnitude = np.linalg.norm(flux_density, axis=1)
@@ -251,7 +241,7 @@ def view_of_inference(
         f"{percent:+.2f} ± {error:.2f} % along the easy axis" if magnetized else "missing"
         for percent, error, magnetized in zip(change, sd, there, strict=True)]))
     scores = result.standardized(result.prediction_posterior)
-    points = (_worst_residuals(result.observation.positions, scores)
+    points = (residual_points(result.observation.positions, scores)
               if any(result.observation.components) else None)
     return magnet_view(result.magnet, values, points, _residual_vectors(result), named)
 
@@ -282,7 +272,7 @@ def _residual_vectors(result: InferenceResult) -> tuple[Floats, Floats] | None:
     return points, lacking
 
 
-def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
+def residual_points(positions: Floats, scores: Floats) -> ViewPoints:
     """Return each measured point with the largest standardized residual of its readings.
 
     If there are more than `MOST_POINTS` points, half of the points drawn are those with the
@@ -297,7 +287,8 @@ def _worst_residuals(positions: Floats, scores: Floats) -> ViewPoints:
         evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
         chosen = np.union1d(kept, evenly)
         points, worst = points[chosen], worst[chosen]
-    return residual_points(points, worst)
+    return ViewPoints(points, worst, "measured points", "largest standardized<br>residual in sd",
+                      "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
 
 
 def magnet_view(
@@ -354,10 +345,9 @@ def _named_trace(blocks: Sequence[MagnetBlock], outer: float) -> go.Scatter3d:
     outside, radius = middles.copy(), np.hypot(*middles[:, :2].T)
     outside[radius < 1e-9 * outer, 0] = outer  # blocks on the axis
     outside[:, :2] *= OUTSIDE * outer / np.hypot(*outside[:, :2].T)[:, None]
-    x, y, z = np.stack([middles, outside, np.full_like(middles, np.nan)], axis=1).reshape(-1, 3).T
     texts = [text for block in blocks for text in ("", place_of(block), "")]
     return go.Scatter3d(
-        x=x, y=y, z=z, text=texts, mode="lines+text", name="found", hoverinfo="skip",
+        **_lines(middles, outside), text=texts, mode="lines+text", name="found", hoverinfo="skip",
         line={"color": MEASURED, "width": 5}, textposition="top center",
         textfont={"color": MEASURED, "size": 14})
 
@@ -420,10 +410,9 @@ def _merge_rings(
     if colours is not None:
         magnitude = np.abs(colours.values)
         worst = [group[int(np.argmax(magnitude[group]))] for group in groups]
-        where = [f"largest in ring {blocks[number].ring}: " if step > 1 else ""
-                 for number in worst]
         colours = replace(colours, values=colours.values[worst], words=[
-            text + colours.words[number] for text, number in zip(where, worst, strict=True)])
+            (f"largest in ring {blocks[number].ring}: " if step > 1 else "") + colours.words[number]
+            for number in worst])
     magnetization = np.array([values.magnetization[group].mean(axis=0) for group in groups])
     return ([replace(blocks[group[0]], z_max=blocks[group[-1]].z_max) for group in groups],
             BlockValues(magnetization, colours))
@@ -467,7 +456,7 @@ def _blocks_trace(
     more = _rings_per_prism(magnet) - 1
     texts = [_hover_text(block, min(more, magnet.array.rings - block.ring), values, number)
              for number, block in enumerate(blocks)]
-    look: dict[str, object] = {"color": "#BBBBBB"}
+    look: Plain = {"color": "#BBBBBB"}
     if (colours := values.colours) is not None:
         limit = float(np.abs(colours.values).max()) or 1.0
         low, high = colours.limits or (-limit, limit)
@@ -557,10 +546,9 @@ def _arrow_traces(
     vectors[:, :values.magnetization.shape[1]] = values.magnetization
     size = np.median([np.ptp(prism(block, 0.0)[0], axis=0).max() for block in blocks[:100]])
     vectors *= ARROW * size / (np.linalg.norm(vectors, axis=1).max() or 1.0)
-    gap = np.full_like(middles, np.nan)  # NaN separates the lines of consecutive arrows
-    x, y, z = np.stack([middles - vectors / 2, middles + vectors / 2, gap], axis=1).reshape(-1, 3).T
-    shafts = go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": MEASURED, "width": 4},
-                          name="magnetization", legendgroup="arrows", hoverinfo="skip")
+    shafts = go.Scatter3d(**_lines(middles - vectors / 2, middles + vectors / 2), mode="lines",
+                          line={"color": MEASURED, "width": 4}, name="magnetization",
+                          legendgroup="arrows", hoverinfo="skip")
     if len(blocks) > most_cones:
         return [shafts]
     (x, y, z), (u, v, w) = (middles + vectors / 2).T, (HEAD * vectors).T

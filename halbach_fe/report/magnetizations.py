@@ -22,7 +22,7 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
 )
-from halbach_fe.report.words import decimals, fraction
+from halbach_fe.report.words import decimals, fraction, rms
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
@@ -32,8 +32,7 @@ def error_summary(magnetizations: Gaussian, truth: Floats) -> dict[str, float]:
     error, sd = magnetizations.mean - truth, magnetizations.sd
     free = sd > 0  # a missing block has no uncertainty
     return {"largest_error_A_per_m": float(np.abs(error).max()),
-            "rms_error_A_per_m": float(np.sqrt(np.mean(error**2))),
-            "z_rms": float(np.sqrt(np.mean((error[free] / sd[free]) ** 2)))}
+            "rms_error_A_per_m": rms(error), "z_rms": rms(error[free] / sd[free])}
 
 
 def expected_spread(magnetizations: Gaussian) -> float:
@@ -94,9 +93,9 @@ def page(
     """
     rows = []
     for name, distribution in known.items():
-        largest, rms, ratio = error_summary(distribution, truth).values()
+        largest, left, ratio = error_summary(distribution, truth).values()
         rows.append({"": name, "largest error in kA/m": decimals(1e-3 * largest),
-                     "rms error in kA/m": decimals(1e-3 * rms),
+                     "rms error in kA/m": decimals(1e-3 * left),
                      "rms of error / sd": f"{ratio:.2f}"})
     further = [{"": key.replace("_", " "), "value": f"{value:.4g}"}
                for key, value in (figures or {}).items()]

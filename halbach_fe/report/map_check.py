@@ -10,18 +10,17 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.measurement.field_map import FIELD_COLUMNS, points_of, readings_sha256, write_map
+from halbach_fe.measurement.field_map import points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import (
     SCATTERED_M,
     VIOLATED,
-    InstrumentTerm,
     MapCheck,
     Reach,
     inner,
     order_of,
     oriented,
 )
-from halbach_fe.measurement.map_join import JoinedMaps, MapPose
+from halbach_fe.measurement.map_join import JoinedMaps
 from halbach_fe.measurement.scan_lines import is_sorted
 from halbach_fe.measurement.total_check import TotalCheck
 from halbach_fe.report.answer import Answer
@@ -31,15 +30,27 @@ from halbach_fe.report.page import (
     SECOND,
     Items,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
     chart,
+    columns_by_axis,
     csv_file,
     figure_of,
+    legend_above,
 )
 from halbach_fe.report.point_maps import draw, panels
-from halbach_fe.report.words import decimals, flux_density, in_a_row, relative, with_error
+from halbach_fe.report.words import (
+    by_axis,
+    decimals,
+    flux_density,
+    in_a_row,
+    point_mm,
+    relative,
+    with_error,
+)
 from halbach_fe.study.types import COMPONENTS
 
 TITLE = "Check of a field map"
@@ -60,10 +71,14 @@ def answer(check: MapCheck) -> Answer:
             "were fitted to too few readings.", "Measure in a volume, with a smaller spacing, and "
             "check that map.", "halbach-fe check MAP -o DIR", sound=False)
     better = check.is_reoriented or bool(sum(map(len, check.broken.values())))
-    if _violates(check):
+    if not check.obeys or _impossible(check):
+        _, (low, high, most) = check.uneven or (None, (0.0, 0.0, 0.0))
+        worst = "" if check.uneven is None else (
+            f"The most is left at {check.windows[0]} from {_range(low, high)}: "
+            f"{flux_density(most, 2)}. ")
         return Answer(
             question, f"{verdict(check)} {_noise(check)}",
-            f"No: nothing that the probe may plausibly be explains this map. {_worst(check)}Do not "
+            f"No: nothing that the probe may plausibly be explains this map. {worst}Do not "
             "update a magnet with it.", "Look for rows, axes and units "
             "that are not what the map says, or leave out what is near to magnets and conductors, "
             "and check it again.", "halbach-fe check MAP -o DIR",
@@ -262,11 +277,6 @@ def sentences(check: MapCheck) -> list[str]:
     return found
 
 
-def _of_the_scan(term: InstrumentTerm) -> bool:
-    """Tell whether a parameter follows from the times of the readings."""
-    return "from start" in term.name or "from the ends" in term.name or "lag" in term.name
-
-
 NOT_WHOLE = (
     "{} by itself obeys where it is harmonic, as each component of a field without sources is. "
     "Gains, axes, turns and places of sensors need three components; a plane of one component "
@@ -350,24 +360,10 @@ def _where(check: MapCheck, reach: Reach) -> str:
     return f"at {reach.along} of {limit} and {'less' if reach.below else 'more'}"
 
 
-def _worst(check: MapCheck) -> str:
-    """Say where the most is left, if that is not the same everywhere."""
-    if check.uneven is None:
-        return ""
-    _, (low, high, most) = check.uneven
-    return (f"The most is left at {check.windows[0]} from {_range(low, high)}: "
-            f"{flux_density(most, 2)}. ")
-
-
 def _impossible(check: MapCheck) -> list[str]:
     """Return the names of the parameters of a probe that no probe has."""
     return [term.name for term in check.terms
             if term.determined and term.predictive and not term.plausible]
-
-
-def _violates(check: MapCheck) -> bool:
-    """Whether the map does not obey Maxwell's equations with any likely probe."""
-    return not check.obeys or bool(_impossible(check))
 
 
 def _axes(check: MapCheck) -> str:
@@ -382,19 +378,18 @@ def _component(name: str) -> str:
     return f"{name[:-1].replace('-', '−')}B{name[-1]}"
 
 
-def instrument_table(check: MapCheck) -> list[dict[str, str]]:
+def instrument_table(check: MapCheck) -> Rows:
     """Return rows of text: the parameters of the instrument that the map determines."""
-    return [{"parameter": term.name,
-             "value": f"{with_error(term.value, term.sd)}\u00a0{term.unit}",
-             "": "found" if term.found else ""}
-            for term in check.terms if term.determined and term.predictive]
+    return [row | {"": "found" if term.found else ""} for term, row in zip(
+        check.terms, term_table(check), strict=True) if term.determined and term.predictive]
 
 
 def undetermined(check: MapCheck) -> str:
     """Say which parameters of the instrument the map does not tell, in a sentence; or nothing."""
     said = []
-    terms = check.terms if check.is_whole else [
-        term for term in check.terms if _of_the_scan(term)]
+    of_the_times = ("from start", "from the ends", "lag")  # of the readings
+    terms = [term for term in check.terms
+             if check.is_whole or any(words in term.name for words in of_the_times)]
     for words, predictive in (("Not stated, because parts of the map contradict each other about "
                                "it", False), ("What this map cannot tell", True)):
         names = [term.name for term in terms if term.predictive == predictive
@@ -404,7 +399,7 @@ def undetermined(check: MapCheck) -> str:
     return " ".join(said)
 
 
-def residual_table(check: MapCheck) -> list[dict[str, str]]:
+def residual_table(check: MapCheck) -> Rows:
     """Return rows of text: rms residuals of the columns in µT, and by region."""
     def row(name: str, values: Floats | tuple[float, float, float]) -> dict[str, str]:
         return {"rms residual in µT": name} | {
@@ -496,9 +491,7 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
                 partial(_readings, check), f"Residuals in the order of the map. {even}. A probe "
                 "that moves makes steps and waves")},
         files={"check.csv": csv_file(
-            dict(zip(("x_m", "y_m", "z_m"), points.T, strict=True)) | {
-                f"residual_{name}": column for name, column in zip(
-                    FIELD_COLUMNS, check.residual_T.T, strict=True)}
+            columns_by_axis("{}_m", points) | columns_by_axis("residual_B{}_T", check.residual_T)
             | {"left_out": check.excluded.astype(int)}, {})} | {
                 f"{name}.csv": partial(write_map, one) for name, one in maps.items()
                 if name != "oriented_map" or check.is_reoriented or check.excluded.any()},
@@ -511,12 +504,12 @@ def _maps_of(data: xr.Dataset, check: MapCheck) -> dict[str, xr.Dataset]:
         {"corrected_map": corrected(data, check)} if check.suffices else {})
 
 
-def check_summary(data: xr.Dataset, check: MapCheck) -> dict[str, object]:
+def check_summary(data: xr.Dataset, check: MapCheck) -> Plain:
     """Return the results as plain data, with `readings_sha256` of the maps to which they belong."""
     return check.plain() | _hashes({"map": data} | _maps_of(data, check))
 
 
-def _hashes(maps: Mapping[str, xr.Dataset]) -> dict[str, object]:
+def _hashes(maps: Mapping[str, xr.Dataset]) -> Plain:
     return {"maps_sha256": {name: readings_sha256(one) for name, one in maps.items()}}
 
 
@@ -566,51 +559,39 @@ def _readings(check: MapCheck) -> Figure:
                                     (POSTERIOR, SECOND, MEASURED), strict=True):
         axis.plot(number[~check.excluded], 1e6 * values[~check.excluded], ".", ms=2.5,
                   color=colour, label=f"B{name}")
-    axis.set_xlabel("row of the map")
-    axis.set_ylabel("residual in µT")
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3,
-                  frameon=False, markerscale=4)
+    axis.set(xlabel="row of the map", ylabel="residual in µT")
+    legend_above(figure, axis, columns=3, markerscale=4)
     return figure
 
 
 def joined_answer(joined: JoinedMaps) -> Answer:
     """Say where the maps lie to each other, and whether they agree."""
     first, *others = joined.checks
-    said = "; ".join(f"the middle of {pose.name} is {_shift(pose)} from where it would be if its "
-                     f"stage were that of {first}" for pose in joined.poses)
-    question = "Where do the maps lie to each other, and are they of one field?"
-    if not joined.agree:
-        worst = max(joined.overlaps, key=lambda one: one.chi2)
-        return Answer(
-            question, f"If they are of one field, {said}.",
-            f"No: where {worst.name} overlaps other maps, the readings contradict each other, with "
-            f"chi² {worst.chi2:.3g} per reading. The bars are widened by its root.",
-            "Look for what changed between the maps: temperature, gain, positions of the stage.",
-            sound=False)
-    if turned := [pose.name for pose in joined.poses if pose.is_turned]:
-        return Answer(
-            question, f"{said[0].upper()}{said[1:]}.",
-            f"Only if the stage of {in_a_row(turned)} stood turned by right angles: with the axes "
-            "that it states, no place fits. A smooth field is much like itself elsewhere.",
-            "Look how the stage stood, or measure with a larger overlap.", sound=False)
-    if _open(joined):
-        return Answer(
-            question, f"{said[0].upper()}{said[1:]}.",
-            f"Only in part: the overlap does not determine {in_a_row(_open(joined))}.",
-            "Measure with a larger overlap, where the field changes along these axes.",
-            sound=False)
+    said = "; ".join(
+        f"the middle of {pose.name} is {point_mm(pose.shift_m, pose.shift_sd_m)}\u00a0mm from "
+        f"where it would be if its stage were that of {first}" for pose in joined.poses)
+    said = (f"{said[0].upper()}{said[1:]}." if joined.agree else
+            f"If they are of one field, {said}.")
+    worst = max(joined.overlaps, key=lambda one: one.chi2)
+    turned, undetermined = [pose.name for pose in joined.poses if pose.is_turned], _open(joined)
+    trust, step = (
+        (f"No: where {worst.name} overlaps other maps, the readings contradict each other, with "
+         f"chi² {worst.chi2:.3g} per reading. The bars are widened by its root.",
+         "Look for what changed between the maps: temperature, gain, positions of the stage.")
+        if not joined.agree else
+        (f"Only if the stage of {in_a_row(turned)} stood turned by right angles: with the axes "
+         "that it states, no place fits. A smooth field is much like itself elsewhere.",
+         "Look how the stage stood, or measure with a larger overlap.") if turned else
+        (f"Only in part: the overlap does not determine {in_a_row(undetermined)}.",
+         "Measure with a larger overlap, where the field changes along these axes.")
+        if undetermined else
+        (f"Yes: where {in_a_row([first, *others])} overlap, chi² is at most "
+         f"{worst.chi2:.2f} per reading; no magnet is assumed.",
+         f"Find where the joined map, in the frame of {first}, lies in the magnet."))
+    sound = joined.agree and not (turned or undetermined)
     return Answer(
-        question, f"{said[0].upper()}{said[1:]}.",
-        f"Yes: where {in_a_row([first, *others])} overlap, chi² is at most "
-        f"{max(one.chi2 for one in joined.overlaps):.2f} per reading; no magnet is assumed.",
-        f"Find where the joined map, in the frame of {first}, lies in the magnet.",
-        "halbach-fe register STUDY --measurements DIR/joined.csv -o DIR")
-
-
-def _shift(pose: MapPose) -> str:
-    """Return a shift in mm with its bars."""
-    return "(" + ", ".join(with_error(1e3 * value, 1e3 * sd) for value, sd in zip(
-        pose.shift_m, pose.shift_sd_m, strict=True)) + ")\u00a0mm"
+        "Where do the maps lie to each other, and are they of one field?", said, trust, step,
+        "halbach-fe register STUDY --measurements DIR/joined.csv -o DIR" if sound else "", sound)
 
 
 def _open(joined: JoinedMaps) -> list[str]:
@@ -640,36 +621,31 @@ def joined_sentences(joined: JoinedMaps) -> list[str]:
     return found
 
 
-def pose_table(joined: JoinedMaps) -> list[dict[str, str]]:
+def pose_table(joined: JoinedMaps) -> Rows:
     """Return the poses as rows of text."""
-    return [{"map": pose.name} | {
-        f"{axis} in mm": with_error(1e3 * pose.shift_m[number], 1e3 * pose.shift_sd_m[number])
-        for number, axis in enumerate(COMPONENTS)} | {
-        f"about {axis} in mrad": with_error(
-            1e3 * pose.rotation_rad[number], 1e3 * pose.rotation_sd_rad[number])
-        for number, axis in enumerate(COMPONENTS)} for pose in joined.poses]
+    return [{"map": pose.name, **by_axis("{} in mm", pose.shift_m, pose.shift_sd_m),
+             **by_axis("about {} in mrad", pose.rotation_rad, pose.rotation_sd_rad)}
+            for pose in joined.poses]
 
 
-def overlap_table(joined: JoinedMaps) -> list[dict[str, str]]:
+def overlap_table(joined: JoinedMaps) -> Rows:
     """Return the overlaps as rows of text."""
     return [{"map": one.name, "readings": str(one.readings), "chi² per reading": f"{one.chi2:.2f}",
              "alone, rms": flux_density(one.alone_T), "jointly, rms": flux_density(one.rms_T)}
             for one in joined.overlaps]
 
 
-def term_table(joined: JoinedMaps) -> list[dict[str, str]]:
+def term_table(found: MapCheck | JoinedMaps) -> Rows:
     """Return the terms of the instrument as rows of text."""
     return [{"parameter": term.name,
              "value": f"{with_error(term.value, term.sd)}\u00a0{term.unit}"}
-            for term in joined.terms]
+            for term in found.terms]
 
 
 def joined_page(maps: Mapping[str, xr.Dataset], joined: JoinedMaps) -> Page:
     """Return the page of joined maps, with that of the check of each map."""
     found, poses, terms = joined_sentences(joined), pose_table(joined), term_table(joined)
-    summary = joined.plain() | {
-        "maps_sha256": {name: readings_sha256(data) for name, data in maps.items()},
-        "joined_sha256": readings_sha256(joined.data)}
+    summary = joined.plain() | _hashes(maps) | {"joined_sha256": readings_sha256(joined.data)}
     return Page(
         "check", "Field maps, joined", None, joined_answer(joined), summary, [
             Section([*([Items(found)] if found else []), Text(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,13 +23,14 @@ from halbach_fe.report.page import (
     SECOND,
     Drawn,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
     figure_of,
     legend_above,
     linearized,
-    page_of,
 )
 from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
 from halbach_fe.response.multipoles import (
@@ -56,7 +57,7 @@ COLOURS = (PRIOR, POSTERIOR, SECOND)
 MARKERS = ("o", "s", "^")
 
 
-def reference_summary(model: MultipoleModel, limit: float | None) -> dict[str, object]:
+def reference_summary(model: MultipoleModel, limit: float | None) -> Plain:
     """Return the reference of multipoles as entries of a JSON file."""
     return {"radius_m": model.radius, "z_m": model.z, "integrated_along_z": model.integrated,
             "main_order": model.main, "orders": list(model.orders),
@@ -190,7 +191,7 @@ def sections_of_circles(
 
 def _summary(
     study: Study, tables: Sequence[MultipoleTable], limit: float | None
-) -> dict[str, object]:
+) -> Plain:
     """Return the content of multipoles.json."""
     return {"study": study.name, "tables": [
         {"reference": reference_summary(model, limit),
@@ -239,7 +240,7 @@ def answer(
         "halbach-fe shim STUDY --measurements MAP -o DIR")
 
 
-def multipole_rows(magnets: Mapping[str, Multipoles]) -> list[dict[str, str]]:
+def multipole_rows(magnets: Mapping[str, Multipoles]) -> Rows:
     """Return the rows of `text_table`, with |c_n| of the last magnet, which the answer states."""
     name, known = list(magnets.items())[-1]
     rows = text_table(**magnets)
@@ -340,34 +341,29 @@ def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
     return f"{with_error(1e3 * known.main, 1e3 * known.main_sd)}\u00a0m{model.unit}"
 
 
-@page_of.register
 def page(found: MultipoleTables) -> Page:
     """Return the page of the multipoles of a magnet."""
-    study, tables = found.magnet.study, found.tables
-    files = [f"multipoles_{_location(model)}.png" for model, _ in tables]
-    lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
-    shown = [{name: _absolute(known) if lacks else known for name, known in magnets.items()}
-             for (_, magnets), lacks in zip(tables, lacking, strict=True)]
-    units = [f"m{model.unit}" if lacks else "units of 1e-4"
-             for (model, _), lacks in zip(tables, lacking, strict=True)]
-    rows = [multipole_rows(magnets) for magnets in shown]
-    sections = [Section([
-        f"{reference_text(model, study, lacks)} ± is the standard deviation, including the error "
-        "of the solver; |c_n| is the size of b_n and a_n together.", Table(table, "numbers"),
-        Drawn(file)], _location(model).capitalize())
-        for (model, _), lacks, table, file in zip(tables, lacking, rows, files, strict=True)]
+    study, sections = found.magnet.study, []
+    figures: dict[str, tuple[Callable[[], Figure], str]] = {}
+    tables: dict[str, Rows] = {}
+    for model, magnets in found.tables:
+        limit, unit, file = found.limit, "units of 1e-4", f"multipoles_{_location(model)}.png"
+        if lacks := lacks_main(list(magnets.values())[-1]):
+            limit, unit = None, f"m{model.unit}"
+            magnets = {name: _absolute(known) for name, known in magnets.items()}
+        where = ("integrated along z" if model.integrated else
+                 "of the cross-section" if model.z is None else f"on {place_of(model)}")
+        rows = tables[f"Multipoles in {unit}, {where}"] = multipole_rows(magnets)
+        sections.append(Section([
+            f"{reference_text(model, study, lacks)} ± is the standard deviation, including the "
+            "error of the solver; |c_n| is the size of b_n and a_n together.",
+            Table(rows, "numbers"), Drawn(file)], _location(model).capitalize()))
+        figures[file] = partial(multipole_figure, magnets, limit, unit), (
+            "Unwanted multipoles, normal (left) and skew (right); bars are two standard deviations")
     return Page(
         "multipoles", "multipoles", study,
-        answer(tables, found.limit, found.disagreement, faults_in_words(study)),
-        _summary(study, tables, found.limit),
-        [*sections, Section([*found.left_out, *linearized(study)])],
-        {f"Multipoles in {unit}, " + (
-            "integrated along z" if model.integrated else
-            "of the cross-section" if model.z is None else f"on {place_of(model)}"): table
-         for (model, _), unit, table in zip(tables, units, rows, strict=True)},
-        figures={file: (
-            partial(multipole_figure, magnets, None if lacks else found.limit, unit),
-            "Unwanted multipoles, normal (left) and skew (right); bars are two standard deviations")
-            for file, magnets, lacks, unit in zip(files, shown, lacking, units, strict=True)},
-        shown=tuple(files),
-        files={"multipoles.csv": partial(write_multipole_csv, study, tables)})
+        answer(found.tables, found.limit, found.disagreement, faults_in_words(study)),
+        _summary(study, found.tables, found.limit),
+        [*sections, Section([*found.left_out, *linearized(study)])], tables, figures=figures,
+        shown=tuple(figures),
+        files={"multipoles.csv": partial(write_multipole_csv, study, found.tables)})

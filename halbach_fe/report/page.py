@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import importlib
 import io
 import json
 import platform
@@ -23,17 +24,23 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.legend import Legend
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, LogFormatter
 from scipy.spatial import ConvexHull
 from tomlkit.items import Array, Trivia, Whitespace
 
+import halbach_fe
+from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
+from halbach_fe.core.result_folder import result_folder
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import with_paths_from
+from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import (
     DPI,
@@ -70,6 +77,12 @@ own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
 
+
+Rows = list[dict[str, str]]
+"""Rows of text, each by the names of its columns."""
+
+Plain = dict[str, object]
+"""Plain data, the content of a JSON file."""
 
 Figures = Mapping[str, tuple[Callable[[], Figure], str]]
 """How figures are drawn, and their captions, by file name."""
@@ -184,15 +197,30 @@ class Page:
         return [name for name in self.figures if name not in placed]
 
 
+PAGES = {
+    "Assembly": "assembly", "SimulatedCampaign": "campaign",
+    "DemagnetizationMap": "demagnetization", "Diagnosis": "diagnosis", "Forces": "forces",
+    "HomogeneityResult": "homogeneity", "InferenceResult": "inference",
+    "MultipoleTables": "multipoles", "MeasurementPlan": "plan", "Designed": "ring_design",
+    "FilledTray": "shim_tray", "Shim": "shimming", "Solution": "solution",
+    "SortedBlocks": "sorting", "Tolerance": "tolerance", "HomogeneityTolerance": "tolerance",
+    "Verification": "verification"}
+"""Module of this room whose function ``page`` returns the page of each result."""
+
+
 @singledispatch
 def page_of(result: object) -> Page:
-    """Return the page of a result; each module of this room registers that of its own.
+    """Return the page of a result: of this room, or one that another package has registered.
 
     Raises
     ------
     StudyError
         If there is no page for such an object.
     """
+    name = type(result).__name__
+    if name in PAGES and type(result) is getattr(halbach_fe, name):
+        page: Page = importlib.import_module(f"halbach_fe.report.{PAGES[name]}").page(result)
+        return page
     raise StudyError(must_be(
         "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
         f"a {type(result).__name__}"))
@@ -207,6 +235,16 @@ def csv_file(
             write_csv(columns, attributes, temporary)
 
     return write
+
+
+def attributes(of: object, *names: str) -> Plain:
+    """Return some attributes of an object as plain data."""
+    return {name: getattr(of, name) for name in names}
+
+
+def columns_by_axis(name: str, values: Floats) -> dict[str, Floats]:
+    """Return the components of vectors (..., 3) as columns; {} in ``name`` stands for the axis."""
+    return {name.format(axis): values[..., number].ravel() for number, axis in enumerate("xyz")}
 
 
 @own_style
@@ -391,15 +429,36 @@ def chart(height_in: float, width_in: float = WIDEST_IN) -> tuple[Figure, Axes]:
     return figure, axis
 
 
-def legend_above(figure: Figure, *axes: Axes, columns: int = 2) -> None:
-    """Put the names of what is drawn above a figure, where they hide nothing.
+def legend_above(
+    figure: Figure, *axes: Axes, columns: int = 2, markerscale: float | None = None
+) -> Legend:
+    """Put the names of what is drawn above a figure, where they hide nothing; return them.
 
     What several axes name alike is named once.
     """
     named = {name: shown for axis in axes for shown, name in zip(
         *axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(named.values(), named.keys(), loc="outside upper center", frameon=False,
-                  ncols=min(columns, len(named)))
+    return figure.legend(named.values(), named.keys(), loc="outside upper center", frameon=False,
+                         ncols=min(columns, len(named)), markerscale=markerscale)
+
+
+def magnet_panels(what: str) -> tuple[Figure, Axes, Axes]:
+    """Return a figure, and its axes for points along the magnet, over ``what``, and across it."""
+    figure = figure_of(3.6)
+    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    along.set(xlabel="z in the magnet in mm", ylabel=what)
+    across.set(xlabel="x in the magnet in mm", ylabel="y in the magnet in mm")
+    across.set_aspect("equal", adjustable="datalim")
+    for axis in (along, across):
+        axis.grid(alpha=0.3)
+    return figure, along, across
+
+
+def draw_by_slot(axis: Axes, values: Floats, **colours: Any) -> AxesImage:
+    """Draw values (rings, slots) of blocks as the colours of a grid."""
+    rings, slots = values.shape
+    return axis.imshow(values, aspect="auto", origin="lower",
+                       extent=(0.5, slots + 0.5, 0.5, rings + 0.5), **colours)
 
 
 def stacked_axes(
@@ -566,3 +625,83 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2,
                   markerscale=3)
     return figure
+
+
+@typed
+def write_report(result: object, folder: str | Path) -> Path:
+    """Write the files of a result into a folder: its tables, and its HTML page with all figures.
+
+    Parameters
+    ----------
+    result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, \
+HomogeneityResult, Forces, MeasurementPlan, FilledTray, Shim, SortedBlocks, Assembly, \
+Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
+        The result of a function of `halbach_fe`.
+    folder : str or Path
+        Folder for the files; it is made if it does not exist. As on the command line, it belongs to
+        one command and one study: results that it holds of these are replaced.
+
+    Returns
+    -------
+    Path
+        Path of the page, which needs no network and no other file.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written, another run is using the folder, or it holds results of
+        another command or study.
+    StudyError
+        If ``result`` is of any other type.
+
+    Examples
+    --------
+    >>> import halbach_fe as hf
+    >>> magnet = hf.build_magnet(hf.read_study("dipole.toml"))
+    >>> solution = hf.solve(magnet, hf.Session.open("results"))
+    >>> hf.write_report(solution, "field").name
+    'report.html'
+    """
+    folder = Path(folder)
+    page = page_of(result)
+    study = page.study.name if page.study else ""
+    with result_folder(folder, f"halbach-fe {page.command}", study):
+        return write_files(page, folder)
+
+
+@own_style
+def html_of(result: object) -> str:
+    """Return what a notebook shows of a result, as HTML that needs no other file: the answer, and
+    the main figure or tables.
+
+    Raises
+    ------
+    StudyError
+        If the result is of a type without a page.
+    """
+    if isinstance(result, Magnet):
+        points = points_from(result.study.observation.positions)
+        return picture(geometry_figure(result, points), f"The magnet {result.name}, with the "
+                       "magnetization of its blocks and the positions of its study")
+    page = page_of(result)
+    return f"<p>{html.escape(' '.join(page.answer.sentences))}</p>" + "".join(
+        [picture(page.figures[name][0](), page.figures[name][1]) for name in page.shown]
+        or map(table, page.tables.values()))
+
+
+def picture(figure: Figure, text: str) -> str:
+    """Return a figure as an HTML image element with an alternative text."""
+    raw = io.BytesIO()
+    figure.savefig(raw, format="png", dpi=100)
+    data = base64.b64encode(raw.getvalue()).decode("ascii")
+    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
+
+
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return rows of text as an HTML table; an empty text if there are no rows."""
+    if not rows:
+        return ""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(value)}</td>" for value in row.values())
+                   + "</tr>" for row in rows)
+    return f"<table><tr>{head}</tr>{body}</table>"

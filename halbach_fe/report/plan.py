@@ -21,25 +21,27 @@ from halbach_fe.report.page import (
     POSTERIOR,
     PRIOR,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
     chart,
+    columns_by_axis,
     csv_file,
     draw_cross_section,
     figure_of,
     label_logarithmic,
     legend_above,
-    page_of,
 )
-from halbach_fe.report.words import counted, fraction, ppm
+from halbach_fe.report.words import counted, fraction, ppm, rms
 from halbach_fe.study.model import Study, is_nonlinear
 
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
 
 
-def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
+def plan_summary(plan: MeasurementPlan) -> Plain:
     """Return the content of plan.json: information in nats, standard deviations in A/m."""
     return {
         "points": len(plan.points), "candidates": len(plan.candidates),
@@ -48,13 +50,13 @@ def plan_summary(plan: MeasurementPlan) -> dict[str, object]:
         "study_information": float(plan.baseline_gain[-1]),
         "points_with_the_study_information": plan.same_information,
         "mean_sd_over_study_with_as_many_points": plan.volume_ratio,
-        "rms_sd_prior": _rms(plan.prior_sd), "rms_sd_plan": _rms(plan.planned_sd),
-        "rms_sd_study_with_as_many_points": _rms(plan.baseline_sd),
+        "rms_sd_prior": rms(plan.prior_sd), "rms_sd_plan": rms(plan.planned_sd),
+        "rms_sd_study_with_as_many_points": rms(plan.baseline_sd),
         **_deviation_summary(plan),
     }
 
 
-def _deviation_summary(plan: MeasurementPlan) -> dict[str, object]:
+def _deviation_summary(plan: MeasurementPlan) -> Plain:
     """Return what is left unknown of the deviation of |B| as entries of plan.json."""
     if plan.deviation is None:
         return {}
@@ -83,9 +85,8 @@ def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
     # Uncertainty relative to the prior's from which on the readings tell little of single blocks.
     vague = 0.7
-    points, same = len(plan.points), plan.same_information
+    points, same, nearly = len(plan.points), plan.same_information, _nearly(plan)
     everything = points == len(plan.candidates)
-    nearly = _nearly(plan)
     enough = (f"the first {nearly} of {points} positions nearly suffice, as the uncertainty "
               f"{'of patterns of blocks ' if plan.deviation is None else ''}that they leave is at "
               f"most {NEARLY:g} times that of all"
@@ -102,7 +103,7 @@ def answer(plan: MeasurementPlan) -> Answer:
         beside = "" if _is_the_study(plan) else (
             f"; with as many of the study's own positions to {fraction(of_study)}"
             f"{'' if left < little * of_study else ', which is hardly more'}")
-        blocks = _rms(plan.planned_sd) / _rms(plan.prior_sd)
+        blocks = rms(plan.planned_sd) / rms(plan.prior_sd)
         better = "What blocks that deviate together do to the field is known better: the"
         said += (f"After {'all of ' if everything else ''}them the uncertainty of a block's "
                  f"magnetization falls to {fraction(blocks)} of what it is before (rms over the "
@@ -121,10 +122,12 @@ def answer(plan: MeasurementPlan) -> Answer:
                  + ("" if _is_the_study(plan) else
                     f" (after as many of the study's positions to {ppm(_of_study(plan))})") + ". ")
     if not everything:
+        of_all = (fraction(float(_pattern_sd(plan, plan.baseline_gain)[-1]))
+                  if plan.deviation is None else f"{ppm(plan.deviation.baseline[-1])} ppm rms")
         said += (f"{counted(same, 'position')} of the plan tell as much as all "
                  f"{len(plan.baseline)} of the study." if same else
                  f"All {len(plan.baseline)} positions of the study together tell more than these "
-                 f"{points}{_of_all(plan)}.")
+                 f"{points}: they leave {of_all}.")
     return Answer(
         "Where should the magnet be measured?", said.strip(),
         "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
@@ -149,7 +152,6 @@ def _of_the_instrument(study: Study) -> str:
         "all readings share, is not in them, and leaves more of the blocks' common strength.")
 
 
-@page_of.register
 def page(plan: MeasurementPlan) -> Page:
     """Return the page of the positions to measure."""
     magnet, summary, rows = plan.magnet, plan_summary(plan), plan_table(plan)
@@ -169,8 +171,8 @@ def page(plan: MeasurementPlan) -> Page:
                  f"{count} components there are as many independent patterns, and readings tell "
                  f"much of some and little of others.{by_patterns}", "small"),
             Text(f"Chosen one after another from {len(plan.candidates)} candidates, for {what}. "
-                 f"The prior sd of a component is {1e-3 * _rms(plan.prior_sd):.3g} kA/m, that with "
-                 f"the plan {1e-3 * _rms(plan.planned_sd):.3g} kA/m (rms).", "small")]),
+                 f"The prior sd of a component is {1e-3 * rms(plan.prior_sd):.3g} kA/m, that with "
+                 f"the plan {1e-3 * rms(plan.planned_sd):.3g} kA/m (rms).", "small")]),
         Section([
             "In this order: if you stop early, what is measured tells most. plan.csv has them in "
             "m, in the axes of the study.", Table(chosen, "numbers")],
@@ -195,11 +197,11 @@ def page(plan: MeasurementPlan) -> Page:
                     "of the study"))},
         files={"plan.csv": csv_file({
             "order": range(1, len(plan.points) + 1),
-            **{f"{axis}_m": plan.points[:, number] for number, axis in enumerate("xyz")},
+            **columns_by_axis("{}_m", plan.points),
             "information_nats": plan.gain}, {})})
 
 
-def chosen_table(plan: MeasurementPlan) -> list[dict[str, str]]:
+def chosen_table(plan: MeasurementPlan) -> Rows:
     """Return rows of text with the chosen positions in mm, in the order of choice.
 
     The last column is what is left after a position and all before it.
@@ -222,13 +224,6 @@ def _pattern_sd(plan: MeasurementPlan, gain: Floats) -> Floats:
     return np.asarray(np.exp(-gain / len(plan.parameters)))
 
 
-def _of_all(plan: MeasurementPlan) -> str:
-    """Say what all positions of the study leave, as the answer says it of the plan."""
-    if plan.deviation is not None:
-        return f": they leave {ppm(plan.deviation.baseline[-1])} ppm rms"
-    return f": they leave {fraction(float(_pattern_sd(plan, plan.baseline_gain)[-1]))}"
-
-
 def _patterns(plan: MeasurementPlan) -> Floats:
     """Return what plan, and as many of the study's positions, leave of the sd of patterns."""
     count = min(len(plan.points), len(plan.baseline))
@@ -236,12 +231,12 @@ def _patterns(plan: MeasurementPlan) -> Floats:
         plan.gain[-1], plan.baseline_gain[np.searchsorted(plan.baseline_counts, count)]]))
 
 
-def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
+def plan_table(plan: MeasurementPlan) -> Rows:
     """Return rows of text that compare the plan with the positions of the study.
 
     A plan that only orders these is not compared with itself.
     """
-    prior, same = _rms(plan.prior_sd), plan.same_information
+    prior, same = rms(plan.prior_sd), plan.same_information
     patterns = _patterns(plan)
     rows = [
         {"": "positions", "plan": str(len(plan.points)), "the study's": str(len(plan.baseline))},
@@ -250,8 +245,8 @@ def plan_table(plan: MeasurementPlan) -> list[dict[str, str]]:
          else f"more than {len(plan.points)}",
          "the study's": str(len(plan.baseline))},
         {"": "sd of a block's magnetization, relative to the prior's (rms over the blocks)*",
-         "plan": fraction(_rms(plan.planned_sd) / prior),
-         "the study's": fraction(_rms(plan.baseline_sd) / prior)},
+         "plan": fraction(rms(plan.planned_sd) / prior),
+         "the study's": fraction(rms(plan.baseline_sd) / prior)},
         {"": "sd of a pattern of blocks, relative to the prior's (geometric mean over all "
          "patterns)*", "plan": fraction(patterns[0]), "the study's": fraction(patterns[1])},
         *([] if plan.deviation is None else [
@@ -273,11 +268,6 @@ def _is_the_study(plan: MeasurementPlan) -> bool:
 def _only_orders(plan: MeasurementPlan) -> bool:
     """Tell whether the plan only orders the study's positions."""
     return _is_the_study(plan) and len(plan.points) == len(plan.baseline)
-
-
-def _rms(values: Floats) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:

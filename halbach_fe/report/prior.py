@@ -15,8 +15,18 @@ from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.page import MEASURED, PUBLISHED, Page, Section, Table, Text, figure_of
-from halbach_fe.report.words import counted, fraction, p_value, with_error
+from halbach_fe.report.page import (
+    MEASURED,
+    PUBLISHED,
+    Page,
+    Plain,
+    Rows,
+    Section,
+    Table,
+    Text,
+    figure_of,
+)
+from halbach_fe.report.words import counted, fraction, p_value, rms, with_error
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -28,7 +38,7 @@ PARTS = ("in length", "in direction, in the plane of the ring", "in direction, t
 NOTHING = "–"
 
 
-def type_table(prior: MeasuredPrior) -> list[dict[str, str]]:
+def type_table(prior: MeasuredPrior) -> Rows:
     """Return the rows of the table of block types, as text: mean ± sd and adjusted p-values.
 
     Columns of p-values are left out if no type has enough blocks for the test.
@@ -50,7 +60,7 @@ def _tested(prior: MeasuredPrior) -> bool:
     return any(not np.isnan(samples.p).all() for samples in prior.types)
 
 
-def _summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
+def _summary(magnet: Magnet, prior: MeasuredPrior) -> Plain:
     """Return the content of prior.json.
 
     Deviations are in percent along the nominal magnetization and in degrees across it.
@@ -58,8 +68,8 @@ def _summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     return {
         "study": magnet.name, "blocks": prior.count, "placed": prior.placed,
         "parameters": len(prior.nominal),
-        "rms_sd_A_per_m": float(np.sqrt(np.mean(prior.gaussian.sd**2))),
-        "rms_shift_A_per_m": float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))),
+        "rms_sd_A_per_m": rms(prior.gaussian.sd),
+        "rms_shift_A_per_m": rms(prior.gaussian.mean - prior.nominal),
         "common_mode_sd": magnet.study.prior.common_mode_sd,
         "mounting_sd_deg": magnet.study.prior.mounting_sd_deg,
         "doubts": list(prior.doubts), "far": prior.far,
@@ -73,7 +83,7 @@ def _summary(magnet: Magnet, prior: MeasuredPrior) -> dict[str, object]:
     }
 
 
-def parts_table(magnet: Magnet, prior: MeasuredPrior) -> list[dict[str, str]]:
+def parts_table(magnet: Magnet, prior: MeasuredPrior) -> Rows:
     """Return rows of text: how far blocks deviate from the study, and how far they remain unknown,
     along the nominal magnetization, across it, and together.
     """
@@ -118,21 +128,15 @@ def _axes(nominal: Floats) -> Floats:
     return np.stack([along, across, np.cross(along, across)], axis=1)
 
 
-def _common_sd(prior: MeasuredPrior) -> float:
-    """Return the sd of the mean strength of all blocks, relative to it."""
-    weights = prior.nominal / np.sum(prior.nominal**2)
-    return float(prior.gaussian.sd_of(weights[None])[0])
-
-
 def answer(prior: MeasuredPrior) -> Answer:
     """Say how the measured blocks deviate from the study, and what to do next."""
     # Part of a standard deviation from which a contribution makes more than half of the variance.
     mostly = 0.5 ** 0.5
-    size = np.sqrt(np.mean(prior.nominal**2))
-    spread = float(np.sqrt(np.mean(prior.gaussian.sd**2))) / size
-    shift = float(np.sqrt(np.mean((prior.gaussian.mean - prior.nominal) ** 2))) / size
+    size = rms(prior.nominal)
+    spread, shift = rms(prior.gaussian.sd) / size, rms(prior.gaussian.mean - prior.nominal) / size
     strength = float(np.mean(np.concatenate([each.deviations[:, 0] for each in prior.types])))
-    common = _common_sd(prior)
+    weights = prior.nominal / np.sum(prior.nominal**2)  # of the mean strength of all blocks
+    common = float(prior.gaussian.sd_of(weights[None])[0])
     side = "stronger" if strength > 0 else "weaker"
     said = (f"On average the {counted(prior.count, 'measured block')} are "
             f"{with_error(100 * abs(strength), 100 * common)}\u00a0% {side} than the study says. "
@@ -181,8 +185,10 @@ def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
         f"Each block may be turned by {mounting:.3g}° (sd) about each axis when mounted."
         if mounting > 0 else "The study has no `prior.mounting_sd_deg`: blocks are assumed to be "
         "mounted without angular errors.")
+    table = magnet.array.free_blocks
     types = ("A type is what the table of free blocks of the study calls so; a block that it gives "
-             "none is a type by itself." if _of_table(magnet) else
+             "none is a type by itself."  # see `types_of`
+             if table is not None and table.type and not magnet.study.prior.types else
              "A type is a kind of block that fits the slots of [prior.types] of the study; without "
              "it, every slot number is a type.")
     tested = ("" if not _tested(prior) else " p is the p-value of the Anderson-Darling test for "
@@ -195,8 +201,7 @@ def page(magnet: Magnet, prior: MeasuredPrior) -> Page:
     } if any(len(samples.deviations) > 2 for samples in prior.types) else {"prior_blocks.png": (
         partial(_deviations_figure, prior), "Deviation of each block from the study's "
         "magnetization: along it, and across it")}
-    sizes = [1e-3 * float(np.sqrt(np.mean(values**2)))
-             for values in (prior.gaussian.mean - prior.nominal, prior.gaussian.sd)]
+    sizes = [1e-3 * rms(prior.gaussian.mean - prior.nominal), 1e-3 * rms(prior.gaussian.sd)]
     return Page("prior", "prior from measured blocks", magnet.study, answer(prior), summary, [
         Section([f"{calibration} {turned}"]),
         Section([
@@ -228,12 +233,6 @@ def _write_prior(magnet: Magnet, prior: MeasuredPrior, path: Path) -> None:
     data["prior_covariance"] = (("parameter", "parameter_2"), prior.gaussian.covariance,
                                 {"units": "A2/m2"})
     write_hdf5(data, path)
-
-
-def _of_table(magnet: Magnet) -> bool:
-    """Tell whether the types are those of the table of free blocks, see `types_of`."""
-    table = magnet.array.free_blocks
-    return bool(table is not None and table.type and not magnet.study.prior.types)
 
 
 def _mean_of_type(samples: TypeSamples) -> Floats:

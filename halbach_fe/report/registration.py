@@ -51,12 +51,23 @@ from halbach_fe.report.page import (
     POSTERIOR,
     SECOND,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
-    figure_of,
+    legend_above,
+    magnet_panels,
 )
-from halbach_fe.report.words import counted, decimals, flux_density, in_a_row, with_error
+from halbach_fe.report.words import (
+    by_axis,
+    counted,
+    decimals,
+    flux_density,
+    in_a_row,
+    point_mm,
+    with_error,
+)
 from halbach_fe.report.words import probability as in_per_cent
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -118,9 +129,8 @@ def answer(
     best = found[0]
     along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
                       axes_of_map(best.instrument).items())
-    place = ", ".join(with_error(1e3 * value, 1e3 * sd) for value, sd in zip(
-        best.middle_m, best.translation_sd_m, strict=True))
-    said = (f"The middle of the map lies at ({place}) mm in the magnet, with {along} of the "
+    place = point_mm(best.middle_m, best.translation_sd_m)
+    said = (f"The middle of the map lies at {place} mm in the magnet, with {along} of the "
             f"magnet. On the map's stage the middle of the magnet is at {_magnet_on_stage(best)}.")
     least_bad = f" for B{best.component}" if best.component else ""
     alike = sum(_fit_alike(best, each) or is_symmetric_to(best, each) for each in rivals(found))
@@ -154,7 +164,9 @@ def answer(
             ("Update the blocks with the map in this pose. The update finds pose and probe again, "
              "together with the blocks.",
              f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR") if sound else
-            _after_doubts(best, maps) if _is_of_the_file(best) else
+            # doubts about what the file says of its numbers, not about the magnet
+            _after_doubts(best, maps) if best.doubts and (
+                _is_a_factor(best) or len(_measured(best)) == 1) else
             ("Do not update the blocks in this pose. Measure lines beside this one, or the "
              "components of B that are missing, or narrow the search by what is known of the place "
              "(--across-m, --turn-rad), and register again.",
@@ -224,11 +236,6 @@ def _is_a_factor(best: Registration) -> bool:
 def _are_alike(best: Registration) -> bool:
     """Tell whether the readings are like the nominal field, so that a factor may relate both."""
     return abs(best.likeness) >= UNLIKE
-
-
-def _is_of_the_file(best: Registration) -> bool:
-    """Tell whether doubts are about what the file says of its numbers, not about the magnet."""
-    return bool(best.doubts) and (_is_a_factor(best) or len(_measured(best)) == 1)
 
 
 def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
@@ -312,9 +319,7 @@ def _numbers(instrument: Instrument) -> list[Floats]:
 
 def _magnet_on_stage(best: Registration) -> str:
     """Return where the middle of the magnet is by the map's own coordinates, in mm."""
-    centre, sd = magnet_on_stage(best)
-    return "({}) mm".format(", ".join(
-        with_error(1e3 * value, 1e3 * each) for value, each in zip(centre, sd, strict=True)))
+    return f"{point_mm(*magnet_on_stage(best))} mm"
 
 
 def magnet_on_stage(best: Registration) -> tuple[Floats, Floats]:
@@ -458,7 +463,7 @@ def _rms_in_words(rms: np.ndarray) -> str:
 
 def pose_table(
     found: Sequence[Registration], before: str = NOMINAL
-) -> list[dict[str, str]]:
+) -> Rows:
     """Return rows of text, one per pose."""
     rows = []
     for number, (each, probability) in enumerate(zip(found, stated_odds(found), strict=True), 1):
@@ -474,43 +479,41 @@ def pose_table(
     return rows
 
 
-def place_table(found: Sequence[Registration]) -> list[dict[str, str]]:
+def place_table(found: Sequence[Registration]) -> Rows:
     """Return a row of text per pose: the middle of the map in mm, and its turns in mrad."""
-    return [{"pose": str(number),
-             **{f"{axis} in mm": with_error(1e3 * value, 1e3 * sd) for axis, value, sd in zip(
-                 COMPONENTS, each.middle_m, each.translation_sd_m, strict=True)},
-             **{f"about {axis} in mrad": with_error(1e3 * value, 1e3 * sd)
-                for axis, value, sd in zip(COMPONENTS, turn_from_axes(each.instrument),
-                                           each.rotation_sd_rad, strict=True)}}
+    return [{"pose": str(number), **by_axis("{} in mm", each.middle_m, each.translation_sd_m),
+             **by_axis("about {} in mrad", turn_from_axes(each.instrument), each.rotation_sd_rad)}
             for number, each in enumerate(found, 1)]
 
 
-def probe_table(best: Registration) -> list[dict[str, str]]:
+def probe_table(best: Registration) -> Rows:
     """Return rows of text: what the fit says about the sensors of the map, with their sd."""
     instrument, sd = best.instrument, best.probe
-    there = _measured(best)
-    rows = [{"of the probe": f"B{name[0]} sees B{name[1]}",
-             "value": with_error(1e3 * value, 1e3 * sd.crosstalk) + "\u00a0mrad"}
-            for name, value in instrument.crosstalk.items() if name[0] in there]
+
+    def row(what: str, value: float, bar: float, unit: str) -> dict[str, str]:
+        factor = 100 if unit == "%" else 1e3
+        return {"of the probe": what,
+                "value": f"{with_error(factor * value, factor * bar)}\u00a0{unit}"}
+
+    def sensor(name: str, number: int) -> Rows:
+        return [row(f"gain of {name}", instrument.gain[number], sd.gain, "%"),
+                row(f"offset of {name}", instrument.offset_T[number], sd.offset_T, "mT")]
+
     if best.total:
-        return [{"of the probe": "gain of |B|",
-                 "value": with_error(100 * instrument.gain[0], 100 * sd.gain) + "\u00a0%"},
-                {"of the probe": "offset of |B|",
-                 "value": with_error(1e3 * instrument.offset_T[0], 1e3 * sd.offset_T)
-                 + "\u00a0mT"}]
-    for name, gain, offset, place in zip(COMPONENTS, instrument.gain, instrument.offset_T,
-                                         instrument.sensor_position_m, strict=True):
-        rows += [] if name not in there else [{"of the probe": f"gain of B{name}",
-                  "value": with_error(100 * gain, 100 * sd.gain) + "\u00a0%"},
-                 {"of the probe": f"offset of B{name}",
-                  "value": with_error(1e3 * offset, 1e3 * sd.offset_T) + "\u00a0mT"},
-                 *({"of the probe": f"place of the B{name} sensor, {axis}",
-                    "value": with_error(1e3 * value, 1e3 * sd.sensor_m) + "\u00a0mm"}
-                   for axis, value in zip(COMPONENTS, place, strict=True))]
+        return sensor("|B|", 0)
+    there = _measured(best)
+    rows = [row(f"B{name[0]} sees B{name[1]}", value, sd.crosstalk, "mrad")
+            for name, value in instrument.crosstalk.items() if name[0] in there]
+    for number, name in enumerate(COMPONENTS):
+        if name in there:
+            rows += sensor(f"B{name}", number) + [
+                row(f"place of the B{name} sensor, {axis}", value, sd.sensor_m, "mm")
+                for axis, value in zip(COMPONENTS, instrument.sensor_position_m[number],
+                                       strict=True)]
     return rows
 
 
-def doubt_table(best: Registration) -> list[dict[str, str]]:
+def doubt_table(best: Registration) -> Rows:
     """Return rows of text: terms that are farther from their priors than chance takes them."""
     return [{"term": each.name, "changed by": each.size, "known before": each.known,
              "that is": f"{decimals(each.distance, 2)} standard deviations"}
@@ -522,7 +525,7 @@ def _measured(best: Registration) -> list[str]:
     return [name for name, rms in zip(COMPONENTS, best.rms_T, strict=True) if not np.isnan(rms)]
 
 
-def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
+def registration_summary(found: Sequence[Registration]) -> Plain:
     """Return the poses as plain data, the content of registration.json."""
     def numbers(values: np.ndarray) -> list[float | None]:
         return [None if np.isnan(value) else float(value) for value in values]
@@ -541,11 +544,9 @@ def registration_summary(found: Sequence[Registration]) -> dict[str, object]:
                       for key, (value, sd) in each.open_keys.items()},
         "magnet_on_stage_m": numbers(magnet_on_stage(each)[0]),
         "magnet_on_stage_sd_m": numbers(magnet_on_stage(each)[1]),
-        "middle_m": numbers(each.middle_m), "translation_sd_m": numbers(each.translation_sd_m),
-        "rotation_sd_rad": numbers(each.rotation_sd_rad),
-        "rms_T": numbers(each.rms_T), "nominal_rms_T": numbers(each.nominal_rms_T),
-        "held_out_rms_T": numbers(each.held_out_rms_T),
-        "held_out_nominal_rms_T": numbers(each.held_out_nominal_rms_T),
+        **{name: numbers(getattr(each, name)) for name in (
+            "middle_m", "translation_sd_m", "rotation_sd_rad", "rms_T", "nominal_rms_T",
+            "held_out_rms_T", "held_out_nominal_rms_T")},
         "log_evidence": each.log_evidence,
     } for each, probability in zip(found, stated_odds(found), strict=True)]}
 
@@ -611,8 +612,7 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
     base = best.instrument.with_(translation_m=(0.0, 0.0, 0.0), rotation_rad=(0.0, 0.0, 0.0))
     read = in_si_and_magnet_axes(base, data)
     points = 1e3 * probe_points(best.instrument, points_of(read))
-    figure = figure_of(3.6)
-    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    figure, along, across = magnet_panels("B in mT")
     if best.total:
         along.plot(points[:, 2], 1e3 * read[TOTAL_COLUMN].values, ".", ms=2, color=POSTERIOR,
                    label="|B| of the map")
@@ -621,14 +621,6 @@ def _where(best: Registration, data: xr.Dataset) -> Figure:
         if not np.isfinite(values).any():
             continue
         along.plot(points[:, 2], 1e3 * values, ".", ms=2, color=colour, label=f"B{name} of the map")
-    along.set_xlabel("z in the magnet in mm")
-    along.set_ylabel("B in mT")
-    along.grid(alpha=0.3)
     across.plot(points[:, 0], points[:, 1], ".", ms=3, color=POSTERIOR)
-    across.set_aspect("equal", adjustable="datalim")
-    across.set_xlabel("x in the magnet in mm")
-    across.set_ylabel("y in the magnet in mm")
-    across.grid(alpha=0.3)
-    figure.legend(*along.get_legend_handles_labels(), loc="outside upper center", ncols=3,
-                  frameon=False, markerscale=4)
+    legend_above(figure, along, columns=3, markerscale=4)
     return figure

@@ -21,14 +21,16 @@ from halbach_fe.report.page import (
     SMALL,
     Drawn,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
+    attributes,
     chart,
     csv_file,
     figure_of,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.words import PERCENT_FROM, counted, in_a_row, ppm, relative
 
@@ -94,7 +96,7 @@ def _count(design: RingDesign) -> str:
     return f"{rings} rings"
 
 
-def _design_rows(found: Designed) -> list[dict[str, str]]:
+def _design_rows(found: Designed) -> Rows:
     """Return a row of text for every design, by its field."""
     return [{
         "design": f"best: {smallest(found)}" if one is found.best else "",
@@ -103,7 +105,7 @@ def _design_rows(found: Designed) -> list[dict[str, str]]:
         "blocks": str(one.blocks), "mass": f"{one.mass_kg:.4g} kg"} for one in found.front]
 
 
-def _ring_rows(found: Designed) -> list[dict[str, str]]:
+def _ring_rows(found: Designed) -> Rows:
     """Return a row of text for every place of the best design, from the middle upwards."""
     best = found.best
     rows = []
@@ -118,15 +120,13 @@ def _ring_rows(found: Designed) -> list[dict[str, str]]:
     return rows
 
 
-def _summary(found: Designed) -> dict[str, object]:
+def _summary(found: Designed) -> Plain:
     """Return the content of design.json."""
-    def plain(one: RingDesign) -> dict[str, object]:
-        values = {"mean_T": one.mean_T, "rms_ppm": one.rms_ppm,
-                  "peak_to_peak_ppm": one.peak_to_peak_ppm, "mass_kg": one.mass_kg,
-                  "blocks": one.blocks}
+    def plain(one: RingDesign) -> Plain:
         places = [{"z_m": float(z), "rings": [ring and asdict(ring) for ring in option]}
                   for z, option in zip(one.z_m, one.rings, strict=True)]
-        return values | {"places": places}
+        return {**attributes(one, "mean_T", "rms_ppm", "peak_to_peak_ppm", "mass_kg", "blocks"),
+                "places": places}
 
     return {"study": found.study.name, "region": asdict(found.region), "reached": found.reached,
             "best": plain(found.best), "designs": [plain(one) for one in found.front]}
@@ -191,7 +191,6 @@ def side_figure(found: Designed) -> Figure:
     return figure
 
 
-@page_of.register
 def page(found: Designed) -> Page:
     """Return the page of a search for rings, with the study of the best design."""
     settings, best, rows, rings = (

@@ -17,11 +17,14 @@ from halbach_fe.report.page import (
     PUBLISHED,
     Drawn,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
+    attributes,
+    columns_by_axis,
     csv_file,
     figure_of,
-    page_of,
 )
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
@@ -59,14 +62,13 @@ def _told(found: FilledTray) -> Answer:
     """Return the same without its numbers in large type."""
     region = found.model.region.text
     question = f"Which magnets in the tray make the field in {region} homogeneous?"
-    measured = "halbach-fe infer STUDY --measurements NEW_MAP -o DIR"
+    harmonics = "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR"
     if not found.filled:
         return Answer(
             question, "Leave the tray empty: none of its magnets makes the field more homogeneous "
             f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(found),
             "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
-            "comes from: its harmonics tell.",
-            "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
+            "comes from: its harmonics tell.", harmonics)
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
     text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
@@ -74,24 +76,22 @@ def _told(found: FilledTray) -> Answer:
             f"{ppm(before)}.")
     if all(not count for count in found.left.values()):
         text += " The whole inventory is used: more magnets may do better."
+    step, trust = "Fill the tray from shim_tray.csv, then measure again and update.", ""
+    command = "halbach-fe infer STUDY --measurements NEW_MAP -o DIR"
     if before < FEW * after:
-        useless = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
-        if found.magnet.study.design is not None:
-            return Answer(
-                question, useless, _ranges(found),
-                "The deviation is that of the design, and too large for a tray: search for a "
-                "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")
-        return Answer(
-            question, useless, _ranges(found),
-            "Take larger magnets or more places, or look for what the deviation comes from: its "
-            "harmonics tell.", "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR")
-    if after > 2 * found.after.rms_ppm:
-        return Answer(
-            question, text, "What remains is mostly what the measurement and the strength of the "
-            f"shims leave open. {_ranges(found)}", "Fill the tray from shim_tray.csv, measure "
-            "again with it, update, and fill a second one.", measured)
-    return Answer(question, text, _ranges(found),
-                  "Fill the tray from shim_tray.csv, then measure again and update.", measured)
+        text = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
+        step, command = (
+            ("The deviation is that of the design, and too large for a tray: search for a "
+             "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")
+            if found.magnet.study.design is not None else
+            ("Take larger magnets or more places, or look for what the deviation comes from: its "
+             "harmonics tell.", harmonics))
+    elif after > 2 * found.after.rms_ppm:
+        trust = ("What remains is mostly what the measurement and the strength of the shims leave "
+                 "open. ")
+        step = ("Fill the tray from shim_tray.csv, measure again with it, update, and fill a "
+                "second one.")
+    return Answer(question, text, f"{trust}{_ranges(found)}", step, command)
 
 
 def _ranges(found: FilledTray) -> str:
@@ -103,7 +103,7 @@ def _ranges(found: FilledTray) -> str:
             f"{doubt}")
 
 
-def _rows(found: FilledTray) -> list[dict[str, str]]:
+def _rows(found: FilledTray) -> Rows:
     """Return a row of text for every magnet."""
     return [{
         "place": str(one.place),
@@ -113,7 +113,7 @@ def _rows(found: FilledTray) -> list[dict[str, str]]:
         "from the x axis": f"{one.direction_deg:.1f}°"} for one in found.filled]
 
 
-def _field_rows(found: FilledTray) -> list[dict[str, str]]:
+def _field_rows(found: FilledTray) -> Rows:
     """Return a row of text for the field before and after."""
     def row(name: str, known: Homogeneity) -> dict[str, str]:
         low, middle, high = map(ppm, known.rms_range_ppm)
@@ -125,14 +125,14 @@ def _field_rows(found: FilledTray) -> list[dict[str, str]]:
     return [row("empty", found.before), row("filled", found.after)]
 
 
-def _summary(found: FilledTray) -> dict[str, object]:
+def _summary(found: FilledTray) -> Plain:
     """Return the content of shim_tray.json."""
     return {"study": found.magnet.name, "region": asdict(found.model.region),
             "places": len(found.places_m), "magnets": len(found.filled), "left": found.left,
             "before": plain_homogeneity(found.before), "after": plain_homogeneity(found.after),
-            "filled": [{"place": one.place, "position_m": one.position_m,
-                        "magnet": one.magnet.name, "from_radius_deg": one.from_radius_deg,
-                        "direction_deg": one.direction_deg} for one in found.filled]}
+            "filled": [{**attributes(one, "place", "position_m"), "magnet": one.magnet.name,
+                        **attributes(one, "from_radius_deg", "direction_deg")}
+                       for one in found.filled]}
 
 
 def _columns(found: FilledTray) -> dict[str, Iterable[object]]:
@@ -140,7 +140,7 @@ def _columns(found: FilledTray) -> dict[str, Iterable[object]]:
     there = {one.place: one for one in found.filled}
     every = [there.get(number) for number in range(1, len(found.places_m) + 1)]
     return {"place": range(1, len(every) + 1),
-            **{f"{axis}_m": found.places_m[:, number] for number, axis in enumerate("xyz")},
+            **columns_by_axis("{}_m", found.places_m),
             "magnet": ["" if one is None else one.magnet.name for one in every],
             **{key: [np.nan if one is None else getattr(one, key) for one in every]
                for key in ("from_radius_deg", "direction_deg")}}
@@ -178,7 +178,6 @@ def _tray_figure(found: FilledTray) -> Figure:
     return figure
 
 
-@page_of.register
 def page(found: FilledTray) -> Page:
     """Return the page of a tray, with the table to fill it from."""
     tray = found.magnet.study.shim_tray

@@ -31,6 +31,8 @@ from halbach_fe.report.page import (
     SECOND,
     SMALL,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     Text,
@@ -39,7 +41,6 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
     linearized,
-    page_of,
 )
 from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
@@ -56,7 +57,7 @@ DRAWN_AS = {"swap": "blocks that are exchanged", "cycle": "blocks that change pl
 """Names of the kinds of moves in the picture of all moves."""
 
 
-def _summary(shim: Shim) -> dict[str, object]:
+def _summary(shim: Shim) -> Plain:
     """Return the content of shim.json."""
     return {
         "study": shim.study.name, **values_summary(shim.model, shim.limit, dict(zip(
@@ -107,7 +108,7 @@ def aim_of(model: MultipoleModel | DeviationModel) -> Aim:
 
 def values_summary(
     model: MultipoleModel | DeviationModel, limit: float | None, values: Mapping[str, Any],
-) -> dict[str, object]:
+) -> Plain:
     """Return multipoles or fields by name, and what they refer to, as entries of a JSON file."""
     if isinstance(model, DeviationModel):
         return {"region": asdict(model.homogeneity.region), "limit_ppm": limit,
@@ -118,7 +119,7 @@ def values_summary(
 
 def values_table(
     model: MultipoleModel | DeviationModel, values: Mapping[str, Any]
-) -> list[dict[str, str]]:
+) -> Rows:
     """Return rows of text with multipoles or fields by name."""
     return (homogeneity_rows(values) if isinstance(model, DeviationModel)
             else text_table(**values))
@@ -140,7 +141,7 @@ def _gained(shim: Shim) -> float:
     return 1 - shim.after.rms / shim.before.rms
 
 
-def _step_summary(shim: Shim, step: Step) -> dict[str, object]:
+def _step_summary(shim: Shim, step: Step) -> Plain:
     """Return a move and its gain as entries of shim.json."""
     unit = aim_of(shim.model).unit
     return {"kind": step.move.kind,
@@ -149,7 +150,7 @@ def _step_summary(shim: Shim, step: Step) -> dict[str, object]:
             f"rms_after_{unit}": step.after.rms}
 
 
-def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
+def _placement_summary(shim: Shim, placement: Placement) -> Plain:
     """Return where a block comes from, where it goes and how it is turned, for shim.json."""
     places = shim.mounts.places
     spare = placement.block - len(places)
@@ -158,7 +159,7 @@ def _placement_summary(shim: Shim, placement: Placement) -> dict[str, object]:
             "turn_deg": list(shim.mounts.turn_deg(placement.turn))}
 
 
-def _move_table(shim: Shim) -> list[dict[str, str]]:
+def _move_table(shim: Shim) -> Rows:
     """Return the rows of the table of moves, as text."""
     aim = aim_of(shim.model)
     return [{"move": f"{number}: {step.move.kind}",
@@ -180,9 +181,10 @@ def _compared(shim: Shim, before: T, after: T) -> dict[str, T]:
 def _placement_text(shim: Shim, placement: Placement) -> str:
     """Return where a block comes from, where it goes and how it is turned, in words."""
     spare = placement.block - len(shim.mounts.places)
-    source = (f"spare {shim.spares[spare]}" if spare >= 0 else _place_text(shim, placement.block))
+    blocks = shim.magnet.blocks
+    source = f"spare {shim.spares[spare]}" if spare >= 0 else place_of(blocks[placement.block])
     stays = placement.block == placement.to
-    where = "in place" if stays else f"to {_place_text(shim, placement.to)}"
+    where = "in place" if stays else f"to {place_of(blocks[placement.to])}"
     vector = np.array(shim.mounts.turn_deg(placement.turn))
     angle = float(np.linalg.norm(vector))
     if not angle:
@@ -198,12 +200,6 @@ def _placement_text(shim: Shim, placement: Placement) -> str:
     sign = -1 if names and axis.sum() < 0 else 1
     return (f"{source} {where}, {'' if stays else 'then '}turned by {sign * angle:.0f}° about its "
             f"{about} axis")
-
-
-def _place_text(shim: Shim, number: int) -> str:
-    """Return the place of a block in words: the block's name if it is a free block."""
-    block = shim.magnet.blocks[number]
-    return place_of(block)
 
 
 def answer(shim: Shim) -> Answer:
@@ -326,7 +322,6 @@ def _unknown_part(shim: Shim) -> str:
             "blocks (--blocks) or a map at more places would tell more")
 
 
-@page_of.register
 def page(shim: Shim) -> Page:
     """Return the page of moves of blocks.
 
@@ -339,6 +334,7 @@ def page(shim: Shim) -> Page:
     rows = values_table(shim.model, _compared(shim, *(shim.fields or (shim.before, shim.after))))
     sections = [Section([_convention(shim), Table(rows, aim.table), *linearized(shim.study)],
                         aim.title)]
+    values = "the unwanted multipoles" if shim.fields is None else "the deviation of |B|"
     figures = {} if shim.fields else {"shim_multipoles.png": (
         partial(multipole_figure, _compared(shim, shim.before, shim.after), shim.limit),
         f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
@@ -350,7 +346,7 @@ def page(shim: Shim) -> Page:
             "shim_moves.png": (
                 partial(_moves_figure, shim), f"{move_title}, with their numbers in the table"),
             "shim_gain.png": (
-                partial(_gain_figure, shim), f"Root mean square of {_values_text(shim)} after each "
+                partial(_gain_figure, shim), f"Root mean square of {values} after each "
                 "move, including the uncertainty")}
     shimmed, note = shim.shimmed_study, f"shimmed: {len(shim.steps)} moves"
     return Page("shim", "how to shim it", shim.study, answer(shim), _summary(shim), sections,
@@ -374,11 +370,6 @@ def _of_the_moves(shim: Shim) -> str:
             "about each axis, which all uncertainties include." if mounting > 0 else
             "The study has no `prior.mounting_sd_deg`: blocks are assumed to be mounted again "
             "without angular errors."))
-
-
-def _values_text(shim: Shim) -> str:
-    """Return what is shimmed for."""
-    return "the unwanted multipoles" if shim.fields is None else "the deviation of |B|"
 
 
 def _convention(shim: Shim) -> str:

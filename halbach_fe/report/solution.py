@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.report.answer import Answer
+from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import (
     MultipoleTable,
@@ -26,23 +27,23 @@ from halbach_fe.report.page import (
     Drawn,
     Figures,
     Page,
+    Rows,
     Section,
     Table,
     View,
     geometry_figure,
     label_logarithmic,
     legend_above,
-    page_of,
     stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
-from halbach_fe.report.stray_field import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.words import (
     ROUNDING,
     counted,
     decimals,
     flux_density,
     is_fourier,
+    listed,
     magnet_rows,
     relative,
 )
@@ -65,18 +66,18 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
     size = np.linalg.norm(solution.flux_density, axis=1)
     low, high, error = float(size.min()), float(size.max()), float(solution.errors.max())
     equal = flux_density(low, 4) == flux_density(high, 4)
-    main = main_field_in_words(tables)
+    question, main = "How strong is the field?", main_field_in_words(tables)
     said = (f"{main} At the study's {counted(len(size), 'position')} the nominal magnet makes "
             f"{'' if equal else flux_density(low, 4) + ' to '}{flux_density(high, 4)}.").lstrip()
     of_blocks = ("It is the field of the magnet as the study states it; a magnet that is built has "
                  "the tolerances of its blocks besides.")
     if far := solution.magnet.surroundings(solution.points).far_away():
-        return Answer("How strong is the field?", said,
+        return Answer(question, said,
                       f"Not before the positions are checked. {far} {of_blocks}",
                       "Correct the positions, or go on if they are meant to be there.",
                       "halbach-fe solve STUDY -o DIR", False)
     if error <= ROUNDING * high:
-        return Answer("How strong is the field?", said,
+        return Answer(question, said,
                       "Yes: that is exact. The study's blocks have a recoil permeability of 1 and "
                       f"there is no iron, so that it is a closed form, without a mesh. {of_blocks}",
                       *_after_an_exact_field(solution))
@@ -90,7 +91,7 @@ def answer(solution: Solution, tables: Sequence[MultipoleTable] = ()) -> Answer:
                 f"Yes, to that error. It is {decimals(error / sigma, 2)} times the noise of the "
                 f"readings, {flux_density(sigma)}; error bars of what follows include it. ")
     return Answer(
-        "How strong is the field?",
+        question,
         f"{said} By comparison with one other mesh and boundary, {reading} is off by up to "
         f"{flux_density(error)}, {relative(error / high)} of the largest |B|; halbach-fe verify "
         "estimates it from several meshes.",
@@ -122,7 +123,6 @@ def _smallest_noise(solution: Solution) -> float:
     return min((region.sigma_T for region in noise.regions), default=0.0) if noise else 0.0
 
 
-@page_of.register
 def page(solution: Solution) -> Page:
     """Return the page of a solved nominal magnet, with the multipoles of full circles."""
     magnet, study, rows = solution.magnet, solution.magnet.study, field_table(solution)
@@ -155,8 +155,7 @@ def page(solution: Solution) -> Page:
                 "make it in vacuum.", "" if not solution.errors.any() else
                 " ± is the standard deviation that the solver's error allows."),
             Section([*map(Drawn, [*figures][1:])], "Pictures"),
-            Section([Table([{"quantity": name, "value": value}
-                            for name, value in magnet_rows(magnet)])], "Model")],
+            Section([Table(listed(magnet_rows(magnet)))], "Model")],
         {"The field at the study's positions": rows,
          "Outside of the magnet": stray_rows(solution.stray_field)},
         figures=figures, shown=("field.png",), files=files, stored=False, stem="report",
@@ -164,7 +163,7 @@ def page(solution: Solution) -> Page:
                     "points, readings": f"{len(solution.points)}, {len(solution.readings)}"})
 
 
-def field_table(solution: Solution) -> list[dict[str, str]]:
+def field_table(solution: Solution) -> Rows:
     """Return rows of text: where the field is strongest and weakest, and the means of B and |B|.
 
     That of the vector B is 0 on a circle of a multipole, whose |B| is not.

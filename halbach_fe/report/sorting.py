@@ -27,13 +27,15 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
     begin_at_zero,
+    columns_by_axis,
     csv_file,
     figure_of,
     legend_above,
-    page_of,
 )
 from halbach_fe.report.shimming import aim_of, values_summary, values_table
 from halbach_fe.report.words import counted, in_a_row, ppm
@@ -45,7 +47,7 @@ QUANTILES = (0.025, 0.5, 0.975)
 all ranges of the page do."""
 
 
-def _summary(found: SortedBlocks) -> dict[str, object]:
+def _summary(found: SortedBlocks) -> Plain:
     """Return the content of sort.json; rms values are those of the mean."""
     unit = aim_of(found.model).unit
     return {
@@ -70,7 +72,7 @@ def _turned_rows(found: SortedBlocks) -> list[int]:
     return [int(row) for row in np.flatnonzero(found.turn_deg.any(axis=1))]
 
 
-def _turn_table(found: SortedBlocks) -> list[dict[str, str]]:
+def _turn_table(found: SortedBlocks) -> Rows:
     """Return the rows of the table of turned blocks, as text."""
     rows = []
     for row in _turned_rows(found):
@@ -83,7 +85,7 @@ def _turn_table(found: SortedBlocks) -> list[dict[str, str]]:
     return rows
 
 
-def place_table(found: SortedBlocks) -> list[dict[str, str]]:
+def place_table(found: SortedBlocks) -> Rows:
     """Return the rows of the table of places, each of a few slots of a ring."""
     slots_a_row = 8  # largest number of slots in a row of the table of places
     table, rows = found.table, []
@@ -98,7 +100,7 @@ def place_table(found: SortedBlocks) -> list[dict[str, str]]:
     return rows
 
 
-def order_table(found: SortedBlocks) -> list[dict[str, str]]:
+def order_table(found: SortedBlocks) -> Rows:
     """Return the rows of the table of multipoles or fields, as text."""
     return values_table(found.model, _compared(
         found, *(found.fields or (found.best, found.numbered))))
@@ -129,8 +131,7 @@ def _answer(found: SortedBlocks) -> Answer:
     """Return the answer of a table that is of this magnet."""
     best, own = found.best.rms_of_mean, found.numbered.rms_of_mean
     low, high = np.quantile(found.random, QUANTILES[::2])
-    aim = aim_of(found.model)
-    what, unit, text = aim.what, aim.rms_unit, aim.size
+    what, unit, text = (aim := aim_of(found.model)).what, aim.rms_unit, aim.size
     sizes = "" if found.fields is None else " ({} instead of {} peak to peak)".format(
         *(ppm(each.peak_to_peak_ppm) for each in found.fields))
     question = "Which block goes into which slot?"
@@ -157,7 +158,8 @@ def _answer(found: SortedBlocks) -> Answer:
             f"by prior.types{types_in_words(found.alike)}; or measure spare blocks. Then sort "
             "again.",
             "halbach-fe sort STUDY BLOCKS -o DIR")
-    spread, prior = _uncertainty(found), found.study.prior
+    prior = found.study.prior  # and what the uncertainty of the blocks makes
+    spread = float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
     known = ["the measured moments", *(words for words, there in (
         ("the calibration of the coil", prior.common_mode_sd > 0),
         ("the mounting", prior.mounting_sd_deg > 0)) if there)]
@@ -210,12 +212,6 @@ def _ordered(found: SortedBlocks) -> str:
             "this one.")
 
 
-def _uncertainty(found: SortedBlocks) -> float:
-    """Return the rms, in the unit of the answer, that the uncertainty of the blocks makes."""
-    return float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
-
-
-@page_of.register
 def page(found: SortedBlocks) -> Page:
     """Return the page of blocks that were assigned to slots."""
     aim = aim_of(found.model)
@@ -235,8 +231,7 @@ def page(found: SortedBlocks) -> Page:
         "sort.csv": csv_file({
             "serial": [found.table.serial[row] for row in turned],
             "ring": found.table.ring[turned], "slot": found.table.slot[turned],
-            **dict(zip(("turn_x_deg", "turn_y_deg", "turn_z_deg"), found.turn_deg[turned].T,
-                       strict=True))},
+            **columns_by_axis("turn_{}_deg", found.turn_deg[turned])},
             {"content": "blocks that are turned in their slots: rotation vectors along own axes"})})
     by_serial = ("By serial number, as in blocks.sorted.csv"
                  f"{'; the turns of blocks are in a table below' if turned else ''}.")

@@ -27,14 +27,16 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     Page,
+    Plain,
+    Rows,
     Section,
     Table,
+    attributes,
     begin_at_zero,
     chart,
     figure_of,
     legend_above,
     linearized,
-    page_of,
 )
 from halbach_fe.report.words import decimals, ppm, share_in_words, whole
 from halbach_fe.response.multipoles import plain
@@ -50,7 +52,7 @@ magnets have at most, from which on the answer says that it is the design's. (To
 squares: a tenth of a deviation is half of it.)"""
 
 
-def _multipole_summary(found: Tolerance) -> dict[str, object]:
+def _multipole_summary(found: Tolerance) -> Plain:
     """Return the content of tolerance.json."""
     shares = found.shares
     return {
@@ -70,7 +72,7 @@ def _by_quantile(values: Floats) -> dict[str, float]:
     return dict(zip(map(str, QUANTILES), values.tolist(), strict=True))
 
 
-def _multipole_quantiles(found: Tolerance) -> list[dict[str, str]]:
+def _multipole_quantiles(found: Tolerance) -> Rows:
     """Return a row of text for each order n."""
     size, sd = len(found.model.orders), found.known.sd
     rows = []
@@ -159,7 +161,6 @@ def _made_by_tolerances(found: Tolerance) -> str:
             f"magnets, below {decimals(most[number])} in 95 %. With what the design makes: ")
 
 
-@page_of.register
 def page(found: Tolerance | HomogeneityTolerance) -> Page:
     """Return the page of magnets that were drawn at random."""
     if isinstance(found, HomogeneityTolerance):
@@ -239,13 +240,12 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     return figure
 
 
-def _homogeneity_summary(found: HomogeneityTolerance) -> dict[str, object]:
+def _homogeneity_summary(found: HomogeneityTolerance) -> Plain:
     """Return the content of tolerance.json."""
     return {
         "study": found.study.name, "region": asdict(found.model.region),
         "draws": len(found.rms_ppm), "limit_ppm": found.limit,
-        "as_ordered": {"mean_T": found.ordered.mean_T, "rms_ppm": found.ordered.rms_ppm,
-                       "peak_to_peak_ppm": found.ordered.peak_to_peak_ppm},
+        "as_ordered": attributes(found.ordered, "mean_T", "rms_ppm", "peak_to_peak_ppm"),
         **{f"{name}_quantiles": _by_quantile(np.quantile(getattr(found, name), QUANTILES))
            for name in ("mean_T", "rms_ppm", "peak_to_peak_ppm")},
         "solver_error_ppm": found.model.solver_error_ppm,
@@ -253,7 +253,7 @@ def _homogeneity_summary(found: HomogeneityTolerance) -> dict[str, object]:
     }
 
 
-def _homogeneity_quantiles(found: HomogeneityTolerance) -> list[dict[str, str]]:
+def _homogeneity_quantiles(found: HomogeneityTolerance) -> Rows:
     """Return a row of text for the rms deviation, the one peak to peak, and the mean field."""
     def row(name: str, ordered: str, texts: list[str]) -> dict[str, str]:
         return {"": name, "as ordered": ordered} | {

@@ -19,17 +19,18 @@ from halbach_fe.report.page import (
     THIRD,
     Drawn,
     Page,
+    Rows,
     Section,
     Table,
     Text,
     View,
     axis_of_points,
+    columns_by_axis,
     csv_file,
     figure_of,
     geometry_figure,
     label_logarithmic,
     legend_above,
-    page_of,
     stacked_axes,
 )
 from halbach_fe.report.words import (
@@ -38,6 +39,7 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     is_fourier,
+    listed,
     magnet_rows,
     ppm,
     relative,
@@ -65,7 +67,7 @@ def _coarsest(found: Verification) -> int:
     return min([*changed, STEPS - 1])
 
 
-def difference_table(found: Verification) -> list[dict[str, str]]:
+def difference_table(found: Verification) -> Rows:
     """Return rows of text: the change of the field for each change of the model, and the error, in
     ppm of the largest field; none if the field is exact.
     """
@@ -178,16 +180,11 @@ def error_basis(found: Verification) -> str:
         text += (" The error of the dual formulation has the opposite sign, as far as energies are "
                  "concerned. The difference between the two formulations is no part of the "
                  "estimate.")
+    reading = "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
     return (f"{text} The error bars of readings, which halbach-fe solve states, are an estimate "
-            f"apart from this one: the change of {_reading(found)} by one other discretization.")
+            f"apart from this one: the change of {reading} by one other discretization.")
 
 
-def _reading(found: Verification) -> str:
-    """Say what a reading of the study is."""
-    return "a Fourier coefficient" if is_fourier(found.magnet.study) else "a component of B"
-
-
-@page_of.register
 def page(found: Verification) -> Page:
     """Return the page of how far the computed field is off."""
     magnet, rows, change = found.magnet, difference_table(found), found.changes[STEPS - 1]
@@ -212,7 +209,7 @@ def page(found: Verification) -> Page:
         "Changes of the model, and how much they change the field")] if rows else []
     model = {"route": found.route.replace("_", " "), "method": magnet.study.solver.method,
              "elements at the magnet": f"{1e3 * found.element_size_m:.3g} mm; finer by a factor of "
-             f"{REFINEMENT}, coarser by it and by its square", **dict(magnet_rows(magnet))}
+             f"{REFINEMENT}, coarser by it and by its square", **magnet_rows(magnet)}
     size = 1e6 * change
     view = View(lambda: view_of_nominal_magnet(
         magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
@@ -221,16 +218,15 @@ def page(found: Verification) -> Page:
             (float(size.min()), float(size.max())))),
         "positions of the study by the change of B that a finer mesh makes" if rows else
         "positions of the study by the magnitude of the field")
-    columns = dict(zip(("x_m", "y_m", "z_m"), found.points.T, strict=True))
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
         [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
-         Section([Table([{"quantity": name, "value": value} for name, value in model.items()])],
-                 "Model")],
+         Section([Table(listed(model))], "Model")],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
         files={"verification.csv": csv_file(
-            columns | {f"{difference.what} in T": column for difference, column in zip(
-                found.differences, found.changes, strict=True)}, {"study": magnet.name})},
+            columns_by_axis("{}_m", found.points) | {
+                f"{difference.what} in T": column for difference, column in zip(
+                    found.differences, found.changes, strict=True)}, {"study": magnet.name})},
         stem="verification")
 
 

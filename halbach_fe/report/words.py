@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
@@ -15,6 +16,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.study.model import Study, iron_of
+from halbach_fe.study.types import COMPONENTS
 
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
@@ -58,6 +60,24 @@ def with_error(value: float, sd: float) -> str:
     places = int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))
     rounded = round(value, places) + 0.0  # without a sign where it is 0
     return f"{rounded:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
+
+
+def by_axis(name: str, values: Iterable[float], sd: Iterable[float]) -> dict[str, str]:
+    """Return components along x, y and z with their standard deviations, from m in mm or from rad
+    in mrad; {} in ``name`` stands for the axis.
+    """
+    return {name.format(axis): with_error(1e3 * value, 1e3 * bar)
+            for axis, value, bar in zip(COMPONENTS, values, sd, strict=True)}
+
+
+def point_mm(values: Iterable[float], sd: Iterable[float]) -> str:
+    """Return a point in m, with its standard deviations, in mm."""
+    return f"({', '.join(by_axis('{}', values, sd).values())})"
+
+
+def rms(values: Floats) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def ppm(value: float) -> str:
@@ -156,8 +176,13 @@ def fraction(value: float) -> str:
     return f"{100 * value:.1f}\u00a0%"
 
 
-def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
-    """Return name and value of the properties of a magnet that its pages list."""
+def listed(values: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return a row of text for each quantity."""
+    return [{"quantity": name, "value": value} for name, value in values.items()]
+
+
+def magnet_rows(magnet: Magnet) -> dict[str, str]:
+    """Return the properties of a magnet that its pages list, by name."""
     array, blocks = magnet.array, magnet.blocks
     outer = f"{1e3 * magnet.array_outer_radius:.6g} mm"
     rows = [("dimension", f"{magnet.dimension}D"), ("blocks", layout(magnet)),
@@ -171,7 +196,7 @@ def magnet_rows(magnet: Magnet) -> list[tuple[str, str]]:
             ("main multipole", str(array.multipole_order))]
     if magnet.dimension == 3:
         rows.insert(3, ("length", f"{2e3 * magnet.array_half_length:.6g} mm"))
-    return [*rows, ("iron", iron_description(magnet))]
+    return dict([*rows, ("iron", iron_description(magnet))])
 
 
 def in_one_line(magnet: Magnet) -> str:

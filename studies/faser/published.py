@@ -22,7 +22,7 @@ from halbach_fe.report.page import (
     legend_above,
     stacked_axes,
 )
-from halbach_fe.report.prediction import MARKERS, main_line, parts_of, predictions
+from halbach_fe.report.point_maps import MARKERS, main_line, parts_of, predictions
 
 
 @dataclass(frozen=True)

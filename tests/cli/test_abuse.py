@@ -505,7 +505,7 @@ def test_a_folder_is_refused_before_the_check(tmp_path, capsys, monkeypatch):
     """Which may take a minute."""
     file = tmp_path / "map.csv"
     file.write_text("x_m,y_m,z_m,Bx_T,By_T,Bz_T\n0,0,0,1,0,0\n")
-    monkeypatch.setattr("halbach_fe.measurement.map_check.check_map", None)
+    monkeypatch.setattr("halbach_fe.check_map", None)
     code, sentence = refused(["check", file, "-o", file], capsys)
     assert code == 8
     assert f"Cannot make folder {file}: File exists. It is a file; name a folder" in sentence

@@ -226,7 +226,7 @@ def test_doctor(capsys):
 
 
 def test_doctor_can_fail(monkeypatch, capsys):
-    monkeypatch.setattr("halbach_fe.cli.shell.TOLERANCE", {"reaction": 1e-9})
+    monkeypatch.setattr("halbach_fe.cli.verbs.TOLERANCE", {"reaction": 1e-9})
     assert main(["doctor"]) == 9
     assert "differs from the closed form" in capsys.readouterr().err
 
@@ -630,7 +630,7 @@ def test_the_help_states_the_default_that_it_does_not_import():
 
 
 def test_a_bug_is_called_a_bug(study, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("halbach_fe.study.reader.read_study", lambda _: 1 / 0)
+    monkeypatch.setattr("halbach_fe.read_study", lambda _: 1 / 0)
     assert main(["solve", str(study), "-o", str(tmp_path / "out")]) == 1
     assert "please report it" in capsys.readouterr().err
 

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from halbach_fe.cli import guard, streams
+from halbach_fe.cli import guard
 from halbach_fe.cli.guard import guarded
 from tests.conftest import ROOT
 
@@ -185,4 +185,4 @@ def test_the_limit_of_memory():
 
 def test_every_character_has_a_spelling():
     """That is in ASCII."""
-    assert all(text.isascii() for text in streams.SPELLED.values())
+    assert all(text.isascii() for text in guard.SPELLED.values())

@@ -23,7 +23,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.inference.infer import infer
 from halbach_fe.report import sorting
-from halbach_fe.report.result_files import html_of, write_report
+from halbach_fe.report.page import html_of, write_report
 from halbach_fe.report.tolerance import OF_THE_DESIGN
 from halbach_fe.report.tolerance import answer as answer_of_tolerance
 from halbach_fe.response.homogeneity import default_region, homogeneity_model

@@ -18,7 +18,7 @@ from halbach_fe.design.ring_catalogue import Catalogue, largest_number
 from halbach_fe.design.ring_design import design_rings, task_of
 from halbach_fe.design.ring_search import Task, _best_pair, search
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.result_files import html_of, write_report
+from halbach_fe.report.page import html_of, write_report
 from halbach_fe.report.ring_design import STUDY_FILE, answer
 from halbach_fe.response.homogeneity import PPM, Region
 from halbach_fe.solver.session import Session

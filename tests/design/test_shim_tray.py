@@ -21,7 +21,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.result_files import html_of, write_report
+from halbach_fe.report.page import html_of, write_report
 from halbach_fe.response.homogeneity import PPM, Region, extremes
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian

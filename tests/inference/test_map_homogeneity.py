@@ -15,7 +15,7 @@ from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, MAP, POOR, not_c
 from halbach_fe.measurement.field_map import field_map, total_field_map
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.report.homogeneity import answer
-from halbach_fe.report.result_files import write_report
+from halbach_fe.report.page import write_report
 from halbach_fe.response.homogeneity import (
     Homogeneity,
     Region,

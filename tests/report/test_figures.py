@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 import halbach_fe as hf
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.page import begin_at_zero
+from halbach_fe.report.page import begin_at_zero, write_report
 from halbach_fe.report.prior import type_table
-from halbach_fe.report.result_files import write_report
 from halbach_fe.report.solution import field_figure
 from halbach_fe.solver.session import Session
 from halbach_fe.synthetic.simulate import simulate_campaign

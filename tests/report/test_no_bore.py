@@ -50,7 +50,7 @@ def test_pages(places, bore, dimension, session, tmp_path):
     magnet = magnet_of(places, dimension)
     assert magnet.has_bore == bore
     assert ("no bore" in in_one_line(magnet)) == (not bore)
-    assert any("radius of the bore" in name for name, _ in magnet_rows(magnet)) == bore
+    assert any("radius of the bore" in name for name in magnet_rows(magnet)) == bore
     if places is LINE:  # their poles are the control of the pictures
         return
     if places is ONE:

@@ -17,7 +17,7 @@ from halbach_fe.api import homogeneity
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.result_files import write_report
+from halbach_fe.report.page import write_report
 from halbach_fe.response.homogeneity import (
     SURFACE_DEGREE,
     Region,

@@ -11,7 +11,7 @@ import pytest
 from halbach_fe.cli import main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.report.result_files import write_report
+from halbach_fe.report.page import write_report
 from halbach_fe.report.verification import answer
 from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.discretization_error import observed_order, refined, verify

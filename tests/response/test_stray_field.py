@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.stray_field import stray_figure
+from halbach_fe.report.homogeneity import stray_figure
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.stray_field import NEAREST, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session

@@ -9,8 +9,7 @@ from html.parser import HTMLParser
 
 from halbach_fe.core.code_digest import version
 from halbach_fe.report.answer import PAGE_RECORD, Answer
-from halbach_fe.report.page import Page, Section, Table, write_files, write_page
-from halbach_fe.report.result_files import page_of
+from halbach_fe.report.page import Page, Section, Table, page_of, write_files, write_page
 
 
 def write_any_page(path, pictures, study=None, provenance=None, answer=None, rows=()):

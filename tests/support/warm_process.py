@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from halbach_fe.cli import main
 from halbach_fe.report import page
 
-IMPORTED = ["halbach_fe.api", "halbach_fe.cli.verbs", "halbach_fe.report.result_files",
+IMPORTED = ["halbach_fe.api", "halbach_fe.cli.verbs", "halbach_fe.report.page",
             "matplotlib.pyplot", "scipy.stats", "magpylib", __name__]
 
 PICTURE = page.png_of(Figure(figsize=(1, 1)))
