@@ -100,7 +100,7 @@ class NominalFields:
     @cached_property
     def block_fields(self) -> Floats:
         """B of each nominal block, (blocks, n, 3) in T."""
-        return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
+        return np.array([unit @ block.polarization
                          for block, unit in zip(self.blocks, self.unit_fields, strict=True)])
 
     @cached_property
@@ -179,7 +179,7 @@ class NominalFields:
 
     def _fields_of(self, blocks: Sequence[MagnetBlock]) -> Floats:
         """Return B (blocks, n, 3) in T of each of some blocks."""
-        return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
+        return np.array([unit @ block.polarization
                          for block, unit in zip(blocks, unit_fields(blocks, self.points),
                                                 strict=True)])
 

@@ -105,7 +105,7 @@ class Variations:
             mine = slice(starts[number], starts[number + 1])
             places = cells.nodes[mine]
             flat = places.reshape(-1, 3)
-            easy = np.array(block.easy_axis) * block.remanence
+            easy = block.polarization
             own = Interaction(_select_cells(cells, mine))
             effect = (own.readings(_cylinder(block, flat)) @ easy).reshape(-1, len(flat))
             distance = np.sum((flat[:, None] - flat)**2, axis=2)

@@ -16,7 +16,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import resource_estimate
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors, refined
+from halbach_fe.response.discretization_error import reading_errors, refined
 from halbach_fe.solver import mesh
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from halbach_fe.solver.getdp import run
@@ -110,7 +110,7 @@ def test_the_runs_are_those_foretold(studies, name, session):
         session, run=lambda getdp, job, *more: jobs.append(job) or run(getdp, job, *more))
     observation = observation_of(study)
     parts = finite_element_part(build_magnet(study), observation.points, session)
-    reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
+    reading_errors(build_magnet(study), observation, parts, session)
     estimate = resource_estimate.estimate_infer(build_magnet(study), observation, session.jobs)
     real = sorted((job.unknowns, job.solves) for job in jobs)
     foretold = sorted((one.unknowns, one.solves) for one in estimate.problems
