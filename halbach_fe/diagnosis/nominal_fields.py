@@ -17,7 +17,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.readings import unit_vectors
 from halbach_fe.measurement.instrument import (
     nonlinear_part,

@@ -309,7 +309,7 @@ def _spacing_error(magnet: Magnet, lines: Lines, mean: Floats) -> Floats:
         number = _blocks_of(magnet, points)
         for block in set(number[(number >= 0) & (number < len(magnet.blocks))]):
             one = magnet.blocks[block]
-            flux[number == block] += one.remanence * np.array(one.easy_axis)
+            flux[number == block] += one.polarization
         flux = np.nan_to_num(flux, posinf=0.0, neginf=0.0)  # on edges
         added = (own - flux[::finer])[:lines.count - 1 + lines.count % 2]
         found.append(change(flux, finer, step) + (0.0 if magnet.is_vacuum else change(
@@ -386,7 +386,7 @@ def _through_blocks(
     error += np.abs(tensors - np.eye(3)).max(initial=0.0) * np.abs(of_change[..., 0])
     of_change[..., 0] += strength
     polarization = np.zeros_like(of_change)
-    nominal = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
+    nominal = np.array([block.polarization for block in blocks])
     remanence[..., 0] += nominal
     weak = error.copy()
     for body in set(number[in_iron]):
@@ -419,7 +419,7 @@ def _through_cross_section(
     for block, unit in enumerate(unit_fields(blocks, points)):
         flux += (unit[..., :2] + parts.block(block, slice(None))) @ remanence[block, :2]
     flux[..., 0] += external_field(magnet, points) + field_of(blocks, points) + parts.nominal
-    remanence[..., 0] += [block.remanence * np.array(block.easy_axis) for block in blocks]
+    remanence[..., 0] += [block.polarization for block in blocks]
     polarization, weak = np.zeros_like(flux), error.copy()
     for body in set(number[number >= 0]):
         here = number == body

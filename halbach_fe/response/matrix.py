@@ -315,8 +315,7 @@ def _rows(
     matrix = np.empty((operator.shape[0], dimension * len(blocks)))
     for number, block in enumerate(blocks):
         readings = operator @ parts.block(number, seen).reshape(-1, dimension)
-        source = parts.sources[number]
-        contribution = readings * (source.remanence * np.array(source.easy_axis[:dimension]))
+        contribution = readings * parts.sources[number].polarization[:dimension]
         total += contribution.sum(axis=1)
         magnitude += np.abs(contribution).sum(axis=1)
         if vacuum is not None:

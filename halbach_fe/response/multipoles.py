@@ -29,7 +29,7 @@ from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.response.block_variation import Deviations
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values

@@ -48,7 +48,7 @@ from halbach_fe.core.errors import NotConvergedError
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.azimuthal_modes import to_cartesian
-from halbach_fe.solver.condensed_newton import factorize
+from halbach_fe.solver.dofs import factorize
 from halbach_fe.solver.interpolation import locate
 from halbach_fe.solver.iron_modes import (
     Complexes,

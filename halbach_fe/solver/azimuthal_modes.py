@@ -332,7 +332,7 @@ def nominal_waves(magnet: Magnet, highest: int) -> Floats:
     waves = np.zeros((highest + 1, 2, len(magnet.blocks_by_ring), 3))
     for block in magnet.blocks:
         middle = _middle(magnet, block)
-        x, y, axial = block.remanence * np.array(block.easy_axis)
+        x, y, axial = block.polarization
         along = np.cos(middle) * x + np.sin(middle) * y
         across = np.cos(middle) * y - np.sin(middle) * x
         cosine, sine = np.cos(m * middle), np.sin(m * middle)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sparse
+import scipy.sparse.linalg as sparse_linalg
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
@@ -260,3 +261,13 @@ def check_difference(difference: float, tolerance: float = MATRIX_TOLERANCE) -> 
         raise GetDPError(
             f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
             "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+
+
+def factorize(matrix: sparse.sparray, ordered: bool = False) -> sparse_linalg.SuperLU:
+    """Factorize a symmetric positive definite matrix, in an order that keeps the factors sparse.
+
+    ``ordered`` tells that the unknowns are in such an order already.
+    """
+    return sparse_linalg.splu(sparse.csc_array(matrix),
+                              permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
+                              diag_pivot_thresh=0.0, options={"SymmetricMode": True})

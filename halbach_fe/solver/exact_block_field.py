@@ -170,8 +170,7 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
         for first in range(0, len(same), most):
             some = [blocks[number] for number in same[first:first + most]]
             fields, axes = _fields_of_alike(some, points)
-            remanences = np.array([block.easy_axis for block in some]) * np.array(
-                [[block.remanence] for block in some])
+            remanences = np.array([block.polarization for block in some])
             sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
             total += np.einsum("bnk,bki->ni", fields, sums, optimize=True)
     return total

@@ -44,8 +44,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     excess_in,
     newton,
 )
-from halbach_fe.solver.condensed_newton import factorize
-from halbach_fe.solver.dofs import check_difference
+from halbach_fe.solver.dofs import check_difference, factorize
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
 from halbach_fe.solver.interpolation import (
     QUADRATURE,

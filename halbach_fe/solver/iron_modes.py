@@ -29,10 +29,10 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.solver.azimuthal_modes import unknowns_of
-from halbach_fe.solver.condensed_newton import factorize
 from halbach_fe.solver.dofs import (
     Unknowns,
     check_difference,
+    factorize,
     read_matrix,
     read_solutions,
     read_unknowns,

@@ -33,8 +33,7 @@ from halbach_fe.solver.azimuthal_modes import (
     modes_needed,
     unknowns_of,
 )
-from halbach_fe.solver.condensed_newton import factorize
-from halbach_fe.solver.dofs import Unknowns
+from halbach_fe.solver.dofs import Unknowns, factorize
 from halbach_fe.solver.interpolation import grid_operators
 from halbach_fe.solver.iron_modes import (
     GaussPoints,
