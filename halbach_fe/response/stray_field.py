@@ -226,12 +226,19 @@ def _farthest(
     largest = _largest(field, surface, distances)
     last = max((number for number, (size, _) in enumerate(largest) if size > limit_T), default=0)
     middle, place = distances[last], largest[last][1]
-    # along the line through that place; the field is a power of the distance, nearly
-    logarithms = np.log(middle) + np.linspace(-0.1, 0.4, 21)
-    line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
-    falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
-    distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
-    return distance, surface(distance, place[None])[0]
+    # along the line through that place the field is a power of the distance, nearly; farther out
+    # the largest |B| may be elsewhere
+    for _ in range(8):
+        logarithms = np.log(middle) + np.linspace(-0.1, 0.4, 21)
+        line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
+        falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
+        distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
+        farthest = surface(distance, place[None])[0]
+        ((size, place),) = _largest(field, surface, np.array([distance]))
+        if size <= 1.0001 * limit_T:
+            break
+        middle = distance
+    return distance, farthest
 
 
 def _largest(field: Field, surface: Surface, distances: Floats) -> list[tuple[float, Floats]]:
