@@ -215,21 +215,17 @@ def _farthest(
     while largest[-1][0] > limit_T:
         distances = distances[-1] * np.array([1.0, 2.0, 4.0])
         largest = _largest(field, surface, distances)
-    between = 5  # number of distances from one of these to the next at which it is then looked for
     if largest[0][0] <= limit_T:
-        distances = np.geomspace(near, distances[0], between)
+        distances = np.geomspace(near, distances[0], 5)
         largest = _largest(field, surface, distances)
     if largest[0][0] <= limit_T:
         return near, None
     last = max(number for number, (size, _) in enumerate(largest) if size > limit_T)
-    distances = np.geomspace(distances[last], distances[last + 1], between)
-    largest = _largest(field, surface, distances)
-    last = max((number for number, (size, _) in enumerate(largest) if size > limit_T), default=0)
     middle, place = distances[last], largest[last][1]
     # along the line through that place the field is a power of the distance, nearly; farther out
     # the largest |B| may be elsewhere
-    for _ in range(8):
-        logarithms = np.log(middle) + np.linspace(-0.1, 0.4, 21)
+    for _ in range(12):
+        logarithms = np.log(middle) + np.linspace(-0.1, 0.8, 37)
         line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
         falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
         distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
