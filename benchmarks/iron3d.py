@@ -24,7 +24,6 @@ from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.formulation_choice import finite_element_part
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.iron_modes import Resolution
-from halbach_fe.solver.separate_blocks import iron_rectangles
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 
@@ -96,7 +95,7 @@ def run(note: Note) -> None:
             def source(places: Floats, blocks: tuple[MagnetBlock, ...] = blocks) -> Floats:
                 return field_of(blocks, places)
 
-            here, bodies = session.within(f"case-{number}"), iron_rectangles(magnet)
+            here, bodies = session.within(f"case-{number}"), magnet.iron
             found = solve_iron(bodies, source, here.within("found"))
             modes = round(MORE_MODES * int(found.problem.numbers[-1]))
             truth = solve_iron(bodies, source, here.within("truth"), estimate=False,

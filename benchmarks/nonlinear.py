@@ -15,7 +15,7 @@ from halbach_fe.cli import common
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.nonlinear import newton_readings, nonlinear_model
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, vacuum_part
@@ -69,7 +69,7 @@ def faser(note: Note) -> None:
         session = Session(scales.getdp, Path(name), jobs=2)
         started = time.monotonic()
         parts = finite_element_part(build_magnet(study), points, session, columns=False)
-        stated = reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
+        stated = reading_errors(build_magnet(study), observation, parts, session)
         part = parts.nominal
         note("nonlinear.faser_3d_seconds", time.monotonic() - started, "s",
              f"error bars included; route {choose_route(build_magnet(study), points)}")

@@ -18,8 +18,8 @@ from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.free_blocks import blocks_of_table, blocks_table
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.mounting import as_meant, mountings
 from halbach_fe.geometry.prism import Prism, upright
+from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.array import block_name

@@ -288,7 +288,7 @@ def _polarized(
         induced = reaction.blocks[0].block_moments()
         found = []
         for block, moment in zip(blocks, induced, strict=True):
-            mean = np.array(block.easy_axis) * block.remanence + moment / block.volume
+            mean = block.polarization + moment / block.volume
             size = float(np.linalg.norm(mean))
             found.append(replace(block, remanence=size, easy_axis=vector(mean / size)))
         blocks = tuple(found)
@@ -402,7 +402,7 @@ def _jump(block: MagnetBlock, points: Floats, normals: Floats) -> Floats:
     """
     inside = block.contains(points)
     jump = np.zeros_like(points)
-    polarization = np.array(block.easy_axis) * block.remanence
+    polarization = block.polarization
     jump[inside] = (normals[inside] @ polarization)[:, None] * normals[inside]
     return jump
 
@@ -451,7 +451,7 @@ class Charges:
         rounding = 1e-9
         for number, block in enumerate(blocks):
             size = block.volume ** (1 / 3)
-            polarization = np.array(block.easy_axis) * block.remanence
+            polarization = block.polarization
             for factor, part in block.parts:
                 points, vectors = (np.vstack(each) for each in zip(
                     *_faces(part, order, size), strict=True))

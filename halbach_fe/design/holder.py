@@ -15,8 +15,14 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import Outline, distance_from_origin, thinnest_wall
-from halbach_fe.geometry.prism import Prism, circle, rectangle, widened, with_notch
+from halbach_fe.geometry.outline import (
+    Outline,
+    circle,
+    distance_from_origin,
+    rectangle,
+    thinnest_wall,
+)
+from halbach_fe.geometry.prism import Prism, widened, with_notch
 from halbach_fe.study.design import Holder, Rods
 
 SEGMENTS = {"0": "abcdef", "1": "bc", "2": "abged", "3": "abgcd", "4": "fgbc", "5": "afgcd",

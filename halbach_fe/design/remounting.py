@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.mounting import as_meant, mountings
+from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.study.array import BlockException
 
 LARGEST_ANGLE = np.radians(2.0)

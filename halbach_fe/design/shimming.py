@@ -37,7 +37,7 @@ from halbach_fe.design.objective import DeviationModel, Known, Objective
 from halbach_fe.design.remounting import Mounts, mounts_of, remounted
 from halbach_fe.design.sorting import Slots
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.block_prior import first_of_types, loose_blocks, with_types
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable

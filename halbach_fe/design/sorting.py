@@ -37,7 +37,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.block_prior import (
     as_mounted,
     first_of_types,

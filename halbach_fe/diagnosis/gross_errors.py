@@ -644,7 +644,7 @@ class _Nominal:
         field, across, variance = (np.zeros_like(points) for _ in range(3))
         for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             x, y, _ = block.easy_axis
-            field += unit @ (np.array(block.easy_axis) * block.remanence)
+            field += unit @ block.polarization
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)
             variance += np.sum((block_magnetization_sd * block.remanence * unit) ** 2, axis=2)
         sensors = sensor_matrix(study.instrument).T

@@ -17,7 +17,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.mounting import as_meant
+from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.readings import unit_vectors
 from halbach_fe.measurement.instrument import (
     nonlinear_part,
@@ -100,7 +100,7 @@ class NominalFields:
     @cached_property
     def block_fields(self) -> Floats:
         """B of each nominal block, (blocks, n, 3) in T."""
-        return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
+        return np.array([unit @ block.polarization
                          for block, unit in zip(self.blocks, self.unit_fields, strict=True)])
 
     @cached_property
@@ -175,7 +175,7 @@ class NominalFields:
 
     def _fields_of(self, blocks: Sequence[MagnetBlock]) -> Floats:
         """Return B (blocks, n, 3) in T of each of some blocks."""
-        return np.array([unit @ (np.array(block.easy_axis) * block.remanence)
+        return np.array([unit @ block.polarization
                          for block, unit in zip(blocks, unit_fields(blocks, self.points),
                                                 strict=True)])
 

@@ -14,7 +14,7 @@ import numpy as np
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
 from halbach_fe.geometry.free_blocks import nominal_free_blocks
-from halbach_fe.geometry.outline import Outline, closed_outline
+from halbach_fe.geometry.outline import Outline, closed_outline, trapezoid_corners
 from halbach_fe.study.array import Array, BlockException
 from halbach_fe.study.materials import MU_0
 
@@ -266,12 +266,10 @@ def outline_of_slot(array: Array, slot: int) -> Outline:
                 f"Input `array.block.side_gap_m` of study must leave the block some width at the "
                 f"inner radius; instead received {block.side_gap_m:g}. Reduce the gap."
             )
-        local = np.array([(inner, -widths[0]), (outer, -widths[1]),
-                          (outer, widths[1]), (inner, widths[0])])
+        local = trapezoid_corners((inner, outer), (widths[0], widths[1]))
         return closed_outline(local @ rotation_about_z(middle)[:2, :2].T)
     half_width, half_depth = block.width_m / 2, (outer - inner) / 2
-    local = np.array([(-half_depth, -half_width), (half_depth, -half_width),
-                      (half_depth, half_width), (-half_depth, half_width)])
+    local = trapezoid_corners((-half_depth, half_depth), (half_width, half_width))
     facing = np.radians(facing_angle_deg(array, slot))
     centre = (inner + outer) / 2 * np.array([np.cos(middle), np.sin(middle)])
     return closed_outline(local @ rotation_about_z(facing)[:2, :2].T + centre)

@@ -193,9 +193,19 @@ class MagnetBlock:
         return self.area * (self.z_max - self.z_min)
 
     @property
+    def polarization(self) -> Floats:
+        """The remanence (3,) in T along the easy axis."""
+        return np.array(self.easy_axis) * self.remanence
+
+    @property
+    def is_permeable(self) -> bool:
+        """Whether the block has another permeability than vacuum."""
+        return not self.isotropic or self.recoil_permeability != 1.0
+
+    @property
     def magnetization(self) -> Floats:
         """Nominal magnetization M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
-        return np.array(self.easy_axis) * self.remanence / (MU_0 * self.recoil_permeability)
+        return self.polarization / (MU_0 * self.recoil_permeability)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m lie inside the block, and not on its surface."""
@@ -222,8 +232,7 @@ class MagnetBlock:
 
 def present_blocks(blocks: Sequence[MagnetBlock]) -> tuple[MagnetBlock, ...]:
     """Return the blocks that are there: a missing one has neither remanence nor permeability."""
-    return tuple(block for block in blocks if block.remanence
-                 or block.recoil_permeability != 1.0 or not block.isotropic)
+    return tuple(block for block in blocks if block.remanence or block.is_permeable)
 
 
 def moved_block(block: MagnetBlock, turn_rad: float, z_m: float, factor: float) -> MagnetBlock:

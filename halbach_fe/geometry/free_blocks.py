@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
-from halbach_fe.geometry.outline import Outline, closed_outline
+from halbach_fe.geometry.outline import Outline, circle, closed_outline, trapezoid_corners
 from halbach_fe.study.array import Array
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, SIZES, FreeBlocks, Shape
 
@@ -109,18 +109,14 @@ def _outline(shape: Shape, sizes: tuple[Any, ...]) -> Outline:
         half = np.radians(size["angle_deg"]) / 2
         return sector_outline(size["inner_radius_m"], size["outer_radius_m"], -half, half)
     if shape == "cylinder":
-        angles = np.pi / 4 * np.array([-3, -1, 1, 3])
-        corners = size["radius_m"] * np.column_stack([np.cos(angles), np.sin(angles)])
-        return closed_outline(corners, arcs=(0, 1, 2, 3))
+        return circle(size["radius_m"])
     if shape == "polygon":
         angles = 2 * np.pi / size["sides"] * np.arange(size["sides"])
         return closed_outline(size["radius_m"] * np.column_stack([np.cos(angles), np.sin(angles)]))
     widths = ((size["size_y_m"],) * 2 if shape == "cuboid"
               else (size["inner_width_m"], size["outer_width_m"]))
     depth = size["size_x_m"] / 2
-    return closed_outline(np.array([
-        (-depth, -widths[0] / 2), (depth, -widths[1] / 2), (depth, widths[1] / 2),
-        (-depth, widths[0] / 2)]))
+    return closed_outline(trapezoid_corners((-depth, depth), (widths[0] / 2, widths[1] / 2)))
 
 
 def sector_outline(inner: float, outer: float, start: float, stop: float) -> Outline:
@@ -193,7 +189,7 @@ def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:
     materials = [array.of_ring(ring).material if array.ring else array.material
                  for ring in range(1, array.rings + 1)]
     for number, block in enumerate(magnet.blocks):
-        if not block.remanence and block.recoil_permeability == 1.0 and block.isotropic:
+        if not (block.remanence or block.is_permeable):
             continue  # a missing block has no effect on the field
         if table is not None and number >= first:
             row = _free_row(block, table, number - first)
@@ -217,7 +213,7 @@ def blocks_of_table(columns: dict[str, list[Any]]) -> tuple[MagnetBlock, ...]:
 
 def _material(block: MagnetBlock) -> dict[str, Any]:
     """Return the columns of number, remanence and permeability of any block."""
-    remanence = (np.array(block.easy_axis) * block.remanence).tolist()
+    remanence = block.polarization.tolist()
     return {
         "name": block.name, "ring": block.ring, "slot": block.slot,
         **dict(zip(REMANENCE_VECTOR, remanence, strict=True)),

@@ -144,8 +144,8 @@ class Magnet(ShownInNotebook):
         """Whether all permeabilities are 1 and nothing is lost, so that the closed-form field needs
         no correction.
         """
-        return not self.has_losses and not self.iron and all(
-            block.isotropic and block.recoil_permeability == 1.0 for block in self.blocks)
+        return not self.has_losses and not self.iron and not any(
+            block.is_permeable for block in self.blocks)
 
     @cached_property
     def nominal_magnetization(self) -> Floats:

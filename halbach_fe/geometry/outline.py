@@ -187,6 +187,23 @@ def closed_outline(corners: Floats, arcs: tuple[int, ...] = ()) -> Outline:
                  for i in range(len(points)))
 
 
+def trapezoid_corners(x: tuple[float, float], half_widths: tuple[float, float]) -> Floats:
+    """Return the corners (4, 2) in m of a trapezoid along x, with its half widths along y."""
+    (near, far), (narrow, wide) = x, half_widths
+    return np.array([(near, -narrow), (far, -wide), (far, wide), (near, narrow)])
+
+
+def circle(radius: float) -> Outline:
+    """Return a circle about the origin, in four arcs; the x axis crosses the middle of one."""
+    angles = np.pi / 4 * np.array([-3, -1, 1, 3])
+    return closed_outline(radius * np.column_stack([np.cos(angles), np.sin(angles)]), (0, 1, 2, 3))
+
+
+def rectangle(size_x: float, size_y: float) -> Outline:
+    """Return a rectangle about the origin."""
+    return closed_outline(trapezoid_corners((-size_x / 2, size_x / 2), (size_y / 2, size_y / 2)))
+
+
 def thinnest_wall(polygons: Sequence[Floats], owners: Sequence[object]) -> tuple[float, int, int]:
     """Return the smallest distance in m of two polygons, and their numbers.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.outline import Edge, Outline, closed_outline, outline_area
+from halbach_fe.geometry.outline import Edge, Outline, outline_area, rectangle
 
 ARC_STEP_RAD = np.radians(1.0)
 """Longest part of an arc that a chord replaces. At 150 mm from the centre it is 6 µm off."""
@@ -65,18 +65,6 @@ class Prism:
     def volume(self) -> float:
         """Volume in m^3."""
         return outline_area(self.outline) * (self.z_max - self.z_min)
-
-
-def circle(radius: float) -> Outline:
-    """Return a circle about the origin, in four arcs; the x axis crosses the middle of one."""
-    angles = np.pi / 4 * np.array([-3, -1, 1, 3])
-    return closed_outline(radius * np.column_stack([np.cos(angles), np.sin(angles)]), (0, 1, 2, 3))
-
-
-def rectangle(size_x: float, size_y: float) -> Outline:
-    """Return a rectangle about the origin."""
-    x, y = size_x / 2, size_y / 2
-    return closed_outline(np.array([(-x, -y), (x, -y), (x, y), (-x, y)]))
 
 
 def upright(block: MagnetBlock) -> Prism | None:

@@ -7,21 +7,27 @@ plane ``F'(x) = S F(S x) S``: the sign of axial vectors under reflection cancels
 
 `symmetry_images` returns the turns by which a magnet is turned onto itself, so that no field map
 tells its blocks apart.
+
+Blocks may be mounted in another place or turn than meant: `mountings`. The turns and moves after
+which they fit a slot are found by their shapes, so that they exist for rings and free blocks alike.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
+from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, nominal_blocks
+from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.outline import Outline, outline_contains, points_on
+from halbach_fe.study.array import Array
 from halbach_fe.study.magnet import External
 
 _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -157,7 +163,7 @@ def _is_periodic(outlines: list[Outline], tensors: Floats, step: int, pitch: flo
     if not _equal(np.roll(space @ tensors @ space.T, step, axis=1), tensors):
         return False
     turn = space[:2, :2]
-    return all(_same_shape(_corners(outline) @ turn.T, _corners(other))
+    return all(_apart(_ends(outline) @ turn.T, _ends(other)) < 1e-9
                for outline, other in zip(outlines, outlines[step:] + outlines[:step], strict=True))
 
 
@@ -166,14 +172,14 @@ def _equal(tensors: Floats, others: Floats) -> bool:
     return bool(np.abs(tensors - others).max() < 1e-12)
 
 
-def _corners(outline: Outline) -> Floats:
+def _ends(outline: Outline) -> Floats:
     return np.array([edge.start for edge in outline])
 
 
-def _same_shape(corners: Floats, others: Floats) -> bool:
-    """Tell whether two sets of corners (n, 2) in m are the same in any order."""
+def _apart(corners: Floats, others: Floats) -> float:
+    """Return how far two sets of points (n, d) in m are apart, in any order."""
     distance = np.linalg.norm(corners[:, None] - others[None], axis=2)
-    return bool((distance.min(axis=0) < 1e-9).all() and (distance.min(axis=1) < 1e-9).all())
+    return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
 
 
 def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
@@ -187,8 +193,8 @@ def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     if (magnet.iron or magnet.dimension == 2 or magnet.external != External() or any(
             block.gradient or block.corner_loss for block in blocks)):
         return None
-    corners = [_block_corners(block) for block in blocks]
-    moments = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
+    corners = [_corners(block) for block in blocks]
+    moments = np.array([block.polarization for block in blocks])
     middles = np.array([each.mean(axis=0) for each in corners])
     found = []
     # distance of corners in m, and difference of remanences in T, up to which blocks are equal:
@@ -196,8 +202,7 @@ def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     same_m, same_T = 1e-7, 1e-7
     for number, block in enumerate(blocks):
         there = int(np.linalg.norm(middles - turn @ middles[number], axis=1).argmin())
-        apart = np.linalg.norm((corners[number] @ turn.T)[:, None] - corners[there], axis=2)
-        if (max(apart.min(axis=0).max(), apart.min(axis=1).max()) > same_m
+        if (_apart(corners[number] @ turn.T, corners[there]) > same_m
                 or np.abs(turn @ moments[number] - moments[there]).max() > same_T
                 or _permeabilities(block) != _permeabilities(blocks[there])):
             return None
@@ -223,12 +228,261 @@ def symmetry_images(magnet: Magnet) -> list[tuple[int, ...]]:
     return list(images)
 
 
-def _block_corners(block: MagnetBlock) -> Floats:
-    """Return the corners (n, 3) of a block in m."""
-    return np.asarray(block.from_frame(np.array([
-        (*edge.start, z) for edge in block.outline for z in (block.z_min, block.z_max)])))
-
-
 def _permeabilities(block: MagnetBlock) -> tuple[float, float]:
     """Return the relative permeabilities of a block."""
     return block.recoil_permeability, block.recoil_permeability_across
+
+
+def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
+    """Return by block its intended place, and how its magnetization follows from the one there.
+
+    Returns
+    -------
+    list of (int, ndarray)
+        Number of the place (from 0, in the order of `Magnet.blocks`) that the block was made for,
+        and the matrix (3, 3) that turns the magnetization it would have there into the
+        magnetization that it has where it is mounted. The matrix is 0 for a missing block.
+    """
+    of_block, found = exceptions_of(magnet.array), []
+    for block in magnet.blocks:
+        ring, slot = block.mounted_from or (block.ring, block.slot)
+        number = magnet.number_of(ring, slot)
+        turn = rotation_matrix(block.rotation_rad) @ block.carried_from(magnet.blocks[number])
+        factor = magnetization_factor(of_block(block.ring, block.slot))
+        found.append((number, factor * turn))
+    return found
+
+
+def as_meant(magnet: Magnet) -> Magnet:
+    """Return the magnet with every block present, unrotated, and in the slot it was made for."""
+    meant = {"mounted_from": None, "magnetization_factor": 1.0, "rotation_deg": (0.0, 0.0, 0.0),
+             "twist_deg": 0.0, "tilt_deg": (0.0, 0.0)}
+    return magnet.with_(array__exceptions=tuple(
+        exception.with_(**meant) for exception in magnet.array.exceptions))
+
+
+Turn = tuple[tuple[float, float, float], ...]
+"""A rotation matrix, row by row."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """A move of many blocks from slot to slot.
+
+    Attributes
+    ----------
+    words : str
+        What is moved, and how.
+    pairs : tuple of (int, int)
+        Number from 0 of a block's slot, and of the slot from which the block that is there comes.
+    turn : tuple or None
+        Rotation of these blocks; None if each turns with the shape of its slot, see
+        `MagnetBlock.carried_from`.
+    """
+
+    words: str
+    pairs: tuple[tuple[int, int], ...]
+    turn: Turn | None
+
+
+@lru_cache(maxsize=4096)
+def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
+    """Return the turns of a block about its middle after which it fits its slot.
+
+    Of those that turn its magnetization into the same direction the smallest is returned, and none
+    that leaves it as it is. Turns by right angles about the axes of the shape are tried, and those
+    from edge to edge.
+    """
+    axes = block.shape_axes
+    tried = list(Rotation.create_group("O"))
+    edges = len(block.outline)
+    most_edges = 12  # number of edges of an outline up to which turns from edge to edge are tried
+    if edges <= most_edges:
+        tried += [Rotation.from_euler("z", 2 * np.pi * k / edges) for k in range(1, edges)]
+    found: list[tuple[Turn, Floats]] = []
+    corners = _corners(block)
+    same_direction = 1e-3  # difference of directions up to which two turns of a block are one
+    for turn in sorted(tried, key=lambda each: float(each.magnitude())):
+        matrix = axes @ turn.as_matrix() @ axes.T
+        direction = matrix @ np.array(block.easy_axis)
+        known = [np.array(block.easy_axis), *(each for _, each in found)]
+        nearest = min(np.linalg.norm(direction - each) for each in known)
+        if nearest > same_direction and _fits(
+                block, _shrink(corners) @ matrix.T + corners.mean(axis=0)):
+            found.append((_matrix_rows(matrix), direction))
+    return tuple(turn for turn, _ in found)
+
+
+def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
+    """Return the moves of rings, and of half of them, after which every block fits its slot.
+
+    Parameters
+    ----------
+    magnet : Magnet
+    kind : str
+        ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise than
+        their places, also the blocks without their holder) or ``upside down``.
+    """
+    return _moves(_drop_exceptions(magnet.array), magnet.dimension, kind)
+
+
+def _drop_exceptions(array: Array) -> Array:
+    """Return an array without its exceptions, whose blocks are all in their slots."""
+    return array.with_(exceptions=()) if array.exceptions else array
+
+
+@lru_cache(maxsize=32)
+def _moves(array: Array, dimension: int, kind: str) -> dict[str, Move]:
+    blocks = nominal_blocks(array, dimension)
+    every: dict[int, list[int]] = {}
+    for number, block in enumerate(blocks):
+        every.setdefault(block.ring, []).append(number)
+    groups = {f"ring {ring}": numbers for ring, numbers in every.items() if len(numbers) > 2}
+    # numbers of blocks in a ring, and of rings, up to which moves of rings are tried
+    most_in_ring, most_rings = 64, 40
+    if dimension == 2 or not 1 <= len(groups) <= most_rings or max(
+            map(len, groups.values())) > most_in_ring:
+        return {}
+    rings = dict(groups)
+    several = len(groups) > 1  # a whole magnet that is turned is an error of another kind
+    if len(groups) > 3:
+        names = list(groups)
+        for name, part in (("the lower half", names[:len(names) // 2]),
+                           ("the upper half", names[-(len(names) // 2):])):
+            groups[name] = [number for each in part for number in groups[each]]
+    tried = (_exchanges(blocks, groups) if kind == "exchanged"
+             else [*_turns(blocks, groups, kind)] if several else [])
+    if kind == "turned":
+        tried = [*tried, *_fillings(blocks, rings)]
+    return {move.words: move for move in tried}
+
+
+def _exchanges(
+    blocks: Sequence[MagnetBlock], groups: dict[str, list[int]]
+) -> Iterator[Move]:
+    """Yield the exchanges of two rings, or of the halves, each of which moves along z."""
+    names, still = list(groups), np.eye(3)
+    for number, one in enumerate(names):
+        for other in names[:number]:
+            if ("half" in one) != ("half" in other):
+                continue
+            way = _middle(blocks, groups[one]) - _middle(blocks, groups[other])
+            up = _pairs(blocks, (groups[other], groups[one]), still, way)
+            down = _pairs(blocks, (groups[one], groups[other]), still, -way)
+            if up is not None and down is not None and not {*groups[one]} & {*groups[other]}:
+                yield Move(f"{other} and {one}", (*up, *down), _matrix_rows(still))
+
+
+def _turns(
+    blocks: Sequence[MagnetBlock], groups: dict[str, list[int]], kind: str
+) -> Iterator[Move]:
+    """Yield the turns of a ring, or of a half, about z, or by half a turn about an axis across."""
+    for name, numbers in groups.items():
+        middle = _middle(blocks, numbers)
+        rings = {blocks[number].ring for number in numbers}
+        count = len(numbers) // len(rings)
+        for k in range(0 if kind == "upside down" else 1, count):
+            if kind == "turned":
+                turn = Rotation.from_euler("z", 2 * np.pi * k / count)
+                words = f"{name} {_by_slots(k, count)}"
+            else:
+                angle = np.pi * k / count + np.radians(blocks[numbers[0]].angle_deg)
+                turn = Rotation.from_rotvec(np.pi * np.array([np.cos(angle), np.sin(angle), 0.0]))
+                words = f"{name} about {np.degrees(angle) % 180:.4g}° from x"
+            pairs = _pairs(blocks, (numbers, numbers), turn.as_matrix(),
+                           middle - turn.apply(middle))
+            if pairs is not None:
+                yield Move(words, pairs, _matrix_rows(turn.as_matrix()))
+
+
+def _fillings(
+    blocks: Sequence[MagnetBlock], rings: dict[str, list[int]]
+) -> Iterator[Move]:
+    """Yield rings that were filled from another slot on, where slots are turned otherwise than
+    their places, as those of bars along the magnetization.
+    """
+    for name, numbers in rings.items():
+        count = len(numbers)
+        for k in range(1, count):
+            turn = Rotation.from_euler("z", 2 * np.pi * k / count).as_matrix()
+            pairs = _pairs(blocks, (numbers, numbers), turn, np.zeros(3), with_shape=True)
+            if pairs is not None and not all(
+                    np.allclose(blocks[to].carried_from(blocks[source]), turn)
+                    for to, source in pairs):
+                yield Move(f"the blocks of {name} {_by_slots(k, count)} each", pairs, None)
+
+
+def _by_slots(k: int, count: int) -> str:
+    """Describe a turn by ``k`` of ``count`` slots."""
+    signed = k if k <= count // 2 else k - count
+    return f"by {signed:+d} slot{'s' if abs(signed) > 1 else ''}"
+
+
+def _pairs(
+    blocks: Sequence[MagnetBlock], groups: tuple[list[int], list[int]], turn: Floats,
+    shift: Floats, with_shape: bool = False
+) -> tuple[tuple[int, int], ...] | None:
+    """Return slot and source of the blocks of a group that is moved to the slots of another one.
+
+    None if a block does not fit there. Blocks turn by ``turn``, or ``with_shape`` as their slots.
+    """
+    source, to = groups
+    if len(source) != len(to):
+        return None
+    places = np.array([blocks[number].middle for number in to])
+    found = []
+    for number in source:
+        corners = _corners(blocks[number])
+        there = turn @ blocks[number].middle + shift
+        slot = to[int(np.linalg.norm(places - there, axis=1).argmin())]
+        moved = (_shrink(corners) + corners.mean(axis=0)) @ turn.T + shift
+        if with_shape:
+            moved = _shrink(corners) @ blocks[slot].carried_from(blocks[number]).T + (
+                turn @ corners.mean(axis=0) + shift)
+        if not _fits(blocks[slot], moved):
+            return None
+        found.append((slot, number))
+    return tuple(found) if len({slot for slot, _ in found}) == len(to) else None
+
+
+def _fits(block: MagnetBlock, shrunk: Floats) -> bool:
+    """Tell whether points (n, 3) in m of a body that was shrunk all lie in the slot of a block.
+
+    None of them is on its surface, so that the distance from it, see `MagnetBlock.contains`, need
+    not be known.
+    """
+    places = block.to_frame(shrunk)
+    if not ((places[:, 2] > block.z_min) & (places[:, 2] < block.z_max)).all():
+        return False
+    return bool(outline_contains(block.outline, places[:, :2]).all())
+
+
+@lru_cache(maxsize=4096)
+def _corners(block: MagnetBlock) -> Floats:
+    """Return points (n, 3) in m on the edges of a block; of an infinite one, at |z| of 1 m."""
+    ends = [-1.0, 1.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
+    outline = points_on(block.outline)
+    corners = block.from_frame(np.vstack([
+        np.column_stack([outline, np.full(len(outline), z)]) for z in ends]))
+    corners.flags.writeable = False
+    return corners
+
+
+def _shrink(corners: Floats) -> Floats:
+    """Return corners (n, 3) about their middle, of a body that is slightly smaller."""
+    # A body whose size is reduced by this factor lies within its slot wherever it fits: slots are
+    # wider than blocks by about a hundredth, and edges of a block may differ by as much
+    reduction = 0.99
+    return np.asarray(reduction * (corners - corners.mean(axis=0)))
+
+
+def _middle(blocks: Sequence[MagnetBlock], numbers: Sequence[int]) -> Floats:
+    """Return the point (3,) in m on the axis in the middle of some blocks."""
+    heights = [blocks[number].middle[2] for number in numbers]
+    return np.array([0.0, 0.0, (min(heights) + max(heights)) / 2])
+
+
+def _matrix_rows(matrix: Floats) -> Turn:
+    """Return a matrix as a tuple."""
+    rows = matrix.round(12) + 0.0
+    return tuple((float(a), float(b), float(c)) for a, b, c in rows)

@@ -50,12 +50,13 @@ from halbach_fe.measurement.instrument import (
 )
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.response.block_variation import (
+    Deviations,
     distribution_of,
     neighbour_deviations,
     study_prior,
+    with_magnetizations,
     with_others,
 )
-from halbach_fe.response.deviation_field import Deviations, with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.formulation_choice import choose_route, field_function, solve_nominal

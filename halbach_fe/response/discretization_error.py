@@ -89,11 +89,6 @@ def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
     return magnet.with_(open_boundary=magnet.study.open_boundary.with_(**update))
 
 
-def error_bar_session(session: Session) -> Session:
-    """Return the session in a subfolder for error bars, so that the study's runs are kept."""
-    return session.within("error-bar")
-
-
 def reading_errors(
     magnet: Magnet, observation: Observation, parts: ElementFields, session: Session
 ) -> Floats:
@@ -113,7 +108,7 @@ def reading_errors(
     parts : ElementFields
         The finite-element part of the field at the observation's points.
     session : Session
-        Session for the additional solves, see `error_bar_session`.
+        The additional solves have a subfolder of its folder.
 
     Returns
     -------
@@ -148,8 +143,8 @@ def reading_errors(
 
 
 def _error_bars(session: Session, purpose: str) -> Session:
-    """Return the session with the purpose of its runs, for messages."""
-    return replace(session, purpose=f"error bars, {purpose}")
+    """Return the session in a subfolder, so that the study's runs are kept, with a purpose."""
+    return replace(session.within("error-bar"), purpose=f"error bars, {purpose}")
 
 
 def _changes_of_modes(

@@ -30,8 +30,9 @@ from halbach_fe.geometry.blocks import present_blocks
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.surface import Surroundings
 from halbach_fe.measurement.observation import flux_density_at
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
+from halbach_fe.solver.axisymmetric_iron import excess_of
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
 from halbach_fe.solver.formulation_choice import check_plane, check_points, finite_element_part
 from halbach_fe.solver.separate_blocks import (
@@ -308,7 +309,7 @@ def _spacing_error(magnet: Magnet, lines: Lines, mean: Floats) -> Floats:
         number = _blocks_of(magnet, points)
         for block in set(number[(number >= 0) & (number < len(magnet.blocks))]):
             one = magnet.blocks[block]
-            flux[number == block] += one.remanence * np.array(one.easy_axis)
+            flux[number == block] += one.polarization
         flux = np.nan_to_num(flux, posinf=0.0, neginf=0.0)  # on edges
         added = (own - flux[::finer])[:lines.count - 1 + lines.count % 2]
         found.append(change(flux, finer, step) + (0.0 if magnet.is_vacuum else change(
@@ -385,7 +386,7 @@ def _through_blocks(
     error += np.abs(tensors - np.eye(3)).max(initial=0.0) * np.abs(of_change[..., 0])
     of_change[..., 0] += strength
     polarization = np.zeros_like(of_change)
-    nominal = np.array([block.remanence * np.array(block.easy_axis) for block in blocks])
+    nominal = np.array([block.polarization for block in blocks])
     remanence[..., 0] += nominal
     weak = error.copy()
     for body in set(number[in_iron]):
@@ -409,7 +410,7 @@ def _through_cross_section(
     blocks = magnet.blocks
     parts = finite_element_part(magnet, points, session, anywhere=True)
     error = reading_errors(magnet, flux_density_at(points), parts,
-                           error_bar_session(session)).reshape(-1, 3)
+                           session).reshape(-1, 3)
     tensors = np.array([block.recoil_tensor for block in blocks])
     change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
                               magnetizations.root]).reshape(len(blocks), 2, -1)
@@ -418,7 +419,7 @@ def _through_cross_section(
     for block, unit in enumerate(unit_fields(blocks, points)):
         flux += (unit[..., :2] + parts.block(block, slice(None))) @ remanence[block, :2]
     flux[..., 0] += external_field(magnet, points) + field_of(blocks, points) + parts.nominal
-    remanence[..., 0] += [block.remanence * np.array(block.easy_axis) for block in blocks]
+    remanence[..., 0] += [block.polarization for block in blocks]
     polarization, weak = np.zeros_like(flux), error.copy()
     for body in set(number[number >= 0]):
         here = number == body
@@ -438,15 +439,25 @@ def _magnetized(body: IronSolid, flux: Floats) -> tuple[Floats, Floats]:
 
     Of the roots it is that of a small change.
     """
+    square = np.sum(flux[..., 0]**2, axis=1)
     if isinstance(body.law, float | int):
-        return (1 - 1 / body.law) * flux, np.full((len(flux), 1), 1 / body.law)
-    mean, curve = flux[..., 0], body.law.reluctivity
-    square = np.sum(mean**2, axis=1)
-    share, slope = MU_0 * curve.coefficient(square), 2 * MU_0 * curve.slope(square)
-    along = np.einsum("ni,niq->nq", mean, flux)
+        share, slope = np.full_like(square, 1 / body.law), np.zeros_like(square)
+    else:
+        curve = body.law.reluctivity
+        share, slope = MU_0 * curve.coefficient(square), 2 * MU_0 * curve.slope(square)
+    return (flux - _linearized(share, slope, flux),
+            np.maximum(share, share + slope * square)[:, None])
+
+
+def _linearized(factor: Floats, slope: Floats, field: Floats) -> Floats:
+    """Return f(|F|^2) F of the first of fields F (n, 3, 1 + q), and its change by the others.
+
+    ``factor`` is f and ``slope`` 2 df/d(|F|^2), both (n,).
+    """
+    along = np.einsum("ni,niq->nq", field[..., 0], field)
     along[:, 0] = 0.0
-    strength = share[:, None, None] * flux + (slope[:, None] * mean)[..., None] * along[:, None]
-    return flux - strength, np.maximum(share, share + slope * square)[:, None]
+    return factor[:, None, None] * field + (
+        slope[:, None] * field[..., 0])[..., None] * along[:, None]
 
 
 def _add_answer(
@@ -472,15 +483,9 @@ def _induced(body: IronSolid, strength: Floats) -> tuple[Floats, Floats]:
 
     Of the roots it is that of a small change.
     """
-    mean = strength[..., 0]
-    square = np.sum(mean**2, axis=1)
-    if isinstance(body.law, float | int):
-        return (body.law - 1) * strength, np.full((len(mean), 1), float(body.law))
-    curve = body.law.permeability
-    excess, slope = curve.coefficient(square) - 1, 2 * curve.slope(square)
-    along = np.einsum("ni,niq->nq", mean, strength)
-    along[:, 0] = 0.0
-    return (excess[:, None, None] * strength + (slope[:, None] * mean)[..., None] * along[:, None],
+    square = np.sum(strength[..., 0]**2, axis=1)
+    excess, slope = excess_of(body.law, square)
+    return (_linearized(excess, slope, strength),
             np.maximum(1 + excess, 1 + excess + slope * square)[:, None])
 
 

@@ -32,8 +32,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import flux_density_at
-from halbach_fe.response.block_variation import distribution_of
-from halbach_fe.response.deviation_field import Deviations, with_magnetizations
+from halbach_fe.response.block_variation import Deviations, distribution_of, with_magnetizations
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
 from halbach_fe.solver.formulation_choice import solve_nominal

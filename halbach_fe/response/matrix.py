@@ -37,7 +37,7 @@ from halbach_fe.response.block_variation import (
     field_changes,
     shared_deviations,
 )
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.formulation_choice import (
     SUPERPOSITION_TOLERANCE,
@@ -208,7 +208,7 @@ def response_matrix(
             magnet, similar, observation, session, _beside(path, key), changes)
     if built is None:
         parts = finite_element_part(magnet, observation.points, session)
-        error = reading_errors(magnet, observation, parts, error_bar_session(session))
+        error = reading_errors(magnet, observation, parts, session)
         built = _assemble(magnet, observation, parts, error, _beside(path, key), changes)
         check_superposition(built.superposition_error, parts.superposition_tolerance)
     _write(path, key, built)
@@ -237,7 +237,7 @@ def _similar_response(
     """
     own = session.within("similar")
     parts = finite_element_part(similar, observation.points, own)
-    error = reading_errors(similar, observation, parts, error_bar_session(own))
+    error = reading_errors(similar, observation, parts, own)
     nominal = finite_element_part(magnet, observation.points, session, columns=False).nominal
     built = _assemble(magnet, observation, replace(
         parts, nominal=nominal, along_nominal=nominal, sources=magnet.blocks, for_deviations=True),
@@ -315,8 +315,7 @@ def _rows(
     matrix = np.empty((operator.shape[0], dimension * len(blocks)))
     for number, block in enumerate(blocks):
         readings = operator @ parts.block(number, seen).reshape(-1, dimension)
-        source = parts.sources[number]
-        contribution = readings * (source.remanence * np.array(source.easy_axis[:dimension]))
+        contribution = readings * parts.sources[number].polarization[:dimension]
         total += contribution.sum(axis=1)
         magnitude += np.abs(contribution).sum(axis=1)
         if vacuum is not None:

@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
@@ -29,7 +30,7 @@ from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.response.block_variation import Deviations
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values
@@ -58,7 +59,8 @@ class MultipoleReference:
     ----------
     radius_m : float or None
         Reference radius R in m. None stands for the radius of the study's circles if they have a
-        single radius, and else for two thirds of the inner radius of the blocks.
+        single radius, and else for two thirds of the inner radius of the blocks, or
+        of poles of iron that are nearer to the axis.
     orders : tuple of int
         Orders of the unwanted multipoles, 1 for the dipole. The magnet's main order is ignored.
     z_m : float or None
@@ -584,25 +586,59 @@ def beyond(magnet: Magnet, reach: float) -> Complexes:
 def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
     """Return the reference radius in m, by default as `MultipoleReference` describes."""
     positions = magnet.study.observation.positions
-    bore = magnet.bore_radius
-    radius = reference.radius_m
+    free, radius = _free_radius(magnet, reference.z_m), reference.radius_m
     # default reference radius relative to the inner radius of the blocks, the usual choice
     default_radius = 2 / 3
     if radius is None:
         own = positions.radius_m if isinstance(positions, CirclePositions) else ()
-        radius = own[0] if len(own) == 1 else default_radius * bore
-    # smallest and largest reference radius relative to the inner radius of the blocks. Far inside,
-    # multipoles of high orders are zero to all digits; nearer to the blocks, sums over angles and z
-    # need very many points, and finite elements are inexact.
+        radius = own[0] if len(own) == 1 else default_radius * free
+    # smallest and largest reference radius relative to that of the bore. Far inside, multipoles of
+    # high orders are zero to all digits; nearer to blocks or iron, sums over angles and z need very
+    # many points, and finite elements are inexact.
     least_radius, most_radius = 1e-3, 0.95
+    bore = free if radius < free else magnet.bore_radius  # a circle in iron is no circle in air
     if not least_radius * bore <= radius <= most_radius * bore:
         raise StudyError(must_be(
             "--reference-radius-m", f"study {magnet.name}",
-            f"from {least_radius * bore:g} to {most_radius * bore:.4g} m, as the blocks' inner "
-            f"radius is {bore:g} m", f"{radius:g}",
+            f"from {least_radius * bore:g} to {most_radius * bore:.4g} m, as the "
+            f"{'blocks' if bore == magnet.bore_radius else 'poles'}' inner radius is {bore:.4g} m",
+            f"{radius:g}",
             "Was it meant in millimetres?" if radius / 1000 <= most_radius * bore < radius / 10
-            else "Choose a smaller one." if radius > bore else ""))
+            else "Choose a smaller one." if radius > most_radius * bore else ""))
     return radius
+
+
+def _free_radius(magnet: Magnet, z: float | None) -> float:
+    """Return the radius in m about the axis within which there are neither blocks nor iron.
+
+    Poles of iron may stand nearer to the axis than the blocks. Beside a circle at ``z`` only those
+    count that are nearer to it along z than the blocks are to the axis.
+    """
+    bore = magnet.bore_radius
+    bodies = [body for body in magnet.iron if not body.is_coaxial or body.inner_radius < bore]
+    if not bodies:
+        return bore
+    heights = np.zeros(1)
+    if magnet.dimension == 3:
+        ends = [(body.surface[2].min(), body.surface[2].max()) for body in bodies]
+        heights = np.unique(np.concatenate([np.linspace(*each, 9) for each in ends]))
+        if z is not None:
+            heights = np.append(heights[np.abs(heights - z) < bore], z)
+    angle = 2 * np.pi * np.arange(720) / 720
+    circles = np.column_stack([np.tile(np.cos(angle), len(heights)),
+                               np.tile(np.sin(angle), len(heights)), np.repeat(heights, 720)])
+
+    def is_free(radius: float) -> bool:
+        return not any(body.contains(circles * [radius, radius, 1.0]).any() for body in bodies)
+
+    radii = np.linspace(0, bore, 65).tolist()
+    for free, beyond in pairwise(radii):
+        if not is_free(beyond):
+            for _ in range(12):
+                middle = (free + beyond) / 2
+                free, beyond = (middle, beyond) if is_free(middle) else (free, middle)
+            return free
+    return bore
 
 
 def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -> Observation:
@@ -610,11 +646,12 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
 
     They are those of the circle at z, or in 3D with z None those of the field integrated along z.
     """
-    bore = magnet.bore_radius
-    # tolerance of sums over equally spaced angles or z, relative to the field at the blocks. Such a
-    # sum mixes a small part of a multipole into another. Harmonics of order k fall as (R / r)^k
-    # from the blocks' radius r inwards, and the sum over steps h along z of a field whose sources
-    # are at the distance d has the error exp(-2 pi d / h).
+    free = _free_radius(magnet, z)
+    bore = free if radius < free else magnet.bore_radius
+    # tolerance of sums over equally spaced angles or z, relative to the field at blocks and iron.
+    # Such a sum mixes a small part of a multipole into another. Harmonics of order k fall as
+    # (R / r)^k from their inner radius r inwards, and the sum over steps h along z of a field whose
+    # sources are at the distance d has the error exp(-2 pi d / h).
     sum_error = 1e-8
     angles = max(2 * highest + 1, highest + int(np.ceil(np.log(sum_error) / np.log(radius / bore))))
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)

@@ -32,11 +32,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import (
-    error_bar_session,
-    reading_errors,
-    variants_to_compare,
-)
+from halbach_fe.response.discretization_error import reading_errors, variants_to_compare
 from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
 from halbach_fe.solver.formulation_choice import (
@@ -237,7 +233,7 @@ def estimate_solve(magnet: Magnet, observation: Observation, jobs: int) -> Estim
     session = Session.counting(jobs)
     few = decisive_points(magnet, observation.points)
     parts = finite_element_part(magnet, few.points, session, columns=False)
-    reading_errors(magnet, few, parts, error_bar_session(session))
+    reading_errors(magnet, few, parts, session)
     return _estimate(magnet, observation.points, len(observation), session, jobs)
 
 
@@ -251,7 +247,7 @@ def estimate_infer(magnet: Magnet, observation: Observation, jobs: int) -> Estim
     session = Session.counting(jobs)
     few = decisive_points(magnet, observation.points)
     parts = finite_element_part(magnet, few.points, session)
-    reading_errors(magnet, few, parts, error_bar_session(session))
+    reading_errors(magnet, few, parts, session)
     if magnet.is_nonlinear:  # `infer` checks whether the iron is linear enough
         finite_element_part(magnet, few.points, replace(session, purpose=UPDATED_MAGNET),
                             columns=False)

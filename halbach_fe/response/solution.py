@@ -17,7 +17,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors
+from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.stray_field import StrayField, stray_field
 from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
@@ -154,7 +154,7 @@ def solve(magnet: Magnet, session: Session = NOT_KEPT) -> Solution:
     sensors = slice(-len(observation.points), None)
     errors = reading_errors(magnet, observation, replace(
         parts, nominal=parts.nominal[sensors],
-        error=None if parts.error is None else parts.error[sensors]), error_bar_session(session))
+        error=None if parts.error is None else parts.error[sensors]), session)
     return Solution(magnet, points, field[:len(points)], observation,
                     observation.apply(field[sensors]), errors, session.getdp.version,
                     stray_field(magnet, session))

@@ -7,7 +7,7 @@ a limit are roots of these functions, whatever lobes the field has.
 
 The field is that of the magnet alone, without the study's external sources. Permeable blocks and
 iron answer to the nominal magnet; what they answer to deviations from it is neglected, see
-`halbach_fe.response.deviation_field`.
+`halbach_fe.response.block_variation`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import vector
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.response.block_variation import distribution_of
-from halbach_fe.response.deviation_field import Deviations, with_magnetizations
+from halbach_fe.response.block_variation import Deviations, distribution_of, with_magnetizations
 from halbach_fe.solver.separate_blocks import applies, field_in_vacuum, solve_separate
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats.gaussian import Gaussian
@@ -39,7 +38,7 @@ of the magnet. Nearer to the edges of blocks the field is strong in any magnet."
 DISTANCES: Floats = np.array([0.125, 0.25, 0.5, 1.0, 2.0])
 """Distances from the magnet with which the search begins, relative to its radius."""
 
-Surface = Callable[[float, Floats], Floats]
+Surface = Callable[[float | Floats, Floats], Floats]
 """Takes a distance in m from the cylinder around the magnet, and places (n, 2): angles about the
 axis, and coordinates from -1 to 1. Returns points (n, 3) in m."""
 
@@ -159,13 +158,13 @@ def stray_field(
     field = _field(magnet, session, magnetizations)
     near = NEAREST * radius
 
-    def beside(distance: float, place: Floats) -> Floats:
+    def beside(distance: float | Floats, place: Floats) -> Floats:
         angle, along = place.T
         away = radius + distance
         return np.column_stack([away * np.cos(angle), away * np.sin(angle),
                                 (half + distance) * along])
 
-    def beyond(distance: float, place: Floats) -> Floats:
+    def beyond(distance: float | Floats, place: Floats) -> Floats:
         angle, along = place.T
         out = np.abs(along) * (radius + distance)
         return np.column_stack([out * np.cos(angle), out * np.sin(angle),
@@ -216,59 +215,61 @@ def _farthest(
     while largest[-1][0] > limit_T:
         distances = distances[-1] * np.array([1.0, 2.0, 4.0])
         largest = _largest(field, surface, distances)
-    between = 5  # number of distances from one of these to the next at which it is then looked for
     if largest[0][0] <= limit_T:
-        distances = np.geomspace(near, distances[0], between)
+        distances = np.geomspace(near, distances[0], 5)
         largest = _largest(field, surface, distances)
     if largest[0][0] <= limit_T:
         return near, None
-    last = max(number for number, (size, _, _) in enumerate(largest) if size > limit_T)
-    distances = np.geomspace(distances[last], distances[last + 1], between)
-    largest = _largest(field, surface, distances)
-    last = max((number for number, (size, _, _) in enumerate(largest) if size > limit_T), default=0)
-    middle = distances[last]
-    _, place, step = largest[last]
-    # number of places along both directions, within the steps around the largest |B| before, among
-    # which it is looked for in the end
-    zoom = 11
-    around = np.linspace(-1, 1, zoom)
-    for _ in range(2):
-        places = place + step * np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
-        places[:, 1] = np.clip(places[:, 1], -1, 1)
-        size = np.linalg.norm(field(surface(middle, places)), axis=1)
-        place, step = places[int(np.argmax(size))], step * (around[1] - around[0])
-    # along the line through that place; the field is a power of the distance, nearly
-    logarithms = np.log(middle) + np.linspace(-0.1, 0.4, 21)
-    line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
-    falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
-    distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
-    return distance, surface(distance, place[None])[0]
+    last = max(number for number, (size, _) in enumerate(largest) if size > limit_T)
+    middle, place = distances[last], largest[last][1]
+    # along the line through that place the field is a power of the distance, nearly; farther out
+    # the largest |B| may be elsewhere
+    for _ in range(12):
+        logarithms = np.log(middle) + np.linspace(-0.1, 0.8, 37)
+        line = np.vstack([surface(distance, place[None]) for distance in np.exp(logarithms)])
+        falling = np.log(np.linalg.norm(field(line), axis=1) / limit_T)
+        distance = float(np.exp(np.interp(0.0, -falling, logarithms)))
+        farthest = surface(distance, place[None])[0]
+        ((size, place),) = _largest(field, surface, np.array([distance]))
+        if size <= 1.0001 * limit_T:
+            break
+        middle = distance
+    return distance, farthest
 
 
-def _largest(
-    field: Field, surface: Surface, distances: Floats
-) -> list[tuple[float, Floats, Floats]]:
-    """Return the largest |B| in T at each distance, its place, and the steps of places, (2,)."""
-    found, every = [], []
+def _largest(field: Field, surface: Surface, distances: Floats) -> list[tuple[float, Floats]]:
+    """Return the largest |B| in T at each distance, and its place."""
+    starts, steps, of = [], [], []
     # limits of the number of places about the axis and along the other direction at which the
     # largest |B| of a surface is looked for. They lie as far apart as the surface is from the
-    # magnet: finer patterns of the field have decayed there.
+    # magnet: finer patterns of the field have decayed there. Near a large magnet they are farther
+    # apart; there it is looked for about the best place of every row.
     fewest, most = 16, 64
-    for distance in distances:
+    for number, distance in enumerate(distances):
         (x, y, z), = surface(distance, np.array([[0.0, 1.0]]))
         out = float(np.hypot(x, y))
-        angles, rows = (int(np.clip(length / distance, fewest, most))
-                        for length in (2 * np.pi * out, 2 * max(abs(z), out)))
+        needed = np.array([2 * np.pi * out, 2 * max(abs(z), out)]) / distance
+        angles, rows = np.clip(needed, fewest, most).astype(int).tolist()
         places = np.stack(np.meshgrid(2 * np.pi * np.arange(angles) / angles,
-                                      np.linspace(-1, 1, rows)), axis=-1).reshape(-1, 2)
-        every.append((places, np.array([2 * np.pi / angles, 2 / (rows - 1)]),
-                      surface(distance, places)))
-    size = np.linalg.norm(field(np.vstack([points for _, _, points in every])), axis=1)
-    ends = np.cumsum([len(places) for places, _, _ in every])[:-1]
-    for (places, step, _), own in zip(every, np.split(size, ends), strict=True):
-        number = int(np.argmax(own))
-        found.append((float(own[number]), places[number], step))
-    return found
+                                      np.linspace(-1, 1, rows)), axis=-1)
+        size = np.linalg.norm(field(surface(distance, places.reshape(-1, 2))), axis=1)
+        best = size.reshape(rows, angles).argmax(axis=1)
+        chosen = np.arange(rows) if (needed > most).any() else [int(size.argmax()) // angles]
+        starts.append(places[chosen, best[chosen]])
+        steps += len(chosen) * [np.array([2 * np.pi / angles, 2 / (rows - 1)])]
+        of += len(chosen) * [number]
+    place, step, owner = np.vstack(starts), np.array(steps), np.array(of)
+    around = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 5)]), axis=-1).reshape(-1, 2)
+    for _ in range(5):
+        tried = place[:, None] + step[:, None] * around
+        tried[..., 1] = np.clip(tried[..., 1], -1, 1)
+        size = np.linalg.norm(field(surface(
+            np.repeat(distances[owner], len(around)), tried.reshape(-1, 2))), axis=1)
+        size = size.reshape(len(owner), -1)
+        place, step = tried[np.arange(len(owner)), size.argmax(axis=1)], step / 2
+    found = [np.flatnonzero(owner == number) for number in range(len(distances))]
+    best = [own[size[own].max(axis=1).argmax()] for own in found]
+    return [(float(size[one].max()), place[one]) for one in best]
 
 
 def _sd(

@@ -41,20 +41,19 @@ import numpy as np
 import scipy.fft
 import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import NotConvergedError
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.azimuthal_modes import to_cartesian
-from halbach_fe.solver.condensed_newton import factorize
+from halbach_fe.solver.dofs import factorize
 from halbach_fe.solver.interpolation import locate
 from halbach_fe.solver.iron_modes import (
     Complexes,
     Exterior,
     IronModes,
-    IronRectangle,
     Resolution,
     assemble_modes,
     check_bodies,
@@ -62,6 +61,7 @@ from halbach_fe.solver.iron_modes import (
 )
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.session import Session
+from halbach_fe.study.materials import Curve
 
 Source = Callable[[Floats], Floats]
 """A function from points (n, 3) in m to mu_0 H (n, 3) in T there."""
@@ -81,8 +81,23 @@ TANGENT_MODES = 24
 """
 
 
+class WithBar:
+    """A reaction of iron that is solved on two meshes: with ``coarse``, the other solution."""
+
+    def error(self: Any, points: Floats) -> Floats:
+        """Return the error bar (n, 3) in T of `field`, nan without a coarser solution."""
+        return np.asarray(self.field_with_errors(points)[1])
+
+    def inside(self: Any, points: Floats) -> tuple[Floats, Floats]:
+        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""
+        found = self.strength(points)
+        change = np.nan if self.coarse is None else np.linalg.norm(
+            found - self.coarse.strength(points), axis=1)[:, None]
+        return found, np.broadcast_to(change, found.shape)
+
+
 @dataclass(frozen=True)
-class IronReaction:
+class IronReaction(WithBar):
     """The field that iron adds to that of its sources; `solve_iron` returns it.
 
     Attributes
@@ -131,16 +146,9 @@ class IronReaction:
         change = np.linalg.norm(found - self.coarse.field(points), axis=1)
         return found, np.repeat(change[:, None], 3, axis=1)
 
-    def error(self, points: Floats) -> Floats:
-        """Return the error bar (n, 3) in T of `field`, nan without a coarser solution."""
-        return self.field_with_errors(points)[1]
-
-    def inside(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""
-        found = _inside(self.name, self.problem.modes, self.problem.numbers, self.total, points)[0]
-        change = np.nan if self.coarse is None else np.linalg.norm(
-            found - self.coarse.inside(points)[0], axis=1)[:, None]
-        return found, np.broadcast_to(change, found.shape)
+    def strength(self, points: Floats) -> Floats:
+        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron."""
+        return _inside(self.name, self.problem.modes, self.problem.numbers, self.total, points)[0]
 
     def nodes(self, angles: int) -> Floats:
         """Return the points (angles k, 3) in m in the iron, angle by angle, for `tangent`."""
@@ -202,7 +210,7 @@ class IronReaction:
 
 
 def solve_iron(
-    bodies: Sequence[IronRectangle], source: Source, session: Session, name: str = "iron",
+    bodies: Sequence[IronSolid], source: Source, session: Session, name: str = "iron",
     resolution: Resolution | None = None, estimate: bool = True,
     start: IronReaction | None = None,
 ) -> IronReaction:
@@ -210,7 +218,7 @@ def solve_iron(
 
     Parameters
     ----------
-    bodies : sequence of IronRectangle
+    bodies : sequence of IronSolid
         May touch, but not overlap.
     source : callable
         mu_0 H of the sources in T at points (n, 3) in m in the iron, some 1e5 points.
@@ -251,7 +259,7 @@ def solve_iron(
     return IronReaction(name, problem, total, total - own, residuals, coarse)
 
 
-def _problem(modes: IronModes, bodies: tuple[IronRectangle, ...], numbers: Ints) -> Problem:
+def _problem(modes: IronModes, bodies: tuple[IronSolid, ...], numbers: Ints) -> Problem:
     """Return the discrete problem for some modes."""
     # angles of the non-linear law per mode: products of two modes do not alias into others
     angles_per_mode = 3
@@ -367,9 +375,9 @@ def _inside(
     return _evaluate(name, modes, potentials, points, anywhere=True)
 
 
-def highest_mode_at(bodies: Sequence[IronRectangle], points: Floats) -> int | None:
+def highest_mode_at(bodies: Sequence[IronSolid], points: Floats) -> int | None:
     """Return the highest mode that iron produces at points (n, 3) in m; None for all modes."""
-    inner = min(body.inner_radius_m for body in bodies)
+    inner = min(body.inner_radius for body in bodies)
     radius = float(np.hypot(points[:, 0], points[:, 1]).max(initial=0.0))
     if radius >= 0.999 * inner:
         return None
@@ -450,6 +458,22 @@ def coupled_modes(present: Sequence[int], highest: int) -> Ints:
     return np.flatnonzero(((m - first) % step == 0) | ((m + first) % step == 0))
 
 
+def excess_of(law: float | Curve, square: Floats) -> tuple[Floats, Floats]:
+    """Return mu_r - 1 and 2 d mu_r / d(|g|^2) of a material, at |g|^2, g = mu_0 H."""
+    if isinstance(law, float | int):
+        return np.full_like(square, law - 1), np.zeros_like(square)
+    return law.permeability.coefficient(square) - 1, 2 * law.permeability.slope(square)
+
+
+def excess_in(bodies: Sequence[IronSolid], body: Ints, square: Floats) -> tuple[Floats, Floats]:
+    """Return `excess_of` where the numbers of bodies, which are broadcast, are ``body``."""
+    excess, slope = np.empty_like(square), np.empty_like(square)
+    for number, own in enumerate(bodies):
+        mine = np.broadcast_to(body == number, square.shape)
+        excess[mine], slope[mine] = excess_of(own.law, square[mine])
+    return excess, slope
+
+
 @dataclass(frozen=True)
 class Problem:
     """The discrete problem.
@@ -457,7 +481,7 @@ class Problem:
     Attributes
     ----------
     modes : IronModes
-    bodies : tuple of IronRectangle
+    bodies : tuple of IronSolid
     numbers : ndarray of int
         The azimuthal modes, ascending.
     stiffnesses : tuple of sparse array, shape (iron, iron)
@@ -469,7 +493,7 @@ class Problem:
     """
 
     modes: IronModes
-    bodies: tuple[IronRectangle, ...]
+    bodies: tuple[IronSolid, ...]
     numbers: Ints
     stiffnesses: tuple[sparse.csr_array, ...]
     gradients: tuple[sparse.csr_array, ...]
@@ -502,18 +526,8 @@ class Problem:
         return np.asarray(np.einsum("m,mic,mic->c", shares, a.conj(), b).real)
 
     def law(self, field: Floats) -> tuple[Floats, Floats]:
-        """Return mu_r - 1 and 2 d mu_r / d(|g|^2) (angles, k) for grad psi (angles, 3, k)."""
-        square = np.einsum("aik,aik->ak", field, field)
-        excess, slope = np.empty_like(square), np.zeros_like(square)
-        for number, body in enumerate(self.bodies):
-            mine: NDArray[np.bool_] = self.modes.body == number
-            if isinstance(body.law, float | int):
-                excess[:, mine] = body.law - 1
-            else:
-                curve = body.law.permeability
-                excess[:, mine] = curve.coefficient(square[:, mine]) - 1
-                slope[:, mine] = 2 * curve.slope(square[:, mine])
-        return excess, slope
+        """Return `excess_in` (angles, k) for grad psi (angles, 3, k)."""
+        return excess_in(self.bodies, self.modes.body, np.einsum("aik,aik->ak", field, field))
 
     def residual(self, total: Complexes, source: Complexes) -> Complexes:
         """Return the residual (modes, iron, 1) of the total potential."""

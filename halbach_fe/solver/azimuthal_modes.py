@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.files import make_folder
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -49,15 +48,8 @@ from halbach_fe.solver.interpolation import (
     nodal_operators,
     probes_of,
 )
-from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, check_inside, render
-from halbach_fe.solver.mesh import (
-    CountedMesh,
-    Entities,
-    VerifiedMesh,
-    build_meridian,
-    count_mesh,
-    verify_mesh,
-)
+from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE, open_mesh, render, variants_of
+from halbach_fe.solver.mesh import CountedMesh, Entities, VerifiedMesh
 from halbach_fe.solver.session import RunSize, Session, Task, run_tasks
 
 PROBLEM = "azimuthal_modes.pro"
@@ -258,18 +250,13 @@ def solve_modes(
     """
     meridian, where = unique_points(meridian_points(magnet, points))
     highest = modes_needed(magnet, points) if highest is None else highest
-    mesh: VerifiedMesh | CountedMesh
-    if session.counter is None:
-        mesh = verify_mesh(build_meridian(magnet, make_folder(session.folder)))
-    else:
-        mesh = count_mesh(magnet, "meridian")
-    check_inside(magnet.name, mesh.radius, mesh.half_length, points)
+    mesh = open_mesh(magnet, points, session, "meridian")
     solved = tuple(sorted({magnet.blocks[number].ring - 1 for number in blocks}))
     weights = nominal_waves(magnet, highest)
     case = ModesCase(magnet, mesh, weights, solved, meridian)
     runs = runs_of(weights, unknowns_of(mesh.inner, mesh.axis, 1),
                    case.single if blocks and single_blocks is None else None)
-    variants = [False] if magnet.study.solver.method == "direct" else [False, True]
+    variants = variants_of(magnet)
     results = iter(run_tasks([_task(case, modes, sources, vacuum, session)
                               for modes, sources in runs for vacuum in variants], session))
     known = single_blocks(case, session) if blocks and single_blocks is not None else {}
@@ -345,7 +332,7 @@ def nominal_waves(magnet: Magnet, highest: int) -> Floats:
     waves = np.zeros((highest + 1, 2, len(magnet.blocks_by_ring), 3))
     for block in magnet.blocks:
         middle = _middle(magnet, block)
-        x, y, axial = block.remanence * np.array(block.easy_axis)
+        x, y, axial = block.polarization
         along = np.cos(middle) * x + np.sin(middle) * y
         across = np.cos(middle) * y - np.sin(middle) * x
         cosine, sine = np.cos(m * middle), np.sin(m * middle)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sparse
+import scipy.sparse.linalg as sparse_linalg
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
@@ -240,3 +241,33 @@ def read_matrix(path: Path, unknowns: int) -> sparse.csr_array:
         raise GetDPError(f"GetDP's matrix {path.name} holds values that are not finite.")
     return sparse.csr_array((values, columns, np.append(0, np.cumsum(lengths))),
                             shape=(unknowns, unknowns))
+
+
+MATRIX_TOLERANCE = 1e-9
+"""Largest difference between GetDP's matrix and ours, relative to its largest value. GetDP's Gauss
+points have 12 digits: 2e-12 were measured. Another numbering of the unknowns makes a difference of
+order 1."""
+
+
+def check_difference(difference: float, tolerance: float = MATRIX_TOLERANCE) -> None:
+    """Check the relative difference between GetDP's matrix and that of our Gauss points.
+
+    Raises
+    ------
+    GetDPError
+        If it is above the tolerance.
+    """
+    if not difference <= tolerance:
+        raise GetDPError(
+            f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
+            "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+
+
+def factorize(matrix: sparse.sparray, ordered: bool = False) -> sparse_linalg.SuperLU:
+    """Factorize a symmetric positive definite matrix, in an order that keeps the factors sparse.
+
+    ``ordered`` tells that the unknowns are in such an order already.
+    """
+    return sparse_linalg.splu(sparse.csc_array(matrix),
+                              permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
+                              diag_pivot_thresh=0.0, options={"SymmetricMode": True})

@@ -170,8 +170,7 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
         for first in range(0, len(same), most):
             some = [blocks[number] for number in same[first:first + most]]
             fields, axes = _fields_of_alike(some, points)
-            remanences = np.array([block.easy_axis for block in some]) * np.array(
-                [[block.remanence] for block in some])
+            remanences = np.array([block.polarization for block in some])
             sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
             total += np.einsum("bnk,bki->ni", fields, sums, optimize=True)
     return total
@@ -245,7 +244,7 @@ def field_on_circles(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
         for steps, block in members:
             turn = rotation_about_z(2 * np.pi * steps / angles)
             axes = first.axes
-            sums = _sums(axes.T @ turn.T @ (np.array(block.easy_axis) * block.remanence))
+            sums = _sums(axes.T @ turn.T @ block.polarization)
             field = (local @ (sums @ axes.T @ turn.T)).reshape(total.shape)
             total[steps:] += field[:angles - steps]
             total[:steps] += field[angles - steps:]
@@ -335,7 +334,7 @@ def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
         inside &= ~inside.all(axis=1, keepdims=True)
         own = np.where(inside.reshape(-1, 1), np.tile(points, (4, 1)), places)
         fields = (unit_field(block, own) @ (
-            np.array(block.easy_axis) * block.remanence)).reshape(2, 2, -1, 3)
+            block.polarization)).reshape(2, 2, -1, 3)
         across = step * (2 - inside.sum(axis=1))
         by_radius, by_angle = (fields[:, 0] - fields[:, 1]) / across[..., None]
         expansion = np.sum(by_radius * radial + by_angle * azimuthal, axis=1)

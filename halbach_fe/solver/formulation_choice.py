@@ -347,7 +347,7 @@ def _moments_part(
     along = nominal
     # the columns are derivatives there, and do not hold what answers to external fields
     if magnet.is_nonlinear or magnet.has_losses or external_acts(magnet):
-        along = sum((block(number, slice(None)) @ (np.array(each.easy_axis) * each.remanence)
+        along = sum((block(number, slice(None)) @ each.polarization
                      for number, each in enumerate(magnet.blocks)), np.zeros_like(nominal))
     # the same tolerance for the route ``moments``. The columns have a single cell per block, and
     # leave out what blocks and iron answer to each other.
@@ -434,7 +434,7 @@ def finer_in_words(magnet: Magnet, points: Floats) -> str:
         return f"a smaller mesh.block_size_m (now {1e3 * mesh.block_size_m:.3g} mm)"
     keys = []
     if route is Route.MOMENTS and (magnet.has_losses or any(
-            block.recoil_permeability != 1.0 or not block.isotropic for block in magnet.blocks)):
+            block.is_permeable for block in magnet.blocks)):
         keys.append(f"a larger mesh.cells_per_side (now {mesh.cells_per_side or CELLS_PER_SIDE})")
     if not magnet.iron_is_axisymmetric:
         size = min(sizes_in_iron(magnet))

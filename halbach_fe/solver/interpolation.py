@@ -41,6 +41,9 @@ centroids first, and tolerance in the element's reference coordinates within whi
 counts as inside. The last pass is for points beside a curved face, which elements of second order
 only approximate."""
 
+CELL_TYPES = {4: "quad", 6: "triangle6", 10: "tetra10"}
+"""meshio's name of a type of elements by their number of nodes."""
+
 _SIMPLEX_EDGES = {2: ((0, 1), (1, 2), (2, 0)),
                   3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}  # as meshio orders them
 _TETRAHEDRON_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # as GetDP numbers them
@@ -294,7 +297,7 @@ def _invert(
     inside : ndarray of bool, shape (n,)
         False also if Newton's method has not converged, as for points far from the element.
     """
-    kind = {4: "quad", 6: "triangle6", 10: "tetra10"}[nodes.shape[1]]
+    kind = CELL_TYPES[nodes.shape[1]]
     dimension = points.shape[1]
     reference = np.full((len(points), dimension), 0.0 if kind == "quad" else 1 / (dimension + 1))
     most_steps = 8  # most elements are not curved, so that the first step is exact for them
@@ -313,14 +316,17 @@ def _invert(
     return reference, converged & (weights >= -slack).all(axis=1)
 
 
-def _slopes(mesh: VerifiedMesh, located: Located, reference_slopes: Floats) -> Floats:
-    """Return gradients (n, k, d) in 1/m of functions from their derivatives in the element.
+def slopes_in(nodes: Floats, reference: Floats, slopes: Floats | None = None) -> Floats:
+    """Return gradients (n, k, d) in 1/m of functions in elements at reference coordinates (n, d).
 
-    ``reference_slopes`` (n, k, d) are the derivatives with respect to the reference coordinates.
+    ``nodes`` (n, nodes, d) in m are those of the element of every point, and ``slopes`` (n, k, d)
+    the functions' derivatives with respect to the reference coordinates, by default those of the
+    shape functions.
     """
-    _, geometry = shape_functions(mesh.cell_type, located.reference)
-    jacobian = np.einsum("nkd,nke->nde", mesh.points[mesh.cells[located.cells]], geometry)
-    return np.einsum("nke,ned->nkd", reference_slopes, np.linalg.inv(jacobian))
+    _, geometry = shape_functions(CELL_TYPES[nodes.shape[1]], reference)
+    jacobian = np.einsum("nkd,nke->nde", nodes, geometry)
+    return np.einsum("nke,ned->nkd", geometry if slopes is None else slopes,
+                     np.linalg.inv(jacobian))
 
 
 def nodal_operators(
@@ -347,7 +353,7 @@ def nodal_operators(
                                     for function, entities in zip(
                                         unknowns.functions[1:], (unknowns.edges, unknowns.faces),
                                         strict=True))])
-    slopes = _slopes(mesh, located, reference_slopes)
+    slopes = slopes_in(mesh.points[mesh.cells[located.cells]], located.reference, reference_slopes)
     return (located.mean @ sparse_operator(values, index, unknowns.count),
             [located.mean @ sparse_operator(slopes[..., axis], index, unknowns.count)
              for axis in range(slopes.shape[2])])
@@ -366,7 +372,7 @@ def curl_operators(
         One for each of the three components.
     """
     weights, reference_slopes = _barycentric(located.reference)
-    slopes = _slopes(mesh, located, np.broadcast_to(
+    slopes = slopes_in(mesh.points[mesh.cells[located.cells]], located.reference, np.broadcast_to(
         reference_slopes, (len(weights), *reference_slopes.shape)))
     edges, cells = unknowns.edges[located.cells], mesh.cells[located.cells]
     a, b = np.array(_TETRAHEDRON_EDGES).T

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,23 +31,32 @@ import scipy.sparse.linalg as sparse_linalg
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import GetDPError, OutputError, PointsOutsideError, StudyError, must_be
-from halbach_fe.core.files import make_folder
+from halbach_fe.core.errors import PointsOutsideError, StudyError, must_be
 from halbach_fe.core.threads import available_memory, in_threads, share_out
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.solver.axisymmetric_iron import Source, conjugate_gradients, newton
-from halbach_fe.solver.condensed_newton import factorize
-from halbach_fe.solver.dofs import read_matrix, read_solutions, read_unknowns
+from halbach_fe.solver.axisymmetric_iron import (
+    Source,
+    WithBar,
+    conjugate_gradients,
+    excess_in,
+    newton,
+)
+from halbach_fe.solver.dofs import check_difference, factorize
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, Job
-from halbach_fe.solver.interpolation import QUADRATURE, elements_of, quadrature, shape_functions
-from halbach_fe.solver.iron_modes import MESH
+from halbach_fe.solver.interpolation import (
+    QUADRATURE,
+    elements_of,
+    quadrature,
+    shape_functions,
+    slopes_in,
+)
+from halbach_fe.solver.iron_modes import MESH, alone, assembled
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
-from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
-from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
+from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
+from halbach_fe.solver.session import RunSize, Session
 
 if TYPE_CHECKING:
     from halbach_fe.geo.iron_bodies import Sizes
@@ -67,10 +75,6 @@ SOLUTION_TOLERANCE = 0.05
 Without preconditioning it is 20 to 60 times as large as what GetDP stops at: 6e-4 were measured by
 `ROUGHLY` in twelve boxes, and 0.02 where GetDP stopped just below `ROUGH_RESIDUAL`. Another
 numbering of the unknowns makes 0.5 or more."""
-
-MATRIX_TOLERANCE = 1e-9
-"""Largest difference between GetDP's matrix and ours inside the iron, relative to its largest
-value. GetDP's Gauss points have 12 digits: 2e-12 were measured."""
 
 
 @dataclass(frozen=True)
@@ -134,9 +138,7 @@ class Problem:
         if len(missing):
             raise PointsOutsideError("iron", "in the elements of its iron; instead "
                                      f"{len(missing)} points lie in none of them")
-        _, slopes = shape_functions("tetra10", reference)
-        jacobian = np.einsum("nkd,nke->nde", self.places[cells], slopes)
-        slopes = np.einsum("nke,ned->nkd", slopes, np.linalg.inv(jacobian))
+        slopes = slopes_in(self.places[cells], reference)
         found = np.zeros((len(points), potential.shape[1], 3))
         np.add.at(found, rows, -np.einsum("nkd,nkc->ncd", slopes, potential[self.nodes[cells]]))
         share = np.bincount(rows, minlength=len(points))[:, None, None]
@@ -151,18 +153,8 @@ class Problem:
         return np.asarray(np.einsum("nc,nc->c", a, b))
 
     def law(self, field: Floats) -> tuple[Floats, Floats]:
-        """Return mu_r - 1 and 2 d mu_r / d(|g|^2), both (e, 15), for grad psi (e, 15, 3)."""
-        square = np.einsum("eqi,eqi->eq", field, field)
-        excess, slope = np.empty_like(square), np.zeros_like(square)
-        for number, body in enumerate(self.bodies):
-            mine = self.body == number
-            if isinstance(body.law, float | int):
-                excess[mine] = body.law - 1
-            else:
-                curve = body.law.permeability
-                excess[mine] = curve.coefficient(square[mine]) - 1
-                slope[mine] = 2 * curve.slope(square[mine])
-        return excess, slope
+        """Return `excess_in`, both (e, 15), for grad psi (e, 15, 3)."""
+        return excess_in(self.bodies, self.body[:, None], np.einsum("eqi,eqi->eq", field, field))
 
     def residual(self, total: Floats, source: Floats) -> Floats:
         """Return the residual (n, 1) of the total potential."""
@@ -263,7 +255,7 @@ class Tangent:
 
 
 @dataclass(frozen=True)
-class BodiesReaction:
+class BodiesReaction(WithBar):
     """The field that iron adds to that of its sources; `solve_bodies` returns it.
 
     Attributes
@@ -302,10 +294,6 @@ class BodiesReaction:
             "nodes", "slopes", "weights", "places", "body")})
         return _field_of(part, self.polarization[mine], points)
 
-    def error(self, points: Floats) -> Floats:
-        """Return the error bar (n, 3) in T of `field`, nan without a coarser solution."""
-        return self.field_with_errors(points)[1]
-
     def field_with_errors(self, points: Floats) -> tuple[Floats, Floats]:
         """Return `field` and `error`, both (n, 3) in T, extrapolated by the coarser solution."""
         found = _field_of(self.problem, self.polarization, points)
@@ -325,12 +313,9 @@ class BodiesReaction:
         distance, nearest = KDTree(middle).query(points)
         return np.asarray(distance / radius[nearest])
 
-    def inside(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""
-        found = self.problem.strength(self.total, points)[0]
-        change = np.nan if self.coarse is None else np.linalg.norm(
-            found - self.coarse.inside(points)[0], axis=1)[:, None]
-        return found, np.broadcast_to(change, found.shape)
+    def strength(self, points: Floats) -> Floats:
+        """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron."""
+        return self.problem.strength(self.total, points)[0]
 
     def nodes(self, _angles: int = 0) -> Floats:
         """Return the points (k, 3) in m in the iron for `tangent`."""
@@ -456,38 +441,24 @@ def _assemble(magnet: Magnet, session: Session, sizes: Sizes) -> Problem:
     """Assemble the problem for elements of some sizes, as `assemble_bodies` does."""
     from halbach_fe.geo.iron_bodies import mesh_iron  # imports Gmsh
 
-    files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
-    make_folder(session.folder)
-    try:
-        regions, shell = mesh_iron(magnet.name, magnet.iron, sizes, files.mesh)
-        regions.write(files.regions)
-    except OSError as error:
-        raise OutputError(
-            f"Cannot write the mesh into {session.folder}: {error.strerror}.") from None
-    mesh = verify_mesh(files)
+    shells = []
+
+    def draw(path: Path) -> tags.Regions:
+        regions, shell = mesh_iron(magnet.name, magnet.iron, sizes, path)
+        shells.append(shell)
+        return regions
+
+    mesh = verify_mesh(write_files(session.folder, "iron", draw))
     count = mesh.inner.nodes
     _check_memory(magnet, count)  # gaps between bodies are not in the estimate
-    found = []
-
-    def stage(folder: Path) -> Job:
-        (folder / PROBLEM).write_bytes(resources.files(pro).joinpath(PROBLEM).read_bytes())
-        (folder / MESH).write_bytes(mesh.path.read_bytes())
-        x, y, z = shell.middle
-        return Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
-                   solutions=SOLUTIONS_FILE, unknowns=count, time_limit_s=session.time_limit_s,
-                   numbers={"R_INNER": shell.inner, "R_OUTER": shell.outer, "CX": x, "CY": y,
-                            "CZ": z, "BODIES": len(magnet.iron)},
-                   options=ROUGHLY, linear_residual=ROUGH_RESIDUAL)
-
-    def read(folder: Path) -> Floats:
-        found.append((read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", mesh.cell_type),
-                      read_matrix(folder / MATRIX_FILE, count)))
-        return np.array(read_solutions(folder / SOLUTIONS_FILE, count, 1), float)
-
-    (solution,) = run_tasks([Task(
-        "getdp-iron", stage, read, (1, count), 1,
-        RunSize("scalar_potential", mesh.elements, count, 1), matrix=True)], session)
-    unknowns, matrix = found[0]
+    (shell,), numbers = shells, ("CX", "CY", "CZ")
+    job = Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
+              solutions=SOLUTIONS_FILE, unknowns=count, time_limit_s=session.time_limit_s,
+              numbers={"R_INNER": shell.inner, "R_OUTER": shell.outer, "BODIES": len(magnet.iron),
+                       **dict(zip(numbers, shell.middle, strict=True))},
+              options=ROUGHLY, linear_residual=ROUGH_RESIDUAL)
+    ((unknowns, matrix, solution),) = assembled(
+        session, mesh, "scalar_potential", [("getdp-iron", alone(mesh, job))], count)
     problem = _problem(magnet.iron, mesh, unknowns.functions[0], matrix)
     in_air = mesh.tags < tags.FIRST_BLOCK_TAG
     check_matrix(problem, unknowns.functions[0][mesh.cells[in_air] + 1], solution.T)
@@ -505,22 +476,18 @@ def check_matrix(problem: Problem, surface: Ints, solution: Floats) -> None:
     GetDPError
         If they differ.
     """
-    def compare(theirs: Floats, ours: Floats, tolerance: float) -> None:
-        difference = np.abs(theirs - ours).max() / np.abs(ours).max()
-        if not difference <= tolerance:
-            raise GetDPError(
-                f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
-                "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+    def difference(theirs: Floats, ours: Floats) -> float:
+        return float(np.abs(theirs - ours).max() / np.abs(ours).max())
 
     matrix = problem.stiffness_of_vacuum
     inside = np.setdiff1d(problem.nodes, surface)
     if len(inside):  # thin bodies of one layer of elements have none
         any_potential = np.random.default_rng(0).standard_normal((matrix.shape[0], 1))
-        compare((matrix @ any_potential)[inside],
-                problem.integrate(problem.field(any_potential))[inside], MATRIX_TOLERANCE)
+        check_difference(difference((matrix @ any_potential)[inside], problem.integrate(
+            problem.field(any_potential))[inside]))
     along_z = np.zeros((*problem.weights.shape, 3, 1))
     along_z[..., 2, 0] = 1.0
-    compare(matrix @ solution, problem.integrate(along_z), SOLUTION_TOLERANCE)
+    check_difference(difference(matrix @ solution, problem.integrate(along_z)), SOLUTION_TOLERANCE)
 
 
 def size_of(magnet: Magnet, coarseness: float) -> RunSize:
@@ -554,9 +521,7 @@ def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,
     """Return the discrete problem; ``index`` has the unknown of a node, counted from 1."""
     iron = np.flatnonzero(mesh.tags >= tags.FIRST_BLOCK_TAG)
     located, weights = quadrature(mesh, iron)
-    _, slopes = shape_functions(mesh.cell_type, located.reference)
-    jacobian = np.einsum("nkd,nke->nde", mesh.points[mesh.cells[located.cells]], slopes)
-    slopes = np.einsum("nke,ned->nkd", slopes, np.linalg.inv(jacobian))
+    slopes = slopes_in(mesh.points[mesh.cells[located.cells]], located.reference)
     return Problem(
         bodies, matrix, index[mesh.cells[iron] + 1], slopes.reshape(-1, POINTS, 10, 3),
         weights.reshape(-1, POINTS), mesh.points[mesh.cells[iron]],

@@ -12,7 +12,7 @@ geometrically away from the edges.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
@@ -26,46 +26,25 @@ from numpy.typing import NDArray
 
 from halbach_fe import pro
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.errors import GetDPError, OutputError, StudyError, must_be
-from halbach_fe.core.files import make_folder
+from halbach_fe.core.errors import StudyError, must_be
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.solver.azimuthal_modes import unknowns_of
-from halbach_fe.solver.condensed_newton import factorize
-from halbach_fe.solver.dofs import Unknowns, read_matrix, read_solutions, read_unknowns
+from halbach_fe.solver.dofs import (
+    Unknowns,
+    check_difference,
+    factorize,
+    read_matrix,
+    read_solutions,
+    read_unknowns,
+)
 from halbach_fe.solver.getdp import Job
 from halbach_fe.solver.interpolation import Located, coordinates, grid_operators, nodal_operators
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
-from halbach_fe.solver.mesh import MeshFiles, VerifiedMesh, verify_mesh
+from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
 from halbach_fe.solver.session import MATRIX_FILE, RunSize, Session, Task, run_tasks
-from halbach_fe.study.materials import Curve
 
 ONE_LINE_M = 1e-9
 """Grid lines that are closer than this, in m, are one."""
-
-
-@dataclass(frozen=True)
-class IronRectangle:
-    """A tube or disc about the z axis: a rectangle of the half-plane.
-
-    Attributes
-    ----------
-    inner_radius_m, outer_radius_m : float
-        Radii; the inner radius of a disc is 0.
-    z_min_m, z_max_m : float
-        Ends.
-    law : float or Curve
-        Relative permeability, or magnetization curve.
-    """
-
-    inner_radius_m: float
-    outer_radius_m: float
-    z_min_m: float
-    z_max_m: float
-    law: float | Curve
-
-    def contains(self, r: Floats, z: Floats) -> NDArray[np.bool_]:
-        """Tell which points with r and z (n,) in m lie inside the rectangle."""
-        return np.asarray((r > self.inner_radius_m) & (r < self.outer_radius_m)
-                          & (z > self.z_min_m) & (z < self.z_max_m))
 
 
 @dataclass(frozen=True)
@@ -98,7 +77,7 @@ class Resolution:
                           max(1, round(2 * modes / 3)), 0.6 * self.boundary)
 
 
-def check_bodies(bodies: Sequence[IronRectangle]) -> None:
+def check_bodies(bodies: Sequence[IronSolid]) -> None:
     """Refuse bodies that are empty or overlap.
 
     Raises
@@ -106,35 +85,35 @@ def check_bodies(bodies: Sequence[IronRectangle]) -> None:
     StudyError
     """
     for body in bodies:
-        if not (0 <= body.inner_radius_m < body.outer_radius_m and body.z_min_m < body.z_max_m):
+        if not (0 <= body.inner_radius < body.outer_radius and body.z_min < body.z_max):
             raise StudyError(must_be("Iron", "the magnet", "a rectangle of the (r, z) half-plane",
                                      f"{body}", "Correct its radii and ends."))
     for a, b in combinations(bodies, 2):
-        across = min(a.outer_radius_m, b.outer_radius_m) - max(a.inner_radius_m, b.inner_radius_m)
-        along = min(a.z_max_m, b.z_max_m) - max(a.z_min_m, b.z_min_m)
+        across = min(a.outer_radius, b.outer_radius) - max(a.inner_radius, b.inner_radius)
+        along = min(a.z_max, b.z_max) - max(a.z_min, b.z_min)
         if min(across, along) > ONE_LINE_M:
             said = " and ".join(
-                f"one from r = {1e3 * body.inner_radius_m:.6g} to "
-                f"{1e3 * body.outer_radius_m:.6g} mm and z = {1e3 * body.z_min_m:.6g} to "
-                f"{1e3 * body.z_max_m:.6g} mm" for body in (a, b))
+                f"one from r = {1e3 * body.inner_radius:.6g} to "
+                f"{1e3 * body.outer_radius:.6g} mm and z = {1e3 * body.z_min:.6g} to "
+                f"{1e3 * body.z_max:.6g} mm" for body in (a, b))
             raise StudyError(must_be("`iron.bodies`", "the magnet", "bodies that do not overlap",
                                      said, "Move them apart, or let them touch."))
 
 
-def grid_lines(bodies: Sequence[IronRectangle], resolution: Resolution) -> tuple[Floats, Floats]:
+def grid_lines(bodies: Sequence[IronSolid], resolution: Resolution) -> tuple[Floats, Floats]:
     """Return the grid lines in r (from 0) and in z, in m, ascending.
 
     They include all edges of the bodies, and end at the outer boundary.
     """
-    outer = max(body.outer_radius_m for body in bodies)
-    extent = max(outer, *(abs(end) for body in bodies for end in (body.z_min_m, body.z_max_m)))
-    thinnest = min(min(body.outer_radius_m - body.inner_radius_m, body.z_max_m - body.z_min_m)
+    outer = max(body.outer_radius for body in bodies)
+    extent = max(outer, *(abs(end) for body in bodies for end in (body.z_min, body.z_max)))
+    thinnest = min(min(body.outer_radius - body.inner_radius, body.z_max - body.z_min)
                    for body in bodies)
     size, most = resolution.edge * thinnest, resolution.largest * outer
     far = resolution.boundary * extent
     r = _distinct_values(radius for body in bodies
-                  for radius in (body.inner_radius_m, body.outer_radius_m))
-    z = _distinct_values(end for body in bodies for end in (body.z_min_m, body.z_max_m))
+                  for radius in (body.inner_radius, body.outer_radius))
+    z = _distinct_values(end for body in bodies for end in (body.z_min, body.z_max))
     growth = resolution.growth
     is_disc = r[0] < ONE_LINE_M
     radii = [] if is_disc else [0.0, *(r[0] - _spaced(r[0], size, growth, most))[::-1][1:]]
@@ -149,12 +128,14 @@ def grid_lines(bodies: Sequence[IronRectangle], resolution: Resolution) -> tuple
     return np.array(radii), np.array(heights)
 
 
-def iron_cells(bodies: Sequence[IronRectangle], r: Floats, z: Floats) -> NDArray[np.int64]:
+def iron_cells(bodies: Sequence[IronSolid], r: Floats, z: Floats) -> NDArray[np.int64]:
     """Return for every rectangle of a grid the number of the body that it is part of, or -1."""
     middles = np.meshgrid((r[1:] + r[:-1]) / 2, (z[1:] + z[:-1]) / 2, indexing="ij")
     result = np.full(middles[0].shape, -1, np.int64)
     for number, body in enumerate(bodies):
-        result[body.contains(*middles)] = number
+        r, z = middles
+        result[(r > body.inner_radius) & (r < body.outer_radius)
+               & (z > body.z_min) & (z < body.z_max)] = number
     return result
 
 
@@ -382,7 +363,7 @@ def _condensed(modes: IronModes, mode: int) -> Exterior:
 
 
 def assemble_modes(
-    name: str, bodies: Sequence[IronRectangle], resolution: Resolution, session: Session
+    name: str, bodies: Sequence[IronSolid], resolution: Resolution, session: Session
 ) -> IronModes:
     """Have GetDP assemble the stiffness of the half-plane around iron, and verify it.
 
@@ -390,7 +371,7 @@ def assemble_modes(
     ----------
     name : str
         Name of the study.
-    bodies : sequence of IronRectangle
+    bodies : sequence of IronSolid
     resolution : Resolution
     session : Session
 
@@ -403,45 +384,61 @@ def assemble_modes(
 
     r, z = grid_lines(bodies, resolution)
     body = iron_cells(bodies, r, z)
-    files = MeshFiles(session.folder / MESH, session.folder / "iron-regions.json")
-    make_folder(session.folder)
-    try:
-        mesh_half_plane(name, r, z, body >= 0, files.mesh).write(files.regions)
-    except OSError as error:
-        raise OutputError(
-            f"Cannot write the mesh into {session.folder}: {error.strerror}.") from None
-    mesh = verify_mesh(files)
+    mesh = verify_mesh(write_files(session.folder, "iron", lambda path: mesh_half_plane(
+        name, r, z, body >= 0, path)))
     count = unknowns_of(mesh.inner, mesh.axis, 0)
-    found: dict[int, tuple[Unknowns, sparse.csr_array]] = {}
-
-    def task(mode: int) -> Task:
-        def stage(folder: Path) -> Job:
-            (folder / PROBLEM).write_bytes(resources.files(pro).joinpath(PROBLEM).read_bytes())
-            (folder / MESH).write_bytes(mesh.path.read_bytes())
-            return Job(problem=PROBLEM, mesh=MESH, resolution="Mode", outputs=(),
-                       solutions=SOLUTIONS_FILE, numbers={"MODE": mode}, unknowns=count,
-                       time_limit_s=session.time_limit_s)
-
-        def read(folder: Path) -> Floats:
-            unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", mesh.cell_type)
-            matrix = read_matrix(folder / MATRIX_FILE, count)
-            found[mode] = unknowns, matrix
-            return np.array(read_solutions(folder / SOLUTIONS_FILE, count, 1), float)
-
-        return Task(f"getdp-iron-mode{mode}", stage, read, (1, count), 1,
-                    RunSize("azimuthal_modes", mesh.elements, count, 1), matrix=True)
-
-    run_tasks([task(0), task(1)], session)
-    unknowns, plain = found[0]
+    (unknowns, plain, _), (_, first, _) = assembled(session, mesh, "azimuthal_modes", [
+        (f"getdp-iron-mode{mode}", alone(mesh, Job(
+            problem=PROBLEM, mesh=MESH, resolution="Mode", outputs=(), solutions=SOLUTIONS_FILE,
+            numbers={"MODE": mode}, unknowns=count, time_limit_s=session.time_limit_s)))
+        for mode in (0, 1)], count)
     everywhere = gauss_points(mesh, np.arange(mesh.elements), unknowns)
-    for mode in (0, 1):
-        check_matrix(everywhere, mode, found[mode][1])
+    for mode, matrix in enumerate((plain, first)):
+        check_matrix(everywhere, mode, matrix)
     in_iron = np.flatnonzero(mesh.in_iron)
     points = gauss_points(mesh, in_iron, unknowns)
     iron = np.unique(points.along_r.indices)
     number = body[np.searchsorted(r, points.r) - 1, np.searchsorted(z, points.z) - 1]
-    return IronModes(mesh, unknowns, plain, sparse.csr_array(found[1][1] - plain),
+    return IronModes(mesh, unknowns, plain, sparse.csr_array(first - plain),
                      axis_unknowns(mesh, unknowns), iron, points.restricted(iron), number)
+
+
+def alone(mesh: VerifiedMesh, job: Job) -> Callable[[Path], Job]:
+    """Return what fills a run folder with a problem that needs nothing but a mesh."""
+    def stage(folder: Path) -> Job:
+        (folder / job.problem).write_bytes(resources.files(pro).joinpath(job.problem).read_bytes())
+        (folder / job.mesh).write_bytes(mesh.path.read_bytes())
+        return job
+
+    return stage
+
+
+Assembled = tuple[Unknowns, sparse.csr_array, Floats]
+"""Unknowns of a problem, its matrix, and a solution (1, unknowns)."""
+
+
+def assembled(
+    session: Session, mesh: VerifiedMesh, route: str,
+    runs: Sequence[tuple[str, Callable[[Path], Job]]], count: int,
+) -> list[Assembled]:
+    """Have GetDP assemble and solve problems of ``count`` unknowns on a mesh.
+
+    Every run has a name, and what fills its folder.
+    """
+    found: dict[str, tuple[Unknowns, sparse.csr_array]] = {}
+
+    def task(name: str, stage: Callable[[Path], Job]) -> Task:
+        def read(folder: Path) -> Floats:
+            (problem,) = (path.stem for path in folder.glob("*.pro") if path.stem != "case")
+            found[name] = (read_unknowns(folder / f"{problem}.pre", mesh.cell_type),
+                           read_matrix(folder / MATRIX_FILE, count))
+            return np.array(read_solutions(folder / SOLUTIONS_FILE, count, 1), float)
+
+        return Task(name, stage, read, (1, count), 1,
+                    RunSize(route, mesh.elements, count, 1), matrix=True)
+
+    solutions = run_tasks([task(*each) for each in runs], session)
+    return [(*found[name], solution) for (name, _), solution in zip(runs, solutions, strict=True)]
 
 
 def points_at(
@@ -486,15 +483,7 @@ def check_matrix(
     GetDPError
         If the two matrices differ.
     """
-    difference = abs(points.stiffness(mode, permeability) - theirs).max() / abs(theirs).max()
-    # largest difference between GetDP's matrix and the one from our Gauss points, relative to its
-    # largest value. GetDP's Gauss points have 12 digits; another numbering of the unknowns makes a
-    # difference of order 1.
-    matrix_tolerance = 1e-9
-    if not difference <= matrix_tolerance:
-        raise GetDPError(
-            f"GetDP's matrix differs by {difference:.1e} from that of halbach-fe: this GetDP "
-            "numbers unknowns or places Gauss points in another way. Use GetDP 3.2.")
+    check_difference(abs(points.stiffness(mode, permeability) - theirs).max() / abs(theirs).max())
 
 
 def axis_unknowns(mesh: VerifiedMesh, unknowns: Unknowns) -> Ints:

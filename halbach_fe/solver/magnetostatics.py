@@ -62,6 +62,7 @@ from halbach_fe.solver.mesh import (
     CountedMesh,
     Entities,
     VerifiedMesh,
+    build_meridian,
     build_mesh,
     count_mesh,
     verify_mesh,
@@ -372,19 +373,31 @@ def _case(
     magnet: Magnet, points: Floats, blocks: Sequence[int], session: Session,
     formulation: Formulation, anywhere: bool = False,
 ) -> _Case:
-    """Mesh a magnet, verify the mesh and check that all points lie inside.
-
-    In a session that counts runs, only the numbers of mesh entities are estimated.
-    """
+    """Return the case of some sources and points, on the mesh of the magnet."""
     if magnet.dimension == 2:
         points = points * [1, 1, 0]  # the field does not depend on z, and the mesh is at z = 0
-    mesh: VerifiedMesh | CountedMesh
-    if session.counter is None:
-        mesh = verify_mesh(build_mesh(magnet, make_folder(session.folder)))
-    else:
-        mesh = count_mesh(magnet, "cross_section" if magnet.dimension == 2 else "extruded")
-    check_inside(magnet.name, mesh.radius, mesh.half_length, points)
+    kind = "cross_section" if magnet.dimension == 2 else "extruded"
+    mesh = open_mesh(magnet, points, session, kind)
     return _Case(magnet, mesh, points, blocks, formulation, anywhere, session.time_limit_s)
+
+
+def open_mesh(
+    magnet: Magnet, points: Floats, session: Session, kind: str
+) -> VerifiedMesh | CountedMesh:
+    """Mesh a magnet, verify the mesh and check that all points (n, 3) in m lie inside.
+
+    ``kind`` is a key of `halbach_fe.geometry.domain.BOUNDARY_RATIO`. In a session that counts runs,
+    only the numbers of mesh entities are estimated.
+    """
+    mesh = count_mesh(magnet, kind) if session.counter is not None else verify_mesh(
+        (build_meridian if kind == "meridian" else build_mesh)(magnet, make_folder(session.folder)))
+    check_inside(magnet.name, mesh.radius, mesh.half_length, points)
+    return mesh
+
+
+def variants_of(magnet: Magnet) -> list[bool]:
+    """Return whether vacuum replaces all materials, for every solve that the method needs."""
+    return [False] if magnet.study.solver.method == "direct" else [False, True]
 
 
 def _difference(
@@ -403,7 +416,7 @@ def _run_variants(
     ``tasks`` takes whether materials are replaced by vacuum, and the number of parallel runs among
     which the sources should be divided. It returns the runs of that variant.
     """
-    variants = [False] if magnet.study.solver.method == "direct" else [False, True]
+    variants = variants_of(magnet)
     by_variant = [tasks(vacuum, max(1, session.jobs // len(variants))) for vacuum in variants]
     results = run_tasks([task for part in by_variant for task in part], session)
     limits = np.cumsum([0, *(len(part) for part in by_variant)])

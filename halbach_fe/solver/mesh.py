@@ -8,7 +8,9 @@ numbers of nodes, edges and faces. For estimates these numbers are also computed
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import meshio
@@ -24,9 +26,6 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.model import Study
 
 MESH_NAME = "mesh.msh"
-REGIONS_NAME = "regions.json"
-MERIDIAN = "meridian"
-"""Prefix of the file names of the mesh of the (r, z) half-plane."""
 
 LEAST_BYTES = {2: 7200, 3: 2000}
 """Fewest bytes that the solve needs per element, by dimension: in a plane GetDP's 3600 for each of
@@ -153,11 +152,23 @@ def build_mesh(magnet: Magnet, folder: Path) -> MeshFiles:
     from halbach_fe import geo  # imports Gmsh, which only meshing needs
 
     _check_memory(magnet)
+    return write_files(folder, "", partial(
+        geo.mesh_2d if magnet.dimension == 2 else geo.mesh_3d, magnet))
+
+
+def write_files(folder: Path, name: str, draw: Callable[[Path], Regions]) -> MeshFiles:
+    """Write a mesh into ``folder`` by ``draw``, and the regions that it returns beside it.
+
+    Raises
+    ------
+    OutputError
+        If the files cannot be written.
+    """
+    files = MeshFiles(folder / (f"{name}.msh" if name else MESH_NAME),
+                      folder / f"{name}{'-' if name else ''}regions.json")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files = MeshFiles(folder / MESH_NAME, folder / REGIONS_NAME)
-        builder = geo.mesh_2d if magnet.dimension == 2 else geo.mesh_3d
-        builder(magnet, files.mesh).write(files.regions)
+        draw(files.mesh).write(files.regions)
     except OSError as error:
         raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
     return files
@@ -210,22 +221,13 @@ def with_rough_mesh(study: Study) -> Study:
 
 
 def build_meridian(magnet: Magnet, folder: Path) -> MeshFiles:
-    """Mesh the (r, z) half-plane of a rotationally symmetric magnet into ``folder``.
-
-    Raises
-    ------
-    OutputError
-        If the files cannot be written.
+    """Mesh the (r, z) half-plane of a rotationally symmetric magnet into ``folder``, see
+    `write_files`.
     """
     from halbach_fe import geo
 
-    files = MeshFiles(folder / f"{MERIDIAN}.msh", folder / f"{MERIDIAN}-regions.json")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        geo.mesh_meridian(magnet, meridian_size(magnet), files.mesh).write(files.regions)
-    except OSError as error:
-        raise OutputError(f"Cannot write the mesh into {folder}: {error.strerror}.") from None
-    return files
+    return write_files(folder, "meridian", partial(
+        geo.mesh_meridian, magnet, meridian_size(magnet)))
 
 
 def verify_mesh(files: MeshFiles) -> VerifiedMesh:

@@ -35,6 +35,13 @@ _TINY = 1e-26
 infinite otherwise. It is the square of 1e-13 of the size, which is below rounding."""
 
 Six = tuple[float, float, float, float, float, float]
+End = tuple[float, float, float, float, float]
+"""An end of an edge relative to the point: x and y, the square of its distance in the plane, and
+the point's distances R from it in the planes of the upper and the lower face."""
+Faces = tuple[float, float, float, float, float]
+"""How far the point is above the upper and the lower face, the squares of both, and the difference
+of their signs: -2 between the end faces, 0 outside. Those of an infinite prism are infinitely far.
+"""
 
 
 @compiled
@@ -56,19 +63,34 @@ def _angle(
 
 
 @compiled
-def _straight_edge(
-    ax: float, ay: float, a2: float, aup: float, alow: float,
-    bx: float, by: float, b2: float, bup: float, blow: float,
-    up: float, low: float, up2: float, low2: float, side: float, tiny: float, zero: float,
-) -> Six:
+def _sign(u: float) -> float:
+    """Return the sign of u, 0 for u = 0."""
+    return 1.0 if u > 0 else (-1.0 if u < 0 else 0.0)
+
+
+@compiled
+def _faces(z: float, z_min: float, z_max: float) -> Faces:
+    """Return the `Faces` of a prism between two values of z."""
+    up, low = z - z_max, z - z_min
+    return up, low, up * up, low * low, _sign(up) - _sign(low)
+
+
+@compiled
+def _end(x: float, y: float, faces: Faces, tiny: float) -> End:
+    """Return an end of an edge at x, y from the point."""
+    square = x * x + y * y
+    return x, y, square, sqrt(square + faces[2] + tiny), sqrt(square + faces[3] + tiny)
+
+
+@compiled
+def _straight_edge(a: End, b: End, faces: Faces, tiny: float, zero: float) -> Six:
     """Return 4 pi times the contribution of an edge from a to b to the field matrix.
 
-    Ends are relative to the point; ``a2`` is the square of the distance of a in the plane, ``aup``
-    and ``alow`` are the point's distances R from a in the planes of the upper and lower face, above
-    which it is by ``up`` and ``low``, and ``side`` is their `_side`. The faces of an infinite
-    prism are infinitely far. Only sums over closed outlines have the symmetric matrix that is
-    returned for every edge.
+    Only sums over closed outlines have the symmetric matrix that is returned for every edge.
     """
+    ax, ay, a2, aup, alow = a
+    bx, by, b2, bup, blow = b
+    up, low, up2, low2, side = faces
     length = sqrt((bx - ax) ** 2 + (by - ay) ** 2)
     if length < zero:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -112,33 +134,14 @@ def _straight_edge(
     return fx * nx, fy * ny, subtended, 0.5 * (fx * ny + fy * nx), along * nx, along * ny
 
 
-@compiled
-def _sign(u: float) -> float:
-    """Return the sign of u, 0 for u = 0."""
-    return 1.0 if u > 0 else (-1.0 if u < 0 else 0.0)
+NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @compiled
-def _side(up: float, low: float) -> float:
-    """Return the sign of ``up`` minus that of ``low``: -2 between the end faces, 0 outside."""
-    return _sign(up) - _sign(low)
-
-
-_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-@compiled
-def _sum(a: Six, b: Six) -> Six:
-    """Return the sum of two field matrices."""
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
-
-
-@compiled
-def _scaled(a: Six) -> Six:
-    """Return a field matrix divided by 4 pi."""
-    factor = 1 / (4 * pi)
-    return (a[0] * factor, a[1] * factor, a[2] * factor,
-            a[3] * factor, a[4] * factor, a[5] * factor)
+def added(a: Six, factor: float, b: Six) -> Six:
+    """Return a + factor b of two field matrices."""
+    return (a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2],
+            a[3] + factor * b[3], a[4] + factor * b[4], a[5] + factor * b[5])
 
 
 @compiled
@@ -155,26 +158,17 @@ def polygon_field(
     x, y, z : float, in m
         The point, in the prism's frame.
     """
-    up, low = z - half, z + half
-    up2, low2 = up * up, low * low
-    side = _side(up, low)
+    faces = _faces(z, -half, half)
     size2 = half * half
     for i in range(len(vertices)):
         size2 = max(size2, vertices[i, 0] ** 2 + vertices[i, 1] ** 2)
     tiny, zero = _TINY * size2, 1e-12 * sqrt(size2)
-    total = _NOTHING
-    last = len(vertices) - 1
-    bx, by = vertices[last, 0] - x, vertices[last, 1] - y
-    b2 = bx * bx + by * by
-    bup, blow = sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny)
+    total, last = NOTHING, len(vertices) - 1
+    there = _end(vertices[last, 0] - x, vertices[last, 1] - y, faces, tiny)
     for i in range(len(vertices)):
-        ax, ay, a2, aup, alow = bx, by, b2, bup, blow
-        bx, by = vertices[i, 0] - x, vertices[i, 1] - y
-        b2 = bx * bx + by * by
-        bup, blow = sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny)
-        total = _sum(total, _straight_edge(
-            ax, ay, a2, aup, alow, bx, by, b2, bup, blow, up, low, up2, low2, side, tiny, zero))
-    return _scaled(total)
+        here, there = there, _end(vertices[i, 0] - x, vertices[i, 1] - y, faces, tiny)
+        total = added(total, 1.0, _straight_edge(here, there, faces, tiny, zero))
+    return added(NOTHING, 1 / (4 * pi), total)
 
 
 ARC_LEVELS, ARC_NODES = 28, 12
@@ -204,15 +198,16 @@ def arc_table(sweep: float) -> tuple[Floats, Floats]:
 
 @compiled
 def _arc(radius: float, first: float, sweep: float, turns: Floats, weights: Floats,
-         x: float, y: float, up: float, low: float, side: float) -> Six:
+         x: float, y: float, faces: Faces) -> Six:
     """Return 4 pi times the contribution of an arc about the z axis, by Gauss quadrature.
 
     The arc is halved, and its halves are, until no panel is longer than the distance from its
     middle to the point; see `arc_table`, which makes ``turns`` and ``weights``.
     """
+    up, low, up2, low2, side = faces
     levels, order, flat = turns.shape[0], turns.shape[1], low == inf
     beyond = up if up > 0 else (-low if low < 0 else 0.0)
-    beyond2, up2, low2 = beyond * beyond, up * up, low * low
+    beyond2 = beyond * beyond
     xx = yy = zz = xy = xz = yz = 0.0
     place, level = 1, 0  # of a panel in the tree of halves: panel k has the halves 2k and 2k + 1
     while place:
@@ -285,20 +280,16 @@ def outline_fields(
     tiny, zero = _TINY * size2, 1e-12 * sqrt(size2)
     for n in range(first, last):
         x, y = points[n, 0], points[n, 1]
-        up, low = points[n, 2] - z_max, points[n, 2] - z_min
-        up2, low2, side = up * up, low * low, _side(up, low)
-        total = _NOTHING
+        faces = _faces(points[n, 2], z_min, z_max)
+        total = NOTHING
         for i in range(len(edges)):
-            ax, ay, bx, by = edges[i, 0] - x, edges[i, 1] - y, edges[i, 2] - x, edges[i, 3] - y
-            a2, b2 = ax * ax + ay * ay, bx * bx + by * by
-            total = _sum(total, _straight_edge(
-                ax, ay, a2, sqrt(a2 + up2 + tiny), sqrt(a2 + low2 + tiny),
-                bx, by, b2, sqrt(b2 + up2 + tiny), sqrt(b2 + low2 + tiny),
-                up, low, up2, low2, side, tiny, zero))
+            total = added(total, 1.0, _straight_edge(
+                _end(edges[i, 0] - x, edges[i, 1] - y, faces, tiny),
+                _end(edges[i, 2] - x, edges[i, 3] - y, faces, tiny), faces, tiny, zero))
         for i in range(len(arcs)):
-            total = _sum(total, _arc(arcs[i, 0], arcs[i, 1], arcs[i, 2], turns[i], weights,
-                                     x, y, up, low, side))
-        out[n] = _scaled(total)
+            total = added(total, 1.0, _arc(arcs[i, 0], arcs[i, 1], arcs[i, 2], turns[i], weights,
+                                           x, y, faces))
+        out[n] = added(NOTHING, 1 / (4 * pi), total)
 
 
 Four = tuple[float, float, float, float]

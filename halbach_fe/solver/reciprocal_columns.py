@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sparse
@@ -28,19 +27,23 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.solver.azimuthal_modes import (
     AXIS_RADIUS,
-    PROBLEM,
     ModesCase,
     fill_run_folder,
     meridian_points,
     modes_needed,
     unknowns_of,
 )
-from halbach_fe.solver.condensed_newton import factorize
-from halbach_fe.solver.dofs import Unknowns, read_matrix, read_unknowns
-from halbach_fe.solver.getdp import Job
+from halbach_fe.solver.dofs import Unknowns, factorize
 from halbach_fe.solver.interpolation import grid_operators
-from halbach_fe.solver.iron_modes import GaussPoints, axis_unknowns, check_matrix, gauss_points
-from halbach_fe.solver.session import LOOK_S, MATRIX_FILE, RunSize, Session, Task, run_tasks
+from halbach_fe.solver.iron_modes import (
+    GaussPoints,
+    assembled,
+    axis_unknowns,
+    check_matrix,
+    gauss_points,
+)
+from halbach_fe.solver.magnetostatics import variants_of
+from halbach_fe.solver.session import LOOK_S, RunSize, Session
 
 SAVED_SOLVES = 2000
 """Solves that reciprocity must save. Below that GetDP takes less than some two minutes for the
@@ -143,7 +146,7 @@ def reciprocal_gradients(case: ModesCase, session: Session) -> dict[int, Floats]
         If GetDP fails, or its matrix differs from that of our Gauss points.
     """
     numbers = range(len(case.weights))
-    variants = [False] if case.magnet.study.solver.method == "direct" else [False, True]
+    variants = variants_of(case.magnet)
     if session.counter is not None:
         size = RunSize(
             "azimuthal_modes", case.mesh.elements, unknowns_of(case.mesh.inner, case.mesh.axis, 0),
@@ -189,20 +192,11 @@ def _assembled(case: ModesCase, session: Session) -> tuple[Unknowns, sparse.csr_
     one = replace(case, solved=case.solved[:1])
     source = one.single[1]
     count = unknowns_of(case.mesh.inner, case.mesh.axis, 0)
-    found: list[tuple[Unknowns, sparse.csr_array]] = []
-
-    def stage(folder: Path) -> Job:
-        return fill_run_folder(one, folder, [0], (source, source), source, False,
-                               session.time_limit_s)
-
-    def read(folder: Path) -> Floats:
-        unknowns = read_unknowns(folder / f"{Path(PROBLEM).stem}.pre", case.real_mesh.cell_type)
-        found.append((unknowns, read_matrix(folder / MATRIX_FILE, count)))
-        return np.zeros(0)
-
-    run_tasks([Task("getdp-matrix-mode0", stage, read, (0,), 1, RunSize(
-        "azimuthal_modes", case.mesh.elements, count, 1), matrix=True)], session)
-    return found[0]
+    ((unknowns, matrix, _),) = assembled(
+        session, case.real_mesh, "azimuthal_modes",
+        [("getdp-matrix-mode0", lambda folder: fill_run_folder(
+            one, folder, [0], (source, source), source, False, session.time_limit_s))], count)
+    return unknowns, matrix
 
 
 def _materials(case: ModesCase) -> tuple[Ints, Floats]:

@@ -30,7 +30,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     solve_iron,
 )
 from halbach_fe.solver.exact_block_field import external_field, field_on_circles, unit_fields
-from halbach_fe.solver.iron_modes import IronRectangle, Resolution, check_bodies
+from halbach_fe.solver.iron_modes import Resolution, check_bodies
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.magnet import External
 
@@ -176,7 +176,7 @@ def _solve_iron(
     """
     if magnet.iron_is_axisymmetric:
         resolution = replace(Resolution().coarser(1), modes=None) if rough else None
-        return solve_iron(iron_rectangles(magnet), source, session, magnet.name, resolution,
+        return solve_iron(magnet.iron, source, session, magnet.name, resolution,
                           estimate, start)
     from halbach_fe.solver.iron_bodies import COARSER, solve_bodies  # imports numba
 
@@ -192,7 +192,7 @@ def sizes_of_iron(magnet: Magnet, estimate: bool) -> list[RunSize]:
         If bodies overlap.
     """
     if magnet.iron_is_axisymmetric:
-        check_bodies(iron_rectangles(magnet))
+        check_bodies(magnet.iron)
         return []
     from halbach_fe.geo.iron_bodies import check_apart  # imports Gmsh
     from halbach_fe.solver.iron_bodies import COARSER, size_of
@@ -219,7 +219,7 @@ def iron_alone(magnet: Magnet, points: Floats, session: Session) -> Floats:
     source = field_in_vacuum(present_blocks(magnet.blocks))
     if not magnet.iron_is_axisymmetric:
         return _solve_iron(magnet, source, session).field(points)
-    bodies = iron_rectangles(magnet)
+    bodies = magnet.iron
     most = None if magnet.is_nonlinear else highest_mode_at(bodies, points)
     resolution = Resolution(modes=None if most is None else min(most, MOST_MODES))
     return solve_iron(bodies, source, session, magnet.name, resolution,
@@ -270,12 +270,6 @@ def separate_columns(
     return column
 
 
-def iron_rectangles(magnet: Magnet) -> tuple[IronRectangle, ...]:
-    """Return the iron of a magnet as rectangles of the (r, z) half-plane."""
-    return tuple(IronRectangle(body.inner_radius, body.outer_radius, body.z_min, body.z_max,
-                               body.law) for body in magnet.iron)
-
-
 def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     """Return a function of points (n, 3) in m that computes mu_0 H of the blocks in vacuum, in T.
 
@@ -316,7 +310,7 @@ def _sum_of_fields(first: Field, second: Field | None) -> Field:
 
 def _permeable(blocks: Sequence[MagnetBlock]) -> bool:
     """Tell whether any block has another permeability than vacuum."""
-    return any(not block.isotropic or block.recoil_permeability != 1.0 for block in blocks)
+    return any(block.is_permeable for block in blocks)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.report.page import write_files
-from halbach_fe.response.deviation_field import with_magnetizations
+from halbach_fe.response.block_variation import with_magnetizations
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import NonlinearModel, nonlinear_model
 from halbach_fe.solver.ring_harmonics_2d import SectorMagnetization, layered_bore_field

@@ -62,4 +62,4 @@ def test_the_response_depends_on_solver_and_problems_but_not_on_pages():
 
 def test_chains_depend_on_the_sampler_too():
     names = {path.name for path in sources("halbach_fe.inference.mcmc")}
-    assert {"pcn.py", "condensed_newton.py", "matrix.py", "magnetostatics_2d.pro"} <= names
+    assert {"pcn.py", "nonlinear.py", "matrix.py", "magnetostatics_2d.pro"} <= names

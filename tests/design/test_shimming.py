@@ -14,7 +14,7 @@ from halbach_fe.design.remounting import mounts_of, remounted, rotation_deg, sha
 from halbach_fe.design.shimming import gain, shim, taken_out
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.mounting import mountings
+from halbach_fe.geometry.symmetry import mountings
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from

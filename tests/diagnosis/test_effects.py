@@ -13,7 +13,7 @@ from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.geometry.mounting import mountings
+from halbach_fe.geometry.symmetry import mountings
 from halbach_fe.measurement.instrument import nonlinear_part, sensor_model, with_memory
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.study.reader import parse_study

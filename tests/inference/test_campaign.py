@@ -27,7 +27,7 @@ from halbach_fe.measurement.field_map import field_map, write_map
 from halbach_fe.measurement.map_join import MapPose
 from halbach_fe.measurement.observation import concatenate, observe
 from halbach_fe.report.inference_answer import answer
-from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.response.block_variation import Deviations
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import root_matrix
 from halbach_fe.study.materials import MU_0

@@ -20,7 +20,7 @@ from halbach_fe.inference.storage import write_inference
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.observation import observe
 from halbach_fe.report.point_maps import main_line
-from halbach_fe.response.deviation_field import with_magnetizations
+from halbach_fe.response.block_variation import with_magnetizations
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.nonlinear import newton_readings
 from halbach_fe.solver.exact_block_field import gradient_of

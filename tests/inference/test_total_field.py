@@ -22,7 +22,7 @@ from halbach_fe.measurement.campaign import maps_of
 from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.registration import sentences
-from halbach_fe.response.deviation_field import Deviations
+from halbach_fe.response.block_variation import Deviations
 from halbach_fe.response.matrix import StoredMatrix
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0

@@ -8,11 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import multipoles
-from halbach_fe.response.matrix import response_matrix
+from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.multipoles import (
     UNITS,
     MultipoleReference,
@@ -21,6 +22,7 @@ from halbach_fe.response.multipoles import (
     multipole_model,
     multipole_models,
 )
+from halbach_fe.solver.session import NOT_KEPT
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -288,3 +290,43 @@ def test_the_main_multipole_has_the_solver_s_error(session):
     root[:, 0] = 1e-3 * model.nominal
     assert off.of(Gaussian(model.nominal, root)).main_sd == pytest.approx(
         np.hypot(1e-3 * known.main, 3e-4))
+
+
+POLES = {
+    "name": "poles", "dimension": 2, "mesh": {"block_size_m": 0.003, "bore_size_m": 0.0015},
+    "array": {"multipole_order": 2, "free_blocks": {
+        "name": ["right", "top", "left", "bottom"], "shape": ["cuboid"] * 4,
+        "x_m": [0.038, 0.0, -0.038, 0.0], "y_m": [0.0, 0.038, 0.0, -0.038], "z_m": [0.0] * 4,
+        "size_x_m": [0.032, 0.01, 0.032, 0.01], "size_y_m": [0.01, 0.032, 0.01, 0.032],
+        "remanence_x_T": [0.0, 1.25, 0.0, -1.25], "remanence_y_T": [1.25, 0.0, -1.25, 0.0],
+        "remanence_z_T": [0.0] * 4}},
+    "iron": {"relative_permeability": 1000.0, "bodies": [{
+        "kind": "prism", "copies": 4, "outline_m": [
+            [0.01061, 0.01061], [0.02, 0.0056], [0.06, 0.0456], [0.0456, 0.06], [0.0056, 0.02]]}]},
+    "observation": {"quantity": "flux_density", "positions": {
+        "kind": "circles", "radius_m": 0.01, "angles": 8}}}
+
+
+def test_circles_beside_poles_of_iron_have_enough_angles(monkeypatch):
+    """The poles begin at 15 mm, the blocks at 22 mm.
+
+    Orders up to 300 that are alike at 15 mm are no part of those up to 10; with the angles that the
+    blocks need they were hundreds of units of them.
+    """
+    def response(magnet, observation, session):
+        place = (observation.points[:, 0] + 1j * observation.points[:, 1]) / 0.015
+        field = sum(place**(order - 1) for order in (2, *range(40, 301)))
+        readings = observation.apply(np.column_stack([field.imag, field.real, 0 * field.real]))
+        return Response(readings[:, None], ("strength",), np.ones(1), *2 * (0 * readings,), 0.0)
+
+    monkeypatch.setattr(multipoles, "response_matrix", response)
+    magnet = build_magnet(parse_study(POLES))
+    model = multipole_model(magnet, MultipoleReference(0.014, tuple(range(1, 11))), NOT_KEPT)
+    assert np.abs(model.units(model.offset + model.matrix[:, 0])).max() < 0.1
+    assert multipole_model(magnet, MultipoleReference(), NOT_KEPT).radius == 0.01
+
+
+def test_circles_that_all_but_touch_poles_are_refused(session):
+    magnet = build_magnet(parse_study(POLES))
+    with pytest.raises(StudyError, match=r"to 0\.01425 m, as the poles' inner radius is 0\.015 m"):
+        multipole_model(magnet, MultipoleReference(0.0145), session)

@@ -21,6 +21,7 @@ from halbach_fe.core.files import make_folder
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.response import nonlinear as engine
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.nonlinear import (
@@ -29,7 +30,6 @@ from halbach_fe.response.nonlinear import (
     compare_with_newton,
     nonlinear_model,
 )
-from halbach_fe.solver import condensed_newton as engine
 from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from halbach_fe import geo
-from halbach_fe.geo import cross_section
+from halbach_fe.geo import extruded
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import resource_estimate
-from halbach_fe.response.discretization_error import error_bar_session, reading_errors, refined
+from halbach_fe.response.discretization_error import reading_errors, refined
 from halbach_fe.solver import mesh
 from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from halbach_fe.solver.getdp import run
@@ -82,9 +82,9 @@ def test_a_small_mesh_is_counted_exactly(studies, name, tmp_path):
 def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
     magnet = refined(build_magnet(read_study(ROOT / "studies" / source / "study.toml")), finer)
     kind = "cross_section" if magnet.dimension == 2 else "extruded"
-    monkeypatch.setattr(cross_section, "COUNTED", np.inf)
+    monkeypatch.setattr(extruded, "COUNTED", np.inf)
     real, rim = geo.plane_size(magnet, kind)
-    monkeypatch.setattr(cross_section, "COUNTED", real / 4)
+    monkeypatch.setattr(extruded, "COUNTED", real / 4)
     found, its_rim = geo.plane_size(magnet, kind)
     assert found != real
     assert within(COUNT_FACTOR, found, real)
@@ -96,7 +96,7 @@ def test_a_larger_mesh_is_extrapolated(source, finer, monkeypatch):
 def test_large_rings_are_drawn_in_part(studies, monkeypatch):
     study = studies["many blocks"]
     found, _ = geo.plane_size(build_magnet(study), "cross_section")
-    monkeypatch.setattr(cross_section, "DRAWN", 512)
+    monkeypatch.setattr(extruded, "DRAWN", 512)
     real, _ = geo.plane_size(build_magnet(study), "cross_section")
     assert found != real
     assert within(COUNT_FACTOR, found, real)
@@ -110,7 +110,7 @@ def test_the_runs_are_those_foretold(studies, name, session):
         session, run=lambda getdp, job, *more: jobs.append(job) or run(getdp, job, *more))
     observation = observation_of(study)
     parts = finite_element_part(build_magnet(study), observation.points, session)
-    reading_errors(build_magnet(study), observation, parts, error_bar_session(session))
+    reading_errors(build_magnet(study), observation, parts, session)
     estimate = resource_estimate.estimate_infer(build_magnet(study), observation, session.jobs)
     real = sorted((job.unknowns, job.solves) for job in jobs)
     foretold = sorted((one.unknowns, one.solves) for one in estimate.problems

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError, PointsOutsideError, StudyError
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import iron_modes
 from halbach_fe.solver.axisymmetric_iron import coupled_modes, solve_iron, to_angles, to_modes
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.iron_modes import IronRectangle, Resolution, grid_lines, iron_cells
+from halbach_fe.solver.iron_modes import Resolution, grid_lines, iron_cells
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
 from halbach_fe.study.materials import froehlich_kennelly
 from halbach_fe.synthetic import ngsolve_reaction
@@ -20,7 +21,7 @@ from halbach_fe.synthetic.iron import FroehlichLaw
 
 IRON = {"initial": 200.0, "saturation": 1.0}
 CURVE = froehlich_kennelly(**IRON)
-TUBE = IronRectangle(0.03, 0.036, -0.025, 0.025, CURVE)
+TUBE = IronSolid(0.03, 0.036, -0.025, 0.025, law=CURVE)
 POINTS = np.array([[0, 0, 0], [0.008, 0.003, 0.01], [-0.005, 0.008, -0.02], [0.004, -0.009, 0.03]])
 FEW = Resolution(edge=0.4, growth=2.2, largest=0.15, modes=8, boundary=10.0)
 """For what holds on any mesh."""
@@ -53,7 +54,7 @@ def test_infinitely_long_tube_in_closed_form(short_dipole, session):
     magnet = build_magnet(short_dipole(
         array__recoil_permeability=1.0, array__rings=1))
     array = magnet.array
-    tube = IronRectangle(0.2, 0.21, -12.0, 12.0, 100.0)
+    tube = IronSolid(0.2, 0.21, -12.0, 12.0, law=100.0)
     blocks = [replace(block, easy_axis=(1.0, 0.0, 0.0), z_min=-np.inf, z_max=np.inf)
               for block in magnet.blocks]
     found = solve_iron([tube], lambda points: field_of(blocks, points), session,
@@ -80,7 +81,7 @@ def test_thick_plate_mirrors_a_dipole(session):
     of the half-space makes 20^-3 of the field. All modes matter, since the dipole is off the axis.
     """
     place, mirrored = (0.01, 0.005, 0.02), (0.01, 0.005, -0.02)
-    plate = IronRectangle(0.0, 0.4, -0.3, 0.0, 50.0)
+    plate = IronSolid(0.0, 0.4, -0.3, 0.0, law=50.0)
     found = solve_iron([plate], dipole((1e-6, 2e-6, 3e-6), place), session,
                        resolution=Resolution(edge=0.01, growth=1.3, largest=0.3, modes=10))
     k = 49 / 51
@@ -100,10 +101,10 @@ def by_ngsolve(bodies, source, points, size=0.012, order=2):
     ngs, occ = pytest.importorskip("ngsolve"), pytest.importorskip("netgen.occ")
     solids = []
     for body in bodies:
-        axes = occ.Axes((0, 0, body.z_min_m), occ.Z)
-        height = body.z_max_m - body.z_min_m
-        solids.append(occ.Cylinder(axes, body.outer_radius_m, height)
-                      - occ.Cylinder(axes, body.inner_radius_m, height))
+        axes = occ.Axes((0, 0, body.z_min), occ.Z)
+        height = body.z_max - body.z_min
+        solids.append(occ.Cylinder(axes, body.outer_radius, height)
+                      - occ.Cylinder(axes, body.inner_radius, height))
         solids[-1].mat("iron")
         solids[-1].maxh = size
     world = occ.Sphere(occ.Pnt(0, 0, 0), 0.4)
@@ -142,7 +143,7 @@ def by_ngsolve(bodies, source, points, size=0.012, order=2):
 
 
 @pytest.mark.parametrize("bodies", [
-    (TUBE,), (replace(TUBE, outer_radius_m=0.032), IronRectangle(0.012, 0.036, 0.027, 0.031, CURVE))
+    (TUBE,), (replace(TUBE, outer_radius=0.032), IronSolid(0.012, 0.036, 0.027, 0.031, law=CURVE))
 ], ids=["thick tube", "thin tube and end plate"])
 def test_saturating_iron_against_ngsolve(bodies, session):
     """Non-linear iron near a dipole off the axis, where all modes are coupled.
@@ -197,11 +198,11 @@ def test_tangent_against_finite_differences(session):
 
 def test_split_iron_is_the_same_iron(session):
     """Two rectangles that touch are one body; only the grid differs, by 0.5 % of the reaction."""
-    halves = [replace(TUBE, z_max_m=0.01), replace(TUBE, z_min_m=0.01)]
+    halves = [replace(TUBE, z_max=0.01), replace(TUBE, z_min=0.01)]
     whole, split = (solve_iron(bodies, STRONG, session, resolution=FEW, estimate=False
                                ).field(POINTS) for bodies in ([TUBE], halves))
     assert worst(split, whole) < 5e-3
-    gap = solve_iron([replace(TUBE, z_max_m=0.005), halves[1]], STRONG, session, resolution=FEW,
+    gap = solve_iron([replace(TUBE, z_max=0.005), halves[1]], STRONG, session, resolution=FEW,
                      estimate=False).field(POINTS)
     assert worst(gap, whole) > 0.01  # negative control: a gap of 5 mm
 
@@ -225,7 +226,7 @@ def test_fourier_transforms():
 
 
 def test_grid_holds_every_edge_of_the_iron():
-    bodies = [TUBE, IronRectangle(0.0, 0.02, 0.04, 0.05, 10.0)]
+    bodies = [TUBE, IronSolid(0.0, 0.02, 0.04, 0.05, law=10.0)]
     r, z = grid_lines(bodies, Resolution())
     for lines, edges in ((r, (0.0, 0.02, 0.03, 0.036)), (z, (-0.025, 0.025, 0.04, 0.05))):
         assert (np.diff(lines) > 0).all()
@@ -236,8 +237,8 @@ def test_grid_holds_every_edge_of_the_iron():
     assert np.isclose(area[number == 1].sum(), 0.02 * 0.01)
 
 
-@pytest.mark.parametrize("second", [replace(TUBE, z_min_m=0.0, z_max_m=0.05),
-                                    replace(TUBE, outer_radius_m=0.02)])
+@pytest.mark.parametrize("second", [replace(TUBE, z_min=0.0, z_max=0.05),
+                                    replace(TUBE, outer_radius=0.02)])
 def test_impossible_iron(second, session):
     with pytest.raises(StudyError):
         solve_iron([TUBE, second], STRONG, session)

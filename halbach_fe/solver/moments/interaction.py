@@ -201,7 +201,7 @@ class Interaction:
         local, weights = gauss_nodes(cells.vertices[some], cells.half[some], divisions, graded)
         nodes = cells.centre[some, None] + local @ np.swapaxes(cells.axes[some], 1, 2)
         in_threads(lambda first, last: near.mean_matrices(
-            place, sources, first, last, *self.arrays, nodes, weights, found),
+            place, sources, first, last, self.arrays, nodes, weights, found),
             share_out(len(targets)))
         return found
 
@@ -275,7 +275,7 @@ class Interaction:
         dipoles = self.dipoles(deviations)
         found = cells.mean(self._far(far, self.clusters, cells.nodes, dipoles, degree))
         in_threads(lambda first, last: near.add_of_deviations(
-            close.starts, close.sources, first, last, *self.arrays, cells.nodes, dipoles,
+            close.starts, close.sources, first, last, self.arrays, cells.nodes, dipoles,
             cells.volume, found), close.shares(32))
         return found
 
@@ -285,7 +285,7 @@ class Interaction:
         far, close = self._pairs
         found = self._far(far, self.clusters, cells.nodes, self.dipoles(polarization), self.degree)
         in_threads(lambda first, last: near.add_at_nodes(
-            close.starts, close.sources, first, last, *self.arrays, cells.nodes, polarization,
+            close.starts, close.sources, first, last, self.arrays, cells.nodes, polarization,
             found), close.shares(32))
         return found
 
@@ -317,7 +317,7 @@ class Interaction:
                 close.shares(16))
             if kept is None:
                 in_threads(lambda first, last: near.add_at_nodes(
-                    close.starts, close.sources, first, last, *self.arrays, cells.nodes,
+                    close.starts, close.sources, first, last, self.arrays, cells.nodes,
                     polarization, at_nodes), close.shares(32))
                 return np.einsum("nqi,ni->nq", at_nodes, along), mean
             component = np.einsum("nqi,ni->nq", at_nodes, along)
@@ -363,7 +363,7 @@ class Interaction:
         """Return the field matrices (n, q, 6) of source cells at the nodes of target cells."""
         found = np.empty((len(targets), self.cells.weights.shape[1], 6))
         in_threads(lambda first, last: near.node_matrices(
-            targets, sources, first, last, *self.arrays, self.cells.nodes, found),
+            targets, sources, first, last, self.arrays, self.cells.nodes, found),
             share_out(len(targets)))
         return found
 
@@ -386,7 +386,7 @@ class Interaction:
         found = np.empty((len(points), 3, *cells.weights.shape, 3))
         weights = cells.weights * cells.volume[:, None]
         in_threads(lambda first, last: near.readings_of_cells(
-            first, last, points, self._reach, cells.radius, *self.arrays, cells.cuts,
+            first, last, points, self._reach, cells.radius, self.arrays, cells.cuts,
             cells.of_parts, cells.nodes, weights, found), share_out(len(points)))
         return found
 
@@ -415,7 +415,7 @@ class Interaction:
             found = self._far_of(far, targets, points[:, None], moments,
                                  self.reading_degree)[:, 0]
             in_threads(lambda first, last: near.add_of_parts(
-                close.starts, close.sources, first, last, *self.arrays, self.cells.cuts, points,
+                close.starts, close.sources, first, last, self.arrays, self.cells.cuts, points,
                 of_parts, found), close.shares(32))
             return found
 

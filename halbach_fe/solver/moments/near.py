@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from math import sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.threads import compiled
-from halbach_fe.solver.prism_kernel import Six, prism_field
+from halbach_fe.solver.prism_kernel import NOTHING, Six, added, prism_field
 
 Flags = NDArray[np.bool_]
 Singles = NDArray[np.float32]
+CellArrays = tuple[Floats, Floats, Floats, Floats, Flags]
+"""Of all cells the centres, axes, vertices and half heights, and whether they are cuboids."""
 
 
 @compiled
@@ -33,39 +36,49 @@ def turned(axes: Floats, g: Six) -> Six:
 
 
 @compiled
-def cell_field(axes: Floats, centre: Floats, vertices: Floats, half: float, cuboid: bool,
-               x: float, y: float, z: float) -> Six:
-    """Return the field matrix of a cell at a point of the magnet, along the magnet's axes."""
-    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
-    return turned(axes, prism_field(
-        vertices, half, cuboid, axes[0, 0] * dx + axes[1, 0] * dy + axes[2, 0] * dz,
-        axes[0, 1] * dx + axes[1, 1] * dy + axes[2, 1] * dz,
-        axes[0, 2] * dx + axes[1, 2] * dy + axes[2, 2] * dz))
+def apart(a: Floats, b: Floats) -> tuple[float, float, float]:
+    """Return the vector from b to a."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @compiled
-def mean_matrices(targets: Ints, sources: Ints, first: int, last: int, centre: Floats,
-                  axes: Floats, vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
-                  weights: Floats, out: Floats) -> None:
+def _in_frame(axes: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a vector of the magnet along the axes of a frame."""
+    return (axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z,
+            axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z,
+            axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z)
+
+
+@compiled
+def _add(g: Any, polarization: Floats, out: Floats) -> None:
+    """Add the field of a polarization by a field matrix."""
+    jx, jy, jz = polarization[0], polarization[1], polarization[2]
+    out[0] += g[0] * jx + g[3] * jy + g[4] * jz
+    out[1] += g[3] * jx + g[1] * jy + g[5] * jz
+    out[2] += g[4] * jx + g[5] * jy + g[2] * jz
+
+
+@compiled
+def cell_field(cells: CellArrays, cell: int, point: Floats) -> Six:
+    """Return the field matrix of a cell at a point of the magnet, along the magnet's axes."""
+    centre, axes, vertices, half, cuboid = cells
+    x, y, z = _in_frame(axes[cell], *apart(point, centre[cell]))
+    return turned(axes[cell], prism_field(vertices[cell], half[cell], cuboid[cell], x, y, z))
+
+
+@compiled
+def mean_matrices(targets: Ints, sources: Ints, first: int, last: int, cells: CellArrays,
+                  nodes: Floats, weights: Floats, out: Floats) -> None:
     """Write the means over target cells of the field matrices of source cells, (n, 6).
 
     ``nodes`` (cells, q, 3) in m and ``weights`` (cells, q) define the means.
     """
     for pair in range(first, last):
-        t, s = targets[pair], sources[pair]
-        xx = yy = zz = xy = xz = yz = 0.0
+        t, total = targets[pair], NOTHING
         for q in range(nodes.shape[1]):
-            g = cell_field(axes[s], centre[s], vertices[s], half[s], cuboid[s],
-                           nodes[t, q, 0], nodes[t, q, 1], nodes[t, q, 2])
-            w = weights[t, q]
-            xx += w * g[0]
-            yy += w * g[1]
-            zz += w * g[2]
-            xy += w * g[3]
-            xz += w * g[4]
-            yz += w * g[5]
-        out[pair, 0], out[pair, 1], out[pair, 2] = xx, yy, zz
-        out[pair, 3], out[pair, 4], out[pair, 5] = xy, xz, yz
+            total = added(total, weights[t, q], cell_field(cells, sources[pair], nodes[t, q]))
+        for c in range(6):
+            out[pair, c] = total[c]
 
 
 @compiled
@@ -74,28 +87,18 @@ def add_means(starts: Ints, sources: Ints, matrices: Floats, polarization: Float
     """Add the mean field of near cells to that of target cells ``first`` to ``last``, (n, 3)."""
     for t in range(first, last):
         for pair in range(starts[t], starts[t + 1]):
-            g = matrices[pair]
-            jx, jy, jz = polarization[sources[pair]]
-            out[t, 0] += g[0] * jx + g[3] * jy + g[4] * jz
-            out[t, 1] += g[3] * jx + g[1] * jy + g[5] * jz
-            out[t, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+            _add(matrices[pair], polarization[sources[pair]], out[t])
 
 
 @compiled
-def add_at_nodes(starts: Ints, sources: Ints, first: int, last: int, centre: Floats, axes: Floats,
-                 vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
-                 polarization: Floats, out: Floats) -> None:
+def add_at_nodes(starts: Ints, sources: Ints, first: int, last: int, cells: CellArrays,
+                 nodes: Floats, polarization: Floats, out: Floats) -> None:
     """Add the field of near cells at the nodes (n, q, 3) of targets ``first`` to ``last``."""
     for t in range(first, last):
         for pair in range(starts[t], starts[t + 1]):
             s = sources[pair]
-            jx, jy, jz = polarization[s]
             for q in range(nodes.shape[1]):
-                g = cell_field(axes[s], centre[s], vertices[s], half[s], cuboid[s],
-                               nodes[t, q, 0], nodes[t, q, 1], nodes[t, q, 2])
-                out[t, q, 0] += g[0] * jx + g[3] * jy + g[4] * jz
-                out[t, q, 1] += g[3] * jx + g[1] * jy + g[5] * jz
-                out[t, q, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+                _add(cell_field(cells, s, nodes[t, q]), polarization[s], out[t, q])
 
 
 @compiled
@@ -123,9 +126,7 @@ def rows_along(targets: Ints, kinds: Ints, first: int, last: int, axes: Floats, 
     """
     for pair in range(first, last):
         frame, u = axes[targets[pair]], along[targets[pair]]
-        x = frame[0, 0] * u[0] + frame[1, 0] * u[1] + frame[2, 0] * u[2]
-        y = frame[0, 1] * u[0] + frame[1, 1] * u[1] + frame[2, 1] * u[2]
-        z = frame[0, 2] * u[0] + frame[1, 2] * u[1] + frame[2, 2] * u[2]
+        x, y, z = _in_frame(frame, u[0], u[1], u[2])
         for q in range(matrices.shape[1]):
             m = matrices[kinds[pair], q]
             px = m[0] * x + m[3] * y + m[4] * z
@@ -148,32 +149,27 @@ def add_along(starts: Ints, sources: Ints, matrices: Singles, polarization: Floa
 
 
 @compiled
-def add_of_deviations(starts: Ints, sources: Ints, first: int, last: int, centre: Floats,
-                      axes: Floats, vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
-                      deviations: Floats, volume: Floats, out: Floats) -> None:
+def add_of_deviations(starts: Ints, sources: Ints, first: int, last: int, cells: CellArrays,
+                      nodes: Floats, deviations: Floats, volume: Floats, out: Floats) -> None:
     """Add the mean over targets ``first`` to ``last`` of the field of deviations, (n, 3).
 
     ``deviations`` (cells, q, 3) in T m^3 are dipoles at the nodes of near cells. By reciprocity the
     mean over a cell of a dipole's field is the field of the cell, polarized uniformly, at the
     dipole, over its volume; unlike the dipole's field it is not singular.
     """
+    each = np.empty(3)
     for t in range(first, last):
         for pair in range(starts[t], starts[t + 1]):
             s = sources[pair]
             for q in range(nodes.shape[1]):
-                g = cell_field(axes[t], centre[t], vertices[t], half[t], cuboid[t],
-                               nodes[s, q, 0], nodes[s, q, 1], nodes[s, q, 2])
-                jx, jy, jz = (deviations[s, q, 0] / volume[t], deviations[s, q, 1] / volume[t],
-                              deviations[s, q, 2] / volume[t])
-                out[t, 0] += g[0] * jx + g[3] * jy + g[4] * jz
-                out[t, 1] += g[3] * jx + g[1] * jy + g[5] * jz
-                out[t, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+                for axis in range(3):
+                    each[axis] = deviations[s, q, axis] / volume[t]
+                _add(cell_field(cells, t, nodes[s, q]), each, out[t])
 
 
 @compiled
-def add_of_parts(starts: Ints, sources: Ints, first: int, last: int, centre: Floats, axes: Floats,
-                 vertices: Floats, half: Floats, cuboid: Flags, cuts: Floats, points: Floats,
-                 polarization: Floats, out: Floats) -> None:
+def add_of_parts(starts: Ints, sources: Ints, first: int, last: int, cells: CellArrays,
+                 cuts: Floats, points: Floats, polarization: Floats, out: Floats) -> None:
     """Add the field of near cells, whose polarization differs from part to part, at points (n, 3).
 
     ``cuts`` (g + 1,) are the limits of the parts along every direction of a cell, between 0 and 1,
@@ -183,29 +179,22 @@ def add_of_parts(starts: Ints, sources: Ints, first: int, last: int, centre: Flo
     for t in range(first, last):
         for pair in range(starts[t], starts[t + 1]):
             s = sources[pair]
-            _parts_at(axes[s], centre[s], vertices[s], half[s], cuboid[s], cuts, points[t], quad,
-                      each)
+            _parts_at(cells, s, cuts, points[t], quad, each)
             for q in range(len(each)):
-                g = each[q]
-                jx, jy, jz = polarization[s, q, 0], polarization[s, q, 1], polarization[s, q, 2]
-                out[t, 0] += g[0] * jx + g[3] * jy + g[4] * jz
-                out[t, 1] += g[3] * jx + g[1] * jy + g[5] * jz
-                out[t, 2] += g[4] * jx + g[5] * jy + g[2] * jz
+                _add(each[q], polarization[s, q], out[t])
 
 
 @compiled
-def _parts_at(axes: Floats, centre: Floats, vertices: Floats, half: float, cuboid: bool,
-              cuts: Floats, point: Floats, quad: Floats, out: Floats) -> None:
+def _parts_at(cells: CellArrays, cell: int, cuts: Floats, point: Floats, quad: Floats,
+              out: Floats) -> None:
     """Write the field matrices (g^3, 6) of the parts of a cell at a point; ``quad`` is scratch."""
-    number = len(cuts) - 1
-    dx, dy, dz = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
-    x = axes[0, 0] * dx + axes[1, 0] * dy + axes[2, 0] * dz
-    y = axes[0, 1] * dx + axes[1, 1] * dy + axes[2, 1] * dz
-    z = axes[0, 2] * dx + axes[1, 2] * dy + axes[2, 2] * dz
+    centre, axes, vertices, halves, cuboids = cells
+    half, cuboid, number = halves[cell], cuboids[cell], len(cuts) - 1
+    x, y, z = _in_frame(axes[cell], *apart(point, centre[cell]))
     part = 0
     for i in range(number):
         for j in range(number):
-            _part(vertices, cuts[i], cuts[i + 1], cuts[j], cuts[j + 1], quad)
+            _part(vertices[cell], cuts[i], cuts[i + 1], cuts[j], cuts[j + 1], quad)
             mx = my = 0.0
             if cuboid:
                 mx, my = (quad[0, 0] + quad[2, 0]) / 2, (quad[0, 1] + quad[2, 1]) / 2
@@ -214,8 +203,8 @@ def _parts_at(axes: Floats, centre: Floats, vertices: Floats, half: float, cuboi
                     quad[corner, 1] -= my
             for k in range(number):
                 level = half * (cuts[k] + cuts[k + 1] - 1)
-                g = turned(axes, prism_field(quad, half * (cuts[k + 1] - cuts[k]), cuboid,
-                                             x - mx, y - my, z - level))
+                g = turned(axes[cell], prism_field(quad, half * (cuts[k + 1] - cuts[k]), cuboid,
+                                                   x - mx, y - my, z - level))
                 for c in range(6):
                     out[part, c] = g[c]
                 part += 1
@@ -238,9 +227,8 @@ def touching(targets: Ints, sources: Ints, centre: Floats, radius: Floats, ratio
     found = np.empty(len(targets), np.bool_)
     for pair in range(len(targets)):
         t, s = targets[pair], sources[pair]
-        distance = sqrt((centre[t, 0] - centre[s, 0]) ** 2 + (centre[t, 1] - centre[s, 1]) ** 2
-                        + (centre[t, 2] - centre[s, 2]) ** 2)
-        found[pair] = distance < ratio * (radius[t] + radius[s])
+        x, y, z = apart(centre[t], centre[s])
+        found[pair] = sqrt(x**2 + y**2 + z**2) < ratio * (radius[t] + radius[s])
     return found
 
 
@@ -255,15 +243,12 @@ def dipole_field(x: float, y: float, z: float) -> Six:
 
 
 @compiled
-def node_matrices(targets: Ints, sources: Ints, first: int, last: int, centre: Floats,
-                  axes: Floats, vertices: Floats, half: Floats, cuboid: Flags, nodes: Floats,
-                  out: Floats) -> None:
+def node_matrices(targets: Ints, sources: Ints, first: int, last: int, cells: CellArrays,
+                  nodes: Floats, out: Floats) -> None:
     """Write the field matrices (pairs, q, 6) of source cells at the nodes of target cells."""
     for pair in range(first, last):
-        t, s = targets[pair], sources[pair]
         for q in range(nodes.shape[1]):
-            g = cell_field(axes[s], centre[s], vertices[s], half[s], cuboid[s],
-                           nodes[t, q, 0], nodes[t, q, 1], nodes[t, q, 2])
+            g = cell_field(cells, sources[pair], nodes[targets[pair], q])
             for c in range(6):
                 out[pair, q, c] = g[c]
 
@@ -278,20 +263,13 @@ def far_panel(first: int, last: int, begin: int, nodes: Floats, weights: Floats,
     """
     for t in range(len(nodes)):
         for s in range(first, last):
-            xx = yy = zz = xy = xz = yz = 0.0
+            total = NOTHING
             if s != t:
                 for p in range(nodes.shape[1]):
                     for q in range(nodes.shape[1]):
-                        g = dipole_field(nodes[t, p, 0] - nodes[s, q, 0],
-                                         nodes[t, p, 1] - nodes[s, q, 1],
-                                         nodes[t, p, 2] - nodes[s, q, 2])
-                        w = weights[t, p] * weights[s, q]
-                        xx += w * g[0]
-                        yy += w * g[1]
-                        zz += w * g[2]
-                        xy += w * g[3]
-                        xz += w * g[4]
-                        yz += w * g[5]
+                        total = added(total, weights[t, p] * weights[s, q],
+                                      dipole_field(*apart(nodes[t, p], nodes[s, q])))
+            xx, yy, zz, xy, xz, yz = total
             f = volume[s] / (4 * np.pi)
             i, j = 3 * t, 3 * (s - begin)
             out[i, j], out[i + 1, j + 1], out[i + 2, j + 2] = f * xx, f * yy, f * zz
@@ -302,9 +280,8 @@ def far_panel(first: int, last: int, begin: int, nodes: Floats, weights: Floats,
 
 @compiled
 def readings_of_cells(first: int, last: int, points: Floats, reach: float, radius: Floats,
-                      centre: Floats, axes: Floats, vertices: Floats, half: Floats, cuboid: Flags,
-                      cuts: Floats, of_parts: Floats, nodes: Floats, moments: Floats,
-                      out: Floats) -> None:
+                      cells: CellArrays, cuts: Floats, of_parts: Floats, nodes: Floats,
+                      moments: Floats, out: Floats) -> None:
     """Write the field at points ``first`` to ``last`` per polarization at every node.
 
     The result (points, 3, cells, q, 3) has the component of the polarization last. Cells within
@@ -315,12 +292,10 @@ def readings_of_cells(first: int, last: int, points: Floats, reach: float, radiu
     quad, each = np.empty((4, 2)), np.empty((nodes.shape[1], 6))
     parts = np.empty_like(each)
     for t in range(first, last):
-        for s in range(len(centre)):
-            dx, dy, dz = (points[t, 0] - centre[s, 0], points[t, 1] - centre[s, 1],
-                          points[t, 2] - centre[s, 2])
+        for s in range(len(nodes)):
+            dx, dy, dz = apart(points[t], cells[0][s])
             if dx * dx + dy * dy + dz * dz < (reach * radius[s]) ** 2:
-                _parts_at(axes[s], centre[s], vertices[s], half[s], cuboid[s], cuts,
-                          points[t], quad, parts)
+                _parts_at(cells, s, cuts, points[t], quad, parts)
                 for q in range(len(each)):
                     for c in range(6):
                         total = 0.0
@@ -329,8 +304,7 @@ def readings_of_cells(first: int, last: int, points: Floats, reach: float, radiu
                         each[q, c] = total
             else:
                 for q in range(nodes.shape[1]):
-                    g = dipole_field(points[t, 0] - nodes[s, q, 0], points[t, 1] - nodes[s, q, 1],
-                                     points[t, 2] - nodes[s, q, 2])
+                    g = dipole_field(*apart(points[t], nodes[s, q]))
                     for c in range(6):
                         each[q, c] = g[c] * moments[s, q] / (4 * np.pi)
             for q in range(nodes.shape[1]):

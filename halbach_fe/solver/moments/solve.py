@@ -137,7 +137,7 @@ class System:
         """
         if any(np.isinf(block.z_max - block.z_min) for block in blocks):
             raise ValueError("the method of moments needs blocks of finite length")
-        remanence = np.array([np.array(block.easy_axis) * block.remanence for block in blocks])
+        remanence = np.array([block.polarization for block in blocks])
         tensors = np.array([block.recoil_tensor for block in blocks]) - np.eye(3)
         there = [number for number in range(len(blocks))
                  if np.any(remanence[number]) or np.any(tensors[number])]

@@ -28,8 +28,19 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.threads import compiled, reordered
+from halbach_fe.solver.moments.near import apart
 
 Harmonics = NDArray[np.complex128]
+
+
+@compiled
+def _complete(values: Harmonics, degree: int) -> None:
+    """Write the harmonics of negative m, of a real potential."""
+    for n in range(degree + 1):
+        sign = -1.0
+        for m in range(1, n + 1):
+            values[n * n + n - m] = sign * values[n * n + n + m].conjugate()
+            sign = -sign
 
 
 @compiled
@@ -46,10 +57,7 @@ def regular(x: float, y: float, z: float, order: int, out: Harmonics) -> None:
             if m <= n - 2:
                 value -= square * out[twice + m]
             out[centre + m] = value / ((n - m) * (n + m))
-        sign = -1.0
-        for m in range(1, n + 1):
-            out[centre - m] = sign * out[centre + m].conjugate()
-            sign = -sign
+    _complete(out, order)
 
 
 @compiled
@@ -67,10 +75,7 @@ def irregular(x: float, y: float, z: float, order: int, out: Harmonics) -> None:
             if m <= n - 2:
                 value -= ((n - 1) * (n - 1) - m * m) * inverse * out[twice + m]
             out[centre + m] = value
-        sign = -1.0
-        for m in range(1, n + 1):
-            out[centre - m] = sign * out[centre + m].conjugate()
-            sign = -sign
+    _complete(out, order)
 
 
 @compiled
@@ -225,16 +230,12 @@ def gather(order: Ints, limits: Ints, children: Ints, centres: Floats, places: F
         if children[cluster, 0] < 0:
             item = order[limits[cluster, 0]]
             for q in range(places.shape[1]):
-                dipole_moments(
-                    dipoles[item, q], places[item, q, 0] - centres[cluster, 0],
-                    places[item, q, 1] - centres[cluster, 1],
-                    places[item, q, 2] - centres[cluster, 2], degree, work, own)
+                dipole_moments(dipoles[item, q], *apart(places[item, q], centres[cluster]), degree,
+                               work, own)
             continue
         for half in range(2):
             child = children[cluster, half]
-            regular(centres[child, 0] - centres[cluster, 0],
-                    centres[child, 1] - centres[cluster, 1],
-                    centres[child, 2] - centres[cluster, 2], degree, work)
+            regular(*apart(centres[child], centres[cluster]), degree, work)
             for n in range(1, degree + 1):
                 for m in range(n + 1):
                     total = 0j
@@ -245,16 +246,6 @@ def gather(order: Ints, limits: Ints, children: Ints, centres: Floats, places: F
                                 child, j * j + j + i]
                     own[n * n + n + m] += total
         _complete(own, degree)
-
-
-@compiled
-def _complete(values: Harmonics, degree: int) -> None:
-    """Write the harmonics of negative m, of a real potential."""
-    for n in range(degree + 1):
-        sign = -1.0
-        for m in range(1, n + 1):
-            values[n * n + n - m] = sign * values[n * n + n + m].conjugate()
-            sign = -sign
 
 
 @reordered
@@ -273,9 +264,7 @@ def translate(starts: Ints, sources: Ints, first: int, last: int, target_centres
         own[:] = 0
         for place in range(starts[target], starts[target + 1]):
             source = sources[place]
-            irregular(target_centres[target, 0] - centres[source, 0],
-                      target_centres[target, 1] - centres[source, 1],
-                      target_centres[target, 2] - centres[source, 2], degree, work)
+            irregular(*apart(target_centres[target], centres[source]), degree, work)
             for i in range(size):
                 one[i], two[i] = work[i].real, work[i].imag
             a, b = real[source], imaginary[source]
@@ -304,9 +293,7 @@ def spread(children: Ints, centres: Floats, degree: int, expansions: Harmonics) 
             child = children[cluster, half]
             if child < 0:
                 continue
-            regular(centres[child, 0] - centres[cluster, 0],
-                    centres[child, 1] - centres[cluster, 1],
-                    centres[child, 2] - centres[cluster, 2], degree, work)
+            regular(*apart(centres[child], centres[cluster]), degree, work)
             for j in range(degree):
                 for i in range(j + 1):
                     total = 0j
@@ -354,9 +341,7 @@ def scatter(order: Ints, limits: Ints, children: Ints, centres: Floats, places: 
         item = order[limits[cluster, 0]]
         for q in range(places.shape[1]):
             bx, by, bz = field_of_expansion(
-                expansions[cluster], places[item, q, 0] - centres[cluster, 0],
-                places[item, q, 1] - centres[cluster, 1],
-                places[item, q, 2] - centres[cluster, 2], degree, work)
+                expansions[cluster], *apart(places[item, q], centres[cluster]), degree, work)
             out[item, q, 0] += bx
             out[item, q, 1] += by
             out[item, q, 2] += bz
