@@ -68,10 +68,12 @@ class ShapeRow(Effect):
         study, amount = with_remanence(study), float(values[0])
         if not place.ring:
             return with_array(study, **self.keys(study.array, amount))
-        rings = list(study.array.ring)
-        rings[place.ring - 1] = rings[place.ring - 1].with_(
-            **self.keys(study.array.of_ring(place.ring), amount))
-        return with_array(study, ring=tuple(rings))
+        rings, keys = list(study.array.ring), self.keys(study.array.of_ring(place.ring), amount)
+        rings[place.ring - 1] = rings[place.ring - 1].with_(**keys)
+        # what all rings state is for the array what the first of them states
+        first = {key: value for key, value in keys.items() if place.ring == 1 and all(
+            getattr(ring, key) is not None for ring in study.array.ring)}
+        return with_array(study, ring=tuple(rings), **first)
 
 
 @dataclass(frozen=True, eq=False)
