@@ -213,10 +213,10 @@ class ProbeModel:
     def few(self, at: ProbeFit, rows: NDArray[np.bool_], penalty: float) -> Self:
         """Return a model of the same field by those combinations of charges that rows determine."""
         other, design = copy(self), self.free(at, rows, 0.0)
-        vectors = design.determined(penalty)
-        other.charges = FewCharges(self.charges.places, self.charges.scale, vectors)
+        chosen, vectors = design.determined(penalty)
+        other.charges = FewCharges(self.charges.places[chosen[:-3]], self.charges.scale, vectors)
         other._last = [other.charges, rows, at.instrument * self.prior_sd, self.weights,
-                       FreeField(design.by_amplitude @ vectors, 0.0)]
+                       FreeField(design.by_amplitude[:, chosen] @ vectors, 0.0)]
         return other
 
     def settled(self) -> Self:
