@@ -107,7 +107,7 @@ def test_a_byte_order_mark_is_no_part_of_the_study():
     assert edited_text(f"\ufeff{PLAIN}", [(after, "why")]) == edited_text(PLAIN, [(after, "why")])
 
 
-@pytest.mark.parametrize("ring, tables", [(1, 2), (3, 4)], ids=["one", "one of three equal ones"])
+@pytest.mark.parametrize(("ring", "tables"), [(1, 2), (3, 4)], ids=["one", "of three equal ones"])
 def test_a_listed_ring_changes_alone(ring, tables):
     """Also one of equal rings, for which a single table stands in the file."""
     text = BARE + "[array]\n" + RINGS.partition("\n")[2] + """
@@ -126,7 +126,8 @@ inner_radius_m = 0.1
         edited = edited_text(text, [(after, "why")])
         assert parse_study(tomllib.loads(edited)) == after != before
         assert edited.count("[[array.ring]]") == tables
-        assert "# the step" in edited and "# equal rings" in edited  # not rewritten in full
+        assert "# the step" in edited  # not rewritten in full
+        assert "# equal rings" in edited
 
 
 def test_nothing_to_change_is_the_file_itself():
