@@ -583,7 +583,7 @@ def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:
     steepness = np.sum(gradient**2, axis=2).ravel()
     flat, steep = np.quantile(steepness, [0.1, 0.9])
     squares = residual.ravel()**2
-    if steep < steeper * flat:
+    if steep <= steeper * flat:  # of a uniform field both are 0
         return float(np.sqrt(squares.mean())), 0.0
     constant = float(squares[steepness <= flat].mean())
     return np.sqrt(constant), np.sqrt(max(squares.mean() - constant, 0.0) / steepness.mean())
