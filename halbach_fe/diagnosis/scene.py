@@ -198,7 +198,8 @@ class Campaign:
             for place in effect.places(own):
                 if not one.can_have(effect, place, own):
                     continue
-                stated = any(study.maps[one.number].stage_shift_sd_m)
+                stated = any(other.stage == study.maps[one.number].stage
+                             and any(other.stage_shift_sd_m) for other in study.maps)
                 for owner in _owners(one, keys_of(effect, place, own), stated):
                     found.setdefault(replace(place, instrument=owner), []).append(one.name)
         return [replace(place, maps=tuple(names)) for place, names in found.items()]
