@@ -532,7 +532,8 @@ class _Search:
         the misfit; `NOT_COMPARED` if too few of the observed values remain.
 
         Iron, permeability and temperature may cause a relative change of the whole field, of 0.1 at
-        most.
+        most. What the study states to be open of the instrument is no gross error: a probe that
+        is rolled by 30 mrad picks up 3 % of the main field, which a wrong sign may happen to hide.
         """
         # Standard deviation that effects of usual size add to a reading, relative to the main
         # field.
@@ -547,7 +548,10 @@ class _Search:
         used = ~np.isnan(shown) & (self.observed | np.isin(COMPONENTS, convention.components))
         if not used.any() or used.sum() < least_used * self.present:
             return NOT_COMPARED
-        whole = max(_size(shown), 1e-300)
+        whole, of = max(_size(shown), 1e-300), self.study.instrument_sd
+        squares = field**2
+        variance = variance + (of.crosstalk**2 + of.rotation_rad**2) * (
+            squares.sum(axis=1, keepdims=True) - squares) + of.gain**2 * squares + of.offset_T**2
         sd = np.sqrt(variance[used] + (effect_field_sd * max(whole, _size(field))) ** 2)
         shown, field = shown[used], field[used]
         weighted = field / sd

@@ -169,22 +169,18 @@ class NominalFields:
         return np.asarray(self.unit_fields[number, :, :, :size] @ (
             MU_0 * block.recoil_tensor[:size, :size] @ magnetization))
 
-    def block_fields_of(self, study: Study) -> Floats:
-        """Return B (blocks, n, 3) in T of each nominal block of another study."""
-        return self._fields_of(build_magnet(study).blocks)
-
-    def _fields_of(self, blocks: Sequence[MagnetBlock]) -> Floats:
+    def fields_of(self, blocks: Sequence[MagnetBlock]) -> Floats:
         """Return B (blocks, n, 3) in T of each of some blocks."""
         return np.array([unit @ block.polarization
                          for block, unit in zip(blocks, unit_fields(blocks, self.points),
-                                                strict=True)])
+                                                strict=True)]).reshape(-1, *self.points.shape)
 
     @cached_property
     def gradient_fields(self) -> Floats:
         """Change of B per unit of each block's magnetization gradient, (blocks, n, 3) in T."""
         uneven = [replace(block, gradient=1.0) if len(block.outline) == 4 else block
                   for block in self.blocks]
-        return np.asarray(self._fields_of(uneven) - self.block_fields)
+        return np.asarray(self.fields_of(uneven) - self.block_fields)
 
     def block_translation_derivative(self, block: int, direction: Floats) -> Floats:
         """Return the derivative of B (n, 3) in T/m when block number ``block`` moves.

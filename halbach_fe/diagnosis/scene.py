@@ -198,7 +198,9 @@ class Campaign:
             for place in effect.places(own):
                 if not one.can_have(effect, place, own):
                     continue
-                for owner in _owners(one, keys_of(effect, place, own)):
+                stated = any(other.stage == study.maps[one.number].stage
+                             and any(other.stage_shift_sd_m) for other in study.maps)
+                for owner in _owners(one, keys_of(effect, place, own), stated):
                     found.setdefault(replace(place, instrument=owner), []).append(one.name)
         return [replace(place, maps=tuple(names)) for place, names in found.items()]
 
@@ -322,13 +324,16 @@ def keys_of(effect: Effect, place: Place, study: Study) -> set[str]:
     return {key for key, value in changed.instrument if value != getattr(study.instrument, key)}
 
 
-def _owners(one: ScannedMap, keys: set[str]) -> list[str]:
+def _owners(one: ScannedMap, keys: set[str], stated: bool) -> list[str]:
     """Return what may have an effect that changes such keys of the instrument of a map.
 
-    That is the probe or the map. What lies on a stage is moved with the stage, or by itself.
+    That is the probe or the map. What lies on a stage is moved with the stage, or by itself unless
+    it is ``stated`` how far it may have moved: an overlap of maps is a reading, which no effect
+    may overrule.
     """
     if keys & set(PROBE_KEYS) and one.probe != one.name:
         return [f"probe {one.probe}"]
     if keys <= set(POSE_KEYS) and one.pose != one.name:
-        return [f"stage {one.pose}", f"map {one.name}"]
+        alone = [] if stated and keys == {"translation_m"} else [f"map {one.name}"]
+        return [f"stage {one.pose}", *alone]
     return [f"map {one.name}"]

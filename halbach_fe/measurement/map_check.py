@@ -463,7 +463,7 @@ def check_map(
     some = _thinned(scan.of(rows.train))
     matrix, alike = _orientation(some, pace)
     _begin(pace, 3, "fitting the field and the instrument")
-    fitted = _first_fit(scan.turned(matrix), some.turned(matrix), rows, pace)
+    fitted, gap = _first_fit(scan.turned(matrix), some.turned(matrix), rows, pace)
     _begin(pace, 4, "asking every part of the map for each error of the instrument")
     fitted, terms = _stated(fitted, scan, rows.train, pace)
     _begin(pace, 5, "fitting all scan lines")
@@ -475,8 +475,7 @@ def check_map(
         order=_order(data),
         orientation=_named(matrix), alike=alike, terms=terms, broken=broken,
         excluded=~rows.usable, contradicted=contradicted_rows(data),
-        corrected_T=fitted.model.ideal(_as_stated(fitted, terms)), gap_m=float(np.min(
-            scan.points[rows.usable].min(axis=0) - fitted.model.charges.places.min(axis=0))),
+        corrected_T=fitted.model.ideal(_as_stated(fitted, terms)), gap_m=gap,
         **_remaining(fitted, whole, scan, matrix, rows))
 
 
@@ -706,8 +705,11 @@ class _Rows:
         return found
 
 
-def _first_fit(scan: Scan, some: ProbeModel, rows: _Rows, pace: Pace) -> _Fitted:
-    """Return the fit of the field and of all parameters of the instrument to a few lines.
+def _first_fit(
+    scan: Scan, some: ProbeModel, rows: _Rows, pace: Pace
+) -> tuple[_Fitted, float]:
+    """Return the fit of the field and of all parameters of the instrument to a few lines, and the
+    distance in m of the charges.
 
     The combinations of charges are those that all chosen rows determine. ``some`` points of the
     scan tell what the fit starts from, and where the charges are.
@@ -724,7 +726,7 @@ def _first_fit(scan: Scan, some: ProbeModel, rows: _Rows, pace: Pace) -> _Fitted
     start = replace(start, amplitudes=fit.amplitudes, sigma=fit.sigma)
     fitted = _Fitted(model, fit_probe(model, few, fit, start), fit).weighted(few)
     pace.advance(FIRST_FIT_PARTS, FIRST_FIT_PARTS)
-    return fitted
+    return fitted, gap
 
 
 def _without_spikes(

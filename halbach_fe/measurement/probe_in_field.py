@@ -213,10 +213,10 @@ class ProbeModel:
     def few(self, at: ProbeFit, rows: NDArray[np.bool_], penalty: float) -> Self:
         """Return a model of the same field by those combinations of charges that rows determine."""
         other, design = copy(self), self.free(at, rows, 0.0)
-        vectors = design.determined(penalty)
-        other.charges = FewCharges(self.charges.places, self.charges.scale, vectors)
+        chosen, vectors = design.determined(penalty)
+        other.charges = FewCharges(self.charges.places[chosen[:-3]], self.charges.scale, vectors)
         other._last = [other.charges, rows, at.instrument * self.prior_sd, self.weights,
-                       FreeField(design.by_amplitude @ vectors, 0.0)]
+                       FreeField(design.by_amplitude[:, chosen] @ vectors, 0.0)]
         return other
 
     def settled(self) -> Self:
@@ -583,7 +583,7 @@ def noise_of(gradient: Floats, residual: Floats) -> tuple[float, float]:
     steepness = np.sum(gradient**2, axis=2).ravel()
     flat, steep = np.quantile(steepness, [0.1, 0.9])
     squares = residual.ravel()**2
-    if steep < steeper * flat:
+    if steep <= steeper * flat:  # of a uniform field both are 0
         return float(np.sqrt(squares.mean())), 0.0
     constant = float(squares[steepness <= flat].mean())
     return np.sqrt(constant), np.sqrt(max(squares.mean() - constant, 0.0) / steepness.mean())

@@ -39,6 +39,7 @@ from halbach_fe.report.diagnosis_answer import (
     unknown_advice,
 )
 from halbach_fe.report.diagnosis_figures import states
+from halbach_fe.report.inference import left_out_section, left_out_table
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.page import Drawn, Page, Rows, Section, Table, View
 from halbach_fe.report.words import (
@@ -167,8 +168,8 @@ def page(
         "diagnose", "what the model lacks", diagnosis.before.study, answer(diagnosis),
         diagnosis_summary(diagnosis, separations), [
             _what_is_missing(diagnosis, rows), *_what_else(diagnosis, separations, titles, rows),
-            *_grounds(diagnosis), Section(order := [*filter(None, [row_order_note(
-                diagnosis.study)])]),
+            *_grounds(diagnosis), left_out_section(diagnosis.after),
+            Section(order := [*filter(None, [row_order_note(diagnosis.study)])]),
             Section([View(lambda: view_of_inference(diagnosis.after, places),
                           colours_in_words(diagnosis.after))]),
             Section([f"{STUDY_FILE} beside this page is the study's file {added}; halbach-fe solve "
@@ -176,7 +177,8 @@ def page(
                     "The study with what was missing" if rows else "The study")],
         {"Missing from the study": found,
          "The model before and after": change_table(diagnosis),
-         "Rms difference of model and readings": residual_table(diagnosis)},
+         "Rms difference of model and readings": residual_table(diagnosis),
+         "Where nobody measured": left_out_table(diagnosis.after)},
         rows, drawn, stem="diagnosis", remarks=[
             *([BAYES_FACTOR_IN_WORDS] if found else []), *order],
         new_study=(STUDY_FILE, partial(

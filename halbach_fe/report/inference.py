@@ -128,6 +128,18 @@ def stretch_table(result: InferenceResult) -> Rows:
         for each in result.regions_left_out for one in each.stretches]
 
 
+def left_out_section(result: InferenceResult) -> Section:
+    """Return the section of what was left out as a whole; empty if nothing was."""
+    left_out = left_out_table(result)
+    return Section([] if not left_out else [
+        "Readings that were left out as a whole, each map in turn or the ends of the only one, "
+        "predicted by an update with all others. Held-out lines between other lines say nothing of "
+        "that. The rms difference is that with the pose and the probe that only this map has "
+        "fitted to it; chi² is 1 on average if the error bars hold.",
+        Table(left_out), "And where it lies, along its longest axis:",
+        Table(stretch_table(result))], "Where nobody measured")
+
+
 def maps_figure(result: InferenceResult) -> Figure:
     """Draw where the maps lie in the magnet."""
     figure, along, across = magnet_panels("distance from the axis in mm")
@@ -413,7 +425,6 @@ def _before_and_after(rows: Sequence[Mapping[str, str]]) -> Section:
 def _sections_of_maps(result: InferenceResult) -> list[Section]:
     """Return what the page says of several maps, of where they lie and of their instruments."""
     overlaps, poses, terms = overlap_table(result), pose_table(result), term_table(result)
-    left_out = left_out_table(result)
     found = ["Estimated together with the magnetizations, whose error bars include what remains "
              "uncertain here."]
     if result.terms:
@@ -431,14 +442,7 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
             "other alone predicts there. chi² is 1 on average if they are of the same magnet, and "
             "pose, probe and noise are as stated or uncertain.", Table(overlaps)],
             "Do the maps agree?"),
-        Section([] if not left_out else [
-            "Readings that were left out as a whole, each map in turn or the ends of the only one, "
-            "predicted by an update with all others. Held-out lines between other lines say "
-            "nothing of that. The rms difference is that with the pose and the probe that only "
-            "this map has fitted to it; chi² is 1 on average if the error bars hold.",
-            Table(left_out), "And where it lies, along its longest axis:",
-            Table(stretch_table(result))],
-            "Where nobody measured"),
+        left_out_section(result),
         Section([] if not poses else ["In the magnet's axes, as the update found it.",
                                       Table(poses)], "Where the maps lie"),
         Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]

@@ -15,6 +15,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, MutableMapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -163,8 +164,19 @@ def _change_list(
         in_rows = _in_line(table) or isinstance(after[0], ExcludedReading)
         table[name] = [] if in_rows else tomlkit.aot()
     there = table[name]
-    for number, (old, new) in enumerate(zip(before, after, strict=False)):
-        _change(there[number], old, new, _inside(there, note))
+    place = number = 0
+    while number < len(before):
+        old, table = before[number], there[place]
+        # of equal rings, which are one table of the file
+        count = table.get("count", 1) if getattr(old, "count", None) == 1 else 1
+        if count > 1 and before[number:number + count] != after[number:number + count]:
+            del table["count"]
+            for _ in range(1, count):
+                there.insert(place + 1, deepcopy(table))
+            count = 1
+        if count == 1:
+            _change(table, old, after[number], _inside(there, note))
+        place, number = place + 1, number + count
     for new in after[len(before):]:
         if isinstance(there, AoT):
             there.append(_table(new, note))

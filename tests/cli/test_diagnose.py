@@ -177,8 +177,8 @@ def test_a_hidden_effect_is_named_and_added(study, tmp_path, capsys):
     assert page.headings == [
         "small: what the model lacks", "What is missing", "What else it could be",
         "What would tell it from other causes", "Where model and map disagree",
-        "How sure that is", "What changed", "Structure in the magnetizations", "The magnet",
-        "The study with what was missing", "Provenance"]
+        "How sure that is", "What changed", "Structure in the magnetizations",
+        "Where nobody measured", "The magnet", "The study with what was missing", "Provenance"]
     assert len(page.pictures) == 5
     assert all(kind == "data:image/png;base64" and picture.startswith(b"\x89PNG") and text
                for kind, picture, text in page.pictures)

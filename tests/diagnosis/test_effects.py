@@ -170,6 +170,48 @@ def test_places_are_in_the_magnet():
         assert EFFECTS[name].places(flat) == []
 
 
+STEPPED = parse_study(changed(
+    DIPOLE, dimension=3, array__rings=6, array__ring_length_m=0.083,
+    array__recoil_permeability=1.0, array__ring=[
+        {"inner_radius_m": 0.09}, {"count": 2}, {"inner_radius_m": 0.12},
+        {"count": 2, "layer": 2, "ring_length_m": 0.166,
+         "inner_radius_m": 0.2, "outer_radius_m": 0.25}]))
+"""A bore with steps in an outer layer, whose middle is the only plane that no ring crosses."""
+
+
+@pytest.mark.parametrize("name", ["length", "inner_radius", "azimuthal_gap", "ring_gap"])
+def test_sections_of_a_stepped_bore_have_lengths_radii_and_gaps_of_their_own(name):
+    """What moves a section along z is in the catalogue wherever rings are listed."""
+    effect = EFFECTS[name]
+    nominal = NominalFields(STEPPED, POINTS, TIME, None)
+    places = effect.places(STEPPED)
+    assert [place.ring for place in places] == ([2] if name == "ring_gap" else [1, 2, 3, 4, 5, 6])
+    for place in places:
+        signature = effect.signature(nominal, place)[0]
+        step = STEP * effect.parameters[0].sd
+        values = (step * np.eye(len(effect.parameters))[0]).tolist()
+        change = shown(effect.apply(STEPPED, place, values)) - shown(STEPPED)
+        size = np.abs(change).max()
+        assert size > 0
+        assert np.abs(change - step * signature).max() < 1e-2 * size
+        assert np.abs(change + step * signature).max() > size  # negative control
+    if name == "ring_gap":  # of all layers
+        moved = [block.displacement_m[2] for block in build_magnet(
+            effect.apply(STEPPED, places[0], [1e-3, 0.0])).blocks[::16]]
+        assert moved == pytest.approx([-5e-4, -5e-4, 5e-4, 5e-4, -5e-4, 5e-4])
+    else:  # a ring of another moment has no remanence that stays
+        by_moment = STEPPED.with_(array__ring=(STEPPED.array.ring[0].with_(
+            block_moment_A_m2=100.0), *STEPPED.array.ring[1:]))
+        assert [place.ring for place in effect.places(by_moment)] == [2, 3, 4, 5, 6]
+
+
+def test_blocks_that_vary_inside_are_beside_no_iron():
+    """Or the diagnosis of such a study stops: no study has both."""
+    assert EFFECTS["iron_ring"].places(STUDY)
+    assert not EFFECTS["iron_ring"].places(STUDY.with_(
+        prior={"variation_sd": 0.1, "variation_length_m": 0.01}))
+
+
 def test_seams_move_what_is_beyond_them_outwards():
     effect = EFFECTS["ring_gap"]
     moved = [

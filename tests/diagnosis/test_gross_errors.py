@@ -81,6 +81,22 @@ def test_a_map_that_is_written_wrongly(case, right):
         np.testing.assert_allclose(read["B_T"], right["B_T"], atol=1e-12)
 
 
+@pytest.mark.parametrize("case", ["rolled", "gauss", "swapped_axes points"])
+def test_what_is_open_of_the_instrument_is_no_gross_error(right, case):
+    """A probe that is rolled by 3 % of the field, where the study says as much the other way: the
+    mirror image of the map would hide it. The registered map of an MRI magnet was such a one.
+    """
+    rolled = np.array([[1, 0, 0], [0.03, 1, 0], [0, 0, 1]])
+    positions, fields = (NONE, rolled) if case == "rolled" else WRITTEN[case]
+    data = written(right, positions, fields)
+    said = STUDY.with_(instrument__crosstalk={"yx": -0.03} if case == "rolled" else {})
+    stated = said.with_(instrument_sd={"crosstalk": 0.03, "rotation_rad": 0.03, "gain": 3e-3})
+    names = [error.names for error in find_gross_errors(said, data)]
+    assert names == [("sign_flipped_axis",)] if case == "rolled" else names  # the control
+    assert [error.names for error in find_gross_errors(stated, data)] == (
+        [] if case == "rolled" else names)
+
+
 @pytest.mark.parametrize("shown", "yz")
 def test_the_only_column_is_of_another_component(right, shown):
     """A study that observes y alone, and a map whose column By has that component."""

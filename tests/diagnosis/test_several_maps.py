@@ -259,6 +259,11 @@ def test_an_effect_belongs_to_a_map_or_to_the_probe():
     campaign = Campaign.of(study, empty_maps())
     assert places("mapper_translation") == [("stage table", ("body", "fringe")),
                                             ("map body", ("body",)), ("map fringe", ("fringe",))]
+    # unless it is stated, as by an overlap, how far one may have moved: that is a reading
+    first, second = study.maps
+    study = study.with_(maps=(first, second.with_(stage_shift_sd_m=(1e-4, 1e-4, 2e-5))))
+    assert places("mapper_translation") == [("stage table", ("body", "fringe"))]
+    assert len(places("mapper_tilt_x")) == 3  # which is said of shifts only
     assert places("arm_sag") == [("map body", ("body",)), ("map fringe", ("fringe",))]
     single = study.of_map(0)
     assert [place.name for place in Campaign.of(single, empty_maps()["body"]).places(

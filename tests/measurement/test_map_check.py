@@ -177,7 +177,8 @@ def test_few_combinations_of_charges_have_the_field_of_all(generator):
     best = free.most_probable(field.ravel())
     whole = charges.field(GRID, best.amplitudes)
     for penalty, like in ((best.penalty, True), (1e6 * best.penalty, False)):
-        few = harmonic_field.FewCharges(charges.places, charges.scale, free.determined(penalty))
+        chosen, vectors = free.determined(penalty)
+        few = harmonic_field.FewCharges(charges.places[chosen[:-3]], charges.scale, vectors)
         own = harmonic_field.FreeField(few.fields(GRID).reshape(-1, len(few)), best.penalty)
         off = few.field(GRID, own.amplitudes(field.ravel())) - whole
         assert len(few) < len(charges)
@@ -415,22 +416,26 @@ def test_what_charges_cannot_follow_is_no_error_of_the_probe(generator):
 
 
 @pytest.mark.parametrize("shape", [sectors, lambda cuboids: cuboids])
-def test_edges_of_magnets_are_no_errors_of_the_probe(generator, shape, monkeypatch):
-    """A map that ends 6 mm from edges of magnets, which charges follow less well than the probe.
+def test_edges_of_magnets_are_no_errors_of_the_probe(shape, monkeypatch):
+    """Maps that end 6 mm from edges of magnets, which charges follow less well than the probe.
 
-    Nothing is wrong with it. The control, of cuboids, does not ask the half in which the field is
-    flat: both halves along x and along y are steep somewhere, and show the same.
+    Nothing is wrong with them. The control, of cuboids, does not ask the half in which the field is
+    flat: both halves along x and along y are steep somewhere, and in some maps show the same.
     """
-    field = shape(truth(generator)).getB(FRINGE)
-    field += NOISE_T * generator.standard_normal(FRINGE.shape)
-    check = check_map(field_map(FRINGE, field))
-    assert check.broken == {}
-    assert not any(term.found for term in check.terms)
-    if shape is not sectors:
-        selected = map_check.selected
-        monkeypatch.setattr(map_check, "selected", lambda parameters, told, **_: selected(
-            parameters, told))
-        assert any(term.found for term in check_map(field_map(FRINGE, field)).terms)
+    asked, selected = [], map_check.selected
+    for seed in range(1 if shape is sectors else 4):
+        generator = np.random.default_rng(seed)
+        field = shape(truth(generator)).getB(FRINGE)
+        data = field_map(FRINGE, field + NOISE_T * generator.standard_normal(FRINGE.shape))
+        check = check_map(data)
+        assert check.broken == {}
+        assert not any(term.found for term in check.terms)
+        if shape is not sectors:
+            with monkeypatch.context() as without:
+                without.setattr(map_check, "selected", lambda parameters, told, **_: selected(
+                    parameters, told))
+                asked += [term.name for term in check_map(data).terms if term.found]
+    assert shape is sectors or asked
 
 
 def test_what_is_as_far_off_where_the_field_is_as_steep_is_no_spike(generator):

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
 from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.study import study_file
 from halbach_fe.study.iron import IronRing, SteelCurve
 from halbach_fe.study.reader import parse_study, read_study
@@ -104,6 +105,29 @@ def test_a_byte_order_mark_is_no_part_of_the_study():
     study = read_study(ROOT / "studies" / "faser" / "study.toml")
     after = study.with_(array__inner_radius_m=0.9 * study.array.inner_radius_m)
     assert edited_text(f"\ufeff{PLAIN}", [(after, "why")]) == edited_text(PLAIN, [(after, "why")])
+
+
+@pytest.mark.parametrize(("ring", "tables"), [(1, 2), (3, 4)], ids=["one", "of three equal ones"])
+def test_a_listed_ring_changes_alone(ring, tables):
+    """Also one of equal rings, for which a single table stands in the file."""
+    text = BARE + "[array]\n" + RINGS.partition("\n")[2] + """
+block.shape = "sector"
+
+[[array.ring]]
+inner_radius_m = 0.11  # the step
+
+[[array.ring]]  # equal rings
+count = 3
+inner_radius_m = 0.1
+"""
+    before = parse_study(tomllib.loads(text))
+    for name, change in (("inner_radius", 1e-4), ("length", 1e-3)):
+        after = EFFECTS[name].apply(before, Place(ring), [change])
+        edited = edited_text(text, [(after, "why")])
+        assert parse_study(tomllib.loads(edited)) == after != before
+        assert edited.count("[[array.ring]]") == tables
+        assert "# the step" in edited  # not rewritten in full
+        assert "# equal rings" in edited
 
 
 def test_nothing_to_change_is_the_file_itself():

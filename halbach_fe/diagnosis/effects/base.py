@@ -374,8 +374,10 @@ def with_remanence(study: Study) -> Study:
 
 def changed(nominal: NominalFields, study: Study) -> Floats:
     """Return B (n, 3) in T of the nominal blocks of ``study``, less that of ``nominal``."""
-    return np.asarray(nominal.block_fields_of(study).sum(axis=0)
-                      - nominal.block_fields.sum(axis=0))
+    blocks = build_magnet(study).blocks
+    others = np.flatnonzero([new != old for new, old in zip(blocks, nominal.blocks, strict=True)])
+    return np.asarray(nominal.fields_of([blocks[number] for number in others]).sum(axis=0)
+                      - nominal.block_fields[others].sum(axis=0))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Effects on the shape of arrays of equal rings, and on where the rings and blocks are, as rows.
+"""Effects on the shape of rings, and on where the rings and blocks are, as rows.
 
 The signature of a shape is the difference that it makes to the blocks in vacuum, divided by a step
 within which that is linear. Rings that move keep their shape: their signature is the sum over the
@@ -28,6 +28,7 @@ from halbach_fe.diagnosis.effects.base import (
     with_remanence,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
+from halbach_fe.geometry.array_layout import ring_limits
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.study.array import Array, BlockException
@@ -36,10 +37,16 @@ from halbach_fe.study.model import Study
 X, Y, Z = np.eye(3)
 OWN_AXES = ("radial", "azimuthal", "axial")
 
+TOUCHING_M = 1e-9
+"""Distance along z up to which rings touch: sums of their lengths differ by rounding."""
+
 
 @dataclass(frozen=True, eq=False)
 class ShapeRow(Effect):
-    """Keys of the array differ, in all rings alike; ``keys`` returns them by the amplitude."""
+    """Keys of the array differ, in all equal rings alike, or in one of rings that the study lists.
+
+    ``keys`` returns them for an array of equal rings, by the amplitude.
+    """
 
     name: str
     title: str
@@ -49,14 +56,26 @@ class ShapeRow(Effect):
     dimensions: tuple[int, ...] = (2, 3)
 
     def places(self, study: Study) -> Sequence[Place]:
-        return [Place()] if study.array.is_uniform and study.dimension in self.dimensions else []
+        array = study.array
+        if study.dimension not in self.dimensions or array.free_blocks is not None:
+            return []
+        return [Place()] if array.is_uniform else [
+            Place(ring) for ring in range(1, array.rings + 1)
+            if array.of_ring(ring).remanence_T is not None]  # a moment holds for a volume
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         return changed(nominal, self.apply(nominal.study, place, [self.step]))[None] / self.step
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        study = with_remanence(study)
-        return with_array(study, **self.keys(study.array, float(values[0])))
+        study, amount = with_remanence(study), float(values[0])
+        if not place.ring:
+            return with_array(study, **self.keys(study.array, amount))
+        rings, keys = list(study.array.ring), self.keys(study.array.of_ring(place.ring), amount)
+        rings[place.ring - 1] = rings[place.ring - 1].with_(**keys)
+        # what all rings state is for the array what the first of them states
+        first = {key: value for key, value in keys.items() if place.ring == 1 and all(
+            getattr(ring, key) is not None for ring in study.array.ring)}
+        return with_array(study, ring=tuple(rings), **first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,26 +191,43 @@ def _several_rings(study: Study) -> list[Place]:
     return rings if len(rings := each_ring(study)) > 1 else []
 
 
-def _apart(rings: int, seam: int, ring: int) -> float:
-    """Return the fraction of the gap above ring ``seam`` by which ring ``ring`` moves along z.
+def _seams(study: Study) -> list[Place]:
+    """Return a place for every plane across the axis that passes between rings, none in two
+    dimensions. Its ring is the first one below; rings of all layers are on either side.
+    """
+    if study.dimension == 2 or study.array.free_blocks is not None:
+        return []
+    bottom, top = np.array(ring_limits(study.array, study.dimension)).T
+    found: dict[bytes, Place] = {}
+    for ring, plane in enumerate(top, start=1):
+        beyond = bottom > plane - TOUCHING_M
+        if beyond.any() and (beyond | (top < plane + TOUCHING_M)).all():
+            found.setdefault(beyond.tobytes(), Place(ring))
+    return list(found.values())
+
+
+def _apart(study: Study, place: Place) -> Floats:
+    """Return the fractions (rings,) of the gap above a ring by which rings move along z.
 
     The outer side of a gap moves away from the middle of the magnet, both of one in the middle.
     """
-    return (ring > seam) - (0.5 if 2 * seam == rings else 1.0 if 2 * seam < rings else 0.0)
+    bottom, top = np.array(ring_limits(study.array, study.dimension)).T
+    beyond = bottom > top[place.ring - 1] - TOUCHING_M
+    height = top[~beyond].max() + bottom[beyond].min() - top.max() - bottom.min()
+    return beyond - (0.5 if abs(height) < TOUCHING_M else 1.0 if height < 0 else 0.0)
 
 
 def _apart_and_along(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
     """Return what a block changes by a gap, and by a displacement of all blocks along z."""
     (change,) = _along(Z)(nominal, place, number)
-    return [_apart(nominal.study.array.rings, place.ring, nominal.blocks[number].ring) * change,
-            change]
+    return [_apart(nominal.study, place)[nominal.blocks[number].ring - 1] * change, change]
 
 
 def _gap_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of the rings that a gap and a common shift move."""
-    rings, (gap, shift) = study.array.rings, values
-    return [BlockException(ring=ring, shift_m=(
-        0.0, 0.0, _apart(rings, place.ring, ring) * gap + shift)) for ring in range(1, rings + 1)]
+    gap, shift = values
+    return [BlockException(ring=ring, shift_m=(0.0, 0.0, share * gap + shift))
+            for ring, share in enumerate(_apart(study, place).tolist(), start=1)]
 
 
 def _planes(study: Study) -> list[Place]:
@@ -298,9 +334,7 @@ EFFECTS = (
     # have moved along z as well, which alone is no gap.
     MoveRow("ring_gap", "gap between two rings",
             (Parameter("gap", "m", 2e-4), Parameter("shift", "m", 1e-4)),
-            lambda study: [Place(ring) for ring in range(1, study.array.rings)]
-            if study.dimension == 3 and study.array.is_uniform else [], _apart_and_along, _gap_of,
-            defining=("gap",), moves_all=True),
+            _seams, _apart_and_along, _gap_of, defining=("gap",), moves_all=True),
     # One map of a magnet without iron cannot tell that from a displaced mapper; several maps, iron
     # or other sources can. A stack of ten rings that is held at one end instead of its middle is
     # displaced by some tenths of a millimetre. Magnets are assembled once, while every map has a

@@ -207,7 +207,7 @@ class IronRingEffect(Effect):
     applied_in_full = True
 
     def places(self, study: Study) -> Sequence[Place]:
-        if iron_of(study) is not None:
+        if iron_of(study) is not None or study.prior.variation_sd:  # which no study has beside iron
             return []
         blocks = build_magnet(study).array_outer_radius
         return [Place(at_m=(blocks + gap, blocks + gap + thickness))
