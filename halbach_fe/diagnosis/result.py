@@ -19,7 +19,7 @@ from halbach_fe.diagnosis.position_noise import PositionNoise
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import axes_of_map
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.study.maps import InstrumentSd
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 
