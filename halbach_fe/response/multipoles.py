@@ -33,7 +33,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import Deviations
@@ -41,6 +41,7 @@ from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values
+from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
 from halbach_fe.study.types import COMPONENTS
@@ -598,34 +599,40 @@ def _along_all_z(
     near, far = complexes(matrix)
     offset_near, offset_far = complexes(offset)
     circle = observation.points[observation.points[:, 2] == observation.points[0, 2]]
-    exact, exact_error = _integrals_of_blocks(magnet, np.hypot(*circle[0, :2]), len(near))
-    external, external_error = _external_integrals(magnet, circle, len(near))
+    radius, highest = float(np.hypot(*circle[0, :2])), len(near)
+    shapes, inexact = _integrals_of_shapes(magnet.blocks, radius, highest)
+    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
+    of_others, inexact_others = _integrals_of_shapes(others, radius, highest)
+    sources = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
+                  for one, shape in zip(others, of_others, strict=True))
+    coils, coils_error = _integrals_of_coils(magnet, circle, highest)
     mesh = model.error[part].reshape(2, 2, -1).max(axis=1).sum(axis=0)
-    error = mesh + np.abs(offset_far + far @ model.nominal) + exact_error + external_error
+    error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + inexact_others + coils_error
     total = near + far
-    total[:, :size] += exact
+    tensors = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks])
+    total[:, :size] += np.einsum("bk,bj->kbj", shapes, tensors[:, 0] + 1j * tensors[:, 1]).reshape(
+        highest, size)
+    external = sources + coils
     return total, offset_near + offset_far + external, error
 
 
-def _integrals_of_blocks(
-    magnet: Magnet, radius: float, highest: int
+def _integrals_of_shapes(
+    blocks: Sequence[MagnetBlock], radius: float, highest: int
 ) -> tuple[Complexes, Floats]:
-    """Return C_n (K, parameters of blocks) in T m per A/m, integrated along all of z in vacuum.
+    """Return `_harmonics_of_shape` of blocks (blocks, K), and error bars (K,) in T m.
 
-    Their error bars (K,) in T m are the changes by quadratures of fewer points.
+    These are the changes of the sum of all by quadratures of fewer points.
     """
-    columns, errors = [], np.zeros(highest)
     fewer = 4  # points of every panel
     # of a panel as long as it is far from the axis, sqrt(1 + 2^2) + 2 = 4.2 is the base of the
     # powers by which a quadrature converges; harmonics of order n vary n times as fast
     size = 14 + highest // 2
-    for block in magnet.blocks:
-        shape = _harmonics_of_shape(block, radius, highest, size)
-        change = np.abs(shape - _harmonics_of_shape(block, radius, highest, size - fewer))
-        to_polarization = MU_0 * block.recoil_tensor
-        columns.append(np.outer(shape, to_polarization[0] + 1j * to_polarization[1]))
-        errors += change * np.hypot(*block.polarization[:2])
-    return np.hstack(columns), errors
+    found, errors = np.zeros((len(blocks), highest), complex), np.zeros(highest)
+    for number, block in enumerate(blocks):
+        found[number], coarser = (_harmonics_of_shape(block, radius, highest, points)
+                                  for points in (size, size - fewer))
+        errors += np.abs(found[number] - coarser) * np.hypot(*block.polarization[:2])
+    return found, errors
 
 
 def _harmonics_of_shape(block: MagnetBlock, radius: float, highest: int, size: int) -> Complexes:
@@ -676,15 +683,15 @@ def _harmonics_of_shape(block: MagnetBlock, radius: float, highest: int, size: i
     return np.asarray(total / (2j * np.pi))
 
 
-def _external_integrals(
+def _integrals_of_coils(
     magnet: Magnet, circle: Floats, highest: int
 ) -> tuple[Complexes, float]:
-    """Return C_n (K,) of external fields but a uniform one, integrated along all of z, in T m.
+    """Return C_n (K,) of external coils and dipoles, integrated along all of z, in T m.
 
     The error bar in T m of all comes second. ``circle`` (angles, 3) in m are equidistant points.
     """
-    external = magnet.external.with_(background_T=(0.0, 0.0, 0.0))
-    if external == type(external)():
+    external = External(coils=magnet.external.coils, dipoles=magnet.external.dipoles)
+    if external == External():
         return np.zeros(highest, complex), 0.0
     alone = magnet.with_(external=external)
     angle = np.arctan2(circle[:, 1], circle[:, 0])
@@ -695,8 +702,7 @@ def _external_integrals(
         found = wave @ (field[:, 1] + 1j * field[:, 0])
         return np.concatenate([found.real, found.imag])
 
-    places = [0.0, *(one.z_m for one in external.neighbours),
-              *(one.position_m[2] for one in external.dipoles),
+    places = [0.0, *(one.position_m[2] for one in external.dipoles),
               *(one.centre_m[2] for one in external.coils)]
     relative_error = 1e-10  # far below what is known of external fields
     found, error = quad_vec(harmonics, -np.inf, np.inf, epsrel=relative_error, epsabs=0.0,
