@@ -236,10 +236,9 @@ class Magnet(ShownInNotebook):
     def field_reach(self) -> float:
         """Distance in m from the middle up to which there is some field; of a 3D magnet."""
         # distance by which the field is summed beyond the ends, relative to the magnet's outer
-        # radius. The field of a block falls as 1/z^3, so that about 1e-3 of the integral of order 1
-        # of a block lies beyond; `halbach_fe.response.multipoles` adds it as that of point dipoles.
-        # Higher orders fall faster: for two rings of 80 mm with errors of 2 %, 0.01 units are
-        # missing. The distance is half of that to the boundary of 3D meshes.
+        # radius, of what permeability and iron add: `halbach_fe.response.multipoles`. It falls as
+        # 1/z^3, so that about 1e-3 of its integral of order 1 lies beyond. The distance is half of
+        # that to the boundary of 3D meshes.
         reach_per_radius = 4.5
         return self.half_length + reach_per_radius * self.radius
 

@@ -61,6 +61,7 @@ def reference_summary(model: MultipoleModel, limit: float | None) -> Plain:
     """Return the reference of multipoles as entries of a JSON file."""
     return {"radius_m": model.radius, "z_m": model.z, "integrated_along_z": model.integrated,
             "main_order": model.main, "orders": list(model.orders),
+            "uniform_field_left_out_T": list(model.left_out_T),
             "axes_turned_by_rad": model.turn, "limit_units": limit,
             "nominal_main": model.nominal_main, "main_unit": model.unit}
 
@@ -75,6 +76,9 @@ def reference_text(model: MultipoleModel, study: Study, absolute: bool = False) 
     own = [model.main + count for count in study.array.blocks_by_ring]
     higher = "" if study.array.free_blocks or min(own) <= max(model.orders) else (
         f" The lowest unwanted order of rings as designed is {min(own)}, not in the table.")
+    uniform = "" if not any(model.left_out_T) else (
+        " The uniform field external.background_T is left out: its integral along all of z is "
+        "infinite.")
     where = ("of the field integrated along z" if model.integrated
              else "of the cross-section" if model.z is None
              # the middle of a magnet is 0 to rounding
@@ -83,7 +87,7 @@ def reference_text(model: MultipoleModel, study: Study, absolute: bool = False) 
             f"{units} (order {model.main}; European convention, order 1 is "
             "the dipole). b_n and a_n are the normal and the skew one of order n, in axes turned "
             "about z such that the main multipole of the nominal magnet is normal."
-            f"{higher}")
+            f"{higher}{uniform}")
 
 
 def multipole_figure(

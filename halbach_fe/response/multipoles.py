@@ -8,8 +8,13 @@ of 1e-4 of the main one, ``c_n = 1e4 C_n / |C_N|``, along axes turned about z su
 magnet's main multipole is normal: ``C_n exp(-i n arg(C_N) / N)``.
 
 In 2D the multipoles are those of a single circle. In 3D they are those of the field integrated
-along z over the magnet and far beyond its ends, because this integral solves the two-dimensional
-Laplace equation again. Alternatively, they are the coefficients of B_r on the circle at a given z.
+along all of z, because this integral solves the two-dimensional Laplace equation again.
+Alternatively, they are the coefficients of B_r on the circle at a given z.
+
+The integral of a block's field is that of a plane magnet, its projection along z with the thickness
+as weight: of a volume dV at ``Z = x + i y`` with the polarization J it is ``B_y + i B_x = i (J_x +
+i J_y) dV / (2 pi (z - Z)^2)``, and J_z has none. What permeability and iron add is summed from one
+end to the other, and continued beyond as it falls there. That of a uniform field is infinite.
 """
 
 from __future__ import annotations
@@ -23,17 +28,21 @@ from itertools import pairwise
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
+from scipy.integrate import quad_vec
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import Deviations
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
+from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, correlated_values
+from halbach_fe.study.magnet import External
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import CirclePositions, FourierCoefficients, Instrument
 from halbach_fe.study.types import COMPONENTS
@@ -202,6 +211,8 @@ class MultipoleModel:
         Nominal magnetization.
     turn : float
         Angle in rad of the axes about z.
+    left_out_T : tuple of 3 floats
+        Uniform field that the integral along z, which would be infinite, is without.
     """
 
     orders: tuple[int, ...]
@@ -214,6 +225,7 @@ class MultipoleModel:
     error: Floats
     nominal: Floats
     turn: float
+    left_out_T: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def unit(self) -> str:
@@ -303,9 +315,9 @@ def multipole_models(
         first = part.stop
         integrated = magnet.dimension == 3 and z is None
         matrix = _complexes(model.matrix[part])
+        offset, error = _complexes(model.offset[part]), model.error[part]
         if integrated:
-            far = beyond(magnet, magnet.field_reach)
-            matrix[0, :len(far)] += far  # variations inside blocks have next to no field there
+            matrix, offset, error = _along_all_z(magnet, observation, model, part)
         index = np.array([main, *orders]) - 1
         try:
             turn = _turn(magnet, matrix[main - 1], model)
@@ -318,8 +330,8 @@ def multipole_models(
         phases = np.exp(-1j * turn * (index + 1))
         models.append(MultipoleModel(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
-            phases * _complexes(model.offset[part])[index], model.error[part][index],
-            model.nominal, -turn))
+            phases * offset[index], error[index], model.nominal, -turn,
+            magnet.external.background_T if integrated else (0.0, 0.0, 0.0)))
     said = tuple(f"{place} has no multipole of order {main}, which cancels there: its table, in "
                  "units of 1e-4 of that, is left out." for place in left_out)
     for each in said:
@@ -559,28 +571,145 @@ def _circle_error(analysis: sparse.csr_array, errors: Floats) -> Floats:
     return np.full(analysis.shape[0] // 2, np.sqrt(2 * np.mean(own**2)))
 
 
-def beyond(magnet: Magnet, reach: float) -> Complexes:
-    """Return the integral of B_y + i B_x along the axis beyond |z| = ``reach`` in m.
+def _along_all_z(
+    magnet: Magnet, observation: Observation, model: Response, part: slice
+) -> tuple[Complexes, Complexes, Floats]:
+    """Return matrix, offset and error bars (K, ...) of the field integrated along all of z.
 
-    The result is (parameters,) in T m per A/m of each block, with every block a point dipole in
-    vacuum. It is the closed form of the integral of
-    ``B = mu_0 / 4 pi (3 (m R) R / R^5 - m / R^3)`` along z.
+    Those of the `model` are sums of fields over the magnet's length and its surroundings, and what
+    is beyond if it falls as the multipole of its order does. They are kept for what permeability
+    and iron add, with all that is beyond as error bar; blocks in vacuum and external fields have
+    integrals of their own.
     """
-    integrals = []
-    for block in magnet.blocks:
-        middle, total = block.middle, np.zeros((2, 3))
-        aside = -middle[:2]
-        square = float(aside @ aside)
-        for side in (1.0, -1.0):  # the lower end is the upper end of the mirrored magnet
-            z = reach - side * middle[2]
-            distance = np.hypot(z, np.sqrt(square))
-            third = (1 - z / distance) / square
-            fifth = (2 - z * (2 * z**2 + 3 * square) / distance**3) / (3 * square**2)
-            total[:, :2] += 3 * fifth * np.outer(aside, aside) - third * np.eye(2)
-            total[:, 2] += side * aside / distance**3
-        total *= MU_0 * block.volume / (4 * np.pi)
-        integrals.append(total[1] + 1j * total[0])
-    return np.concatenate(integrals)
+    def complexes(values: Floats) -> tuple[Complexes, Complexes]:
+        near, far = np.split(values, 2)
+        return _complexes(near), _complexes(far)
+
+    sources = observation.operator @ external_field(magnet, observation.points).ravel()
+    summed = np.hstack([
+        observation.operator @ unit.reshape(-1, 3) @ (MU_0 * block.recoil_tensor)
+        for block, unit in zip(magnet.blocks, unit_fields(
+            magnet.blocks, observation.points), strict=True)])
+    size = summed.shape[1]
+    matrix, offset = model.matrix[part].copy(), model.offset[part] - sources
+    matrix[:, :size] -= summed
+    unknown = magnet.study.uncertain_of_magnet
+    for column, one in enumerate(unknown, matrix.shape[1] - len(unknown)):
+        uniform = [one.sd * one.change.get(f"external.background_T[{axis}]", 0.0)
+                   for axis in (1, 2, 3)]
+        matrix[:, column] -= observation.operator @ np.tile(uniform, len(observation.points))
+    near, far = complexes(matrix)
+    offset_near, offset_far = complexes(offset)
+    circle = observation.points[observation.points[:, 2] == observation.points[0, 2]]
+    radius, highest = float(np.hypot(*circle[0, :2])), len(near)
+    shapes, inexact = _integrals_of_shapes(magnet.blocks, radius, highest)
+    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
+    of_others, inexact_others = _integrals_of_shapes(others, radius, highest)
+    sources = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
+                  for one, shape in zip(others, of_others, strict=True))
+    coils, coils_error = _integrals_of_coils(magnet, circle, highest)
+    mesh = model.error[part].reshape(2, 2, -1).max(axis=1).sum(axis=0)
+    error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + inexact_others + coils_error
+    total = near + far
+    tensors = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks])
+    total[:, :size] += np.einsum("bk,bj->kbj", shapes, tensors[:, 0] + 1j * tensors[:, 1]).reshape(
+        highest, size)
+    external = sources + coils
+    return total, offset_near + offset_far + external, error
+
+
+def _integrals_of_shapes(
+    blocks: Sequence[MagnetBlock], radius: float, highest: int
+) -> tuple[Complexes, Floats]:
+    """Return `_harmonics_of_shape` of blocks (blocks, K), and error bars (K,) in T m.
+
+    These are the changes of the sum of all by quadratures of fewer points.
+    """
+    fewer = 4  # points of every panel
+    # of a panel as long as it is far from the axis, sqrt(1 + 2^2) + 2 = 4.2 is the base of the
+    # powers by which a quadrature converges; harmonics of order n vary n times as fast
+    size = 14 + highest // 2
+    found, errors = np.zeros((len(blocks), highest), complex), np.zeros(highest)
+    for number, block in enumerate(blocks):
+        found[number], coarser = (_harmonics_of_shape(block, radius, highest, points)
+                                  for points in (size, size - fewer))
+        errors += np.abs(found[number] - coarser) * np.hypot(*block.polarization[:2])
+    return found, errors
+
+
+def _harmonics_of_shape(block: MagnetBlock, radius: float, highest: int, size: int) -> Complexes:
+    """Return C_n (K,) in m per J_x + i J_y of a block, integrated along z.
+
+    By Gauss's theorem the integral of (x + i y)^-(n + 1) over the block's volume is one over its
+    outline and along the axis of its frame, of a block that stands upright times its height.
+
+    Parameters
+    ----------
+    block : MagnetBlock
+    radius : float
+        Reference radius in m.
+    highest : int
+        K.
+    size : int
+        Gauss points in every panel, which is not longer than the block is far from the axis.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(size)
+    most_panels = 64  # along a side of blocks that all but touch the axis
+
+    def panels(length: float, longest: float) -> tuple[Floats, Floats]:
+        count = min(int(np.ceil(length / longest)), most_panels)
+        starts = np.arange(count)[:, None]
+        return ((starts + (1 + nodes) / 2) / count).ravel(), np.tile(weights / 2 / count, count)
+
+    axes = block.axes[0] + 1j * block.axes[1]  # in the plane of x and y
+    aside = int(np.argmax(np.abs(axes[:2])))
+    height = block.z_max - block.z_min
+    origin = complex(*block.position[:2]) + block.z_min * axes[2]
+    rounding = 1e-15
+    upright = abs(axes[2]) < rounding
+    total = np.zeros(highest, complex)
+    for factor, part in block.parts:
+        sides = [edge.at(np.linspace(0, 1, 17))[0] @ axes[:2] for edge in part.outline]
+        distance = float(np.abs(origin + np.concatenate(sides)[:, None]
+                                + height * axes[2] * np.linspace(0, 1, 9)).min())
+        levels, along = (np.zeros(1), np.ones(1)) if upright else panels(height, distance)
+        for edge in part.outline:
+            t, across = panels(edge.length, distance)
+            places, normals = edge.at(t)
+            z = (origin + places @ axes[:2])[:, None] + height * axes[2] * levels
+            power = factor * height * np.outer(across * normals[:, aside], along) / (
+                axes[aside] * z)
+            for order in range(highest):
+                total[order] += power.sum()
+                power *= radius / z
+    return np.asarray(total / (2j * np.pi))
+
+
+def _integrals_of_coils(
+    magnet: Magnet, circle: Floats, highest: int
+) -> tuple[Complexes, float]:
+    """Return C_n (K,) of external coils and dipoles, integrated along all of z, in T m.
+
+    The error bar in T m of all comes second. ``circle`` (angles, 3) in m are equidistant points.
+    """
+    external = External(coils=magnet.external.coils, dipoles=magnet.external.dipoles)
+    if external == External():
+        return np.zeros(highest, complex), 0.0
+    alone = magnet.with_(external=external)
+    angle = np.arctan2(circle[:, 1], circle[:, 0])
+    wave = np.exp(-1j * np.outer(np.arange(highest), angle)) / len(angle)
+
+    def harmonics(z: float) -> Floats:
+        field = external_field(alone, np.column_stack([circle[:, :2], np.full(len(circle), z)]))
+        found = wave @ (field[:, 1] + 1j * field[:, 0])
+        return np.concatenate([found.real, found.imag])
+
+    places = [0.0, *(one.position_m[2] for one in external.dipoles),
+              *(one.centre_m[2] for one in external.coils)]
+    relative_error = 1e-10  # far below what is known of external fields
+    found, error = quad_vec(harmonics, -np.inf, np.inf, epsrel=relative_error, epsabs=0.0,
+                            norm="max", points=sorted(set(places)))
+    return found[:highest] + 1j * found[highest:], float(error)
 
 
 def _radius(magnet: Magnet, reference: MultipoleReference) -> float:
@@ -644,7 +773,8 @@ def _free_radius(magnet: Magnet, z: float | None) -> float:
 def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -> Observation:
     """Return an observation of the Fourier coefficients of B_r.
 
-    They are those of the circle at z, or in 3D with z None those of the field integrated along z.
+    They are those of the circle at z, or in 3D with z None those of the field summed along z, and
+    then, as further readings, what is beyond the ends if order n falls as z^-(n + 2) there.
     """
     free = _free_radius(magnet, z)
     bore = free if radius < free else magnet.bore_radius
@@ -669,9 +799,16 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
     weights = np.full(limits[2], step)
     if limits[2] > 1:
         weights[[0, -1]] /= 2
-    total = sparse.csr_array(sparse.kron(weights[None], sparse.eye_array(2 * highest)) @ matrix)
-    return Observation(points, total, total, points, labels[:2 * highest],
-                       positions[:2 * highest])
+    size = 2 * highest
+    total = sparse.csr_array(sparse.kron(weights[None], sparse.eye_array(size)) @ matrix)
+    labels, positions = labels[:size], positions[:size]
+    if limits[2] > 1:
+        ends = np.isin(np.arange(limits[2]), (0, limits[2] - 1)).astype(float)
+        falling = np.tile(limits[1] / (1 + np.arange(1, highest + 1)), 2)
+        beyond = sparse.kron(ends[None], sparse.diags_array(falling)) @ matrix
+        total = sparse.csr_array(sparse.vstack([total, beyond]))
+        labels, positions = 2 * labels, np.tile(positions, (2, 1))
+    return Observation(points, total, total, points, labels, positions)
 
 
 SAME_HEIGHT_M = 1e-6
