@@ -148,9 +148,10 @@ def shims(note: Note, session: Session) -> None:
         low, _, high = found.after.rms_range_ppm
         within += low <= rms[1] <= high
         direction = model.weights @ shimmed
-        _, functions = real_harmonics(model.degrees, model.surface_degree)
+        _, functions = real_harmonics(
+            model.degrees, model.sampling.degree, model.sampling.inner_radius)
         true = PPM / mean[1] * functions @ (
-            shimmed[:model.surface] @ (direction / np.linalg.norm(direction)))
+            shimmed[:model.sampling.surface] @ (direction / np.linalg.norm(direction)))
         foretold = np.array([[one.ppm, one.sd_ppm] for one in found.after.harmonics]).T
         chi2.append(np.mean(((true - foretold[0]) / foretold[1])**2))
     note("mri.shim_reduction", float(np.median(reduction)), "ratio",

@@ -17,7 +17,10 @@ def install_command(extra: str) -> str:
 
     A clone or a wheel is named by its own place: an index of packages may not hold it.
     """
-    origin = json.loads(metadata.distribution("halbach-fe").read_text("direct_url.json") or "{}")
+    # a folder of sources on the path has records of its own, without the place
+    records = (one.read_text("direct_url.json") for one in metadata.distributions(
+        name="halbach-fe"))
+    origin = json.loads(next(filter(None, records), "{}"))
     url = origin.get("url", "")
     if "dir_info" in origin:
         editable = "-e " if origin["dir_info"].get("editable") else ""

@@ -3,6 +3,7 @@
 import json
 import sys
 from importlib import metadata
+from types import SimpleNamespace
 
 import pytest
 
@@ -25,8 +26,9 @@ ORIGINS = {  # what pip wrote of the installation (PEP 610), and the command tha
 @pytest.mark.parametrize("origin", ORIGINS)
 def test_the_command_names_the_place_of_the_installation(origin, monkeypatch):
     written, command = ORIGINS[origin]
-    monkeypatch.setattr(metadata.PathDistribution, "read_text", lambda self, name: (
-        json.dumps(written) if written and name == "direct_url.json" else None))
+    records = {"direct_url.json": json.dumps(written)} if written else {}
+    monkeypatch.setattr(metadata, "distributions", lambda name: [
+        SimpleNamespace(read_text={}.get), SimpleNamespace(read_text=records.get)])
     assert install_command("campaign") == command
 
 

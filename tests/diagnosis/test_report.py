@@ -31,7 +31,9 @@ from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis import change_table, found_table
+from halbach_fe.report.diagnosis import page as page_of_diagnosis
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.report.page import write_files
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
@@ -72,7 +74,7 @@ def flat(dipole, session, generator):
 def test_a_cross_section(flat, tmp_path):
     found, further = flat
     assert [one.hypothesis.effect.name for one in found.identified] == ["gain_x"]
-    write_result(found, tmp_path, further)
+    write_files(page_of_diagnosis(found, further), tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert page.count("<img alt=") == 5
     assert "along z" not in page.split("<h2>Structure")[1].split("<img")[0]  # no M_z
@@ -91,7 +93,7 @@ def test_a_line(short_dipole, session, generator, tmp_path):
     (one,) = found.identified
     rivals = {candidate.effect for candidate, _ in one.selection.alternatives}
     assert {one.hypothesis.effect.name, *rivals} >= {"background", "offset_x"}
-    write_result(found, tmp_path, further)
+    write_files(page_of_diagnosis(found, further), tmp_path)
     page = (tmp_path / "diagnosis.html").read_text()
     assert "The map does not tell" in page
     assert "<strong>Measure next: the same map with the probe turned by 180° about z." in page

@@ -83,6 +83,6 @@ def command_of(path):
     return " ".join(html.unescape(re.sub("<.*?>", "", code[1])).split())
 
 
-def write_result(result, folder, *details):
+def write_result(result, folder):
     """Write the page of a result and its files into any folder, also one of another command."""
-    return write_files(page_of(result, *details), folder)
+    return write_files(page_of(result), folder)
