@@ -16,10 +16,6 @@ QUOTED = {
         "response.seconds", "response.memory_GiB"),
     ("README.md", "its difference to NGSolve"): ("response.error_against_ngsolve",),
     ("README.md", "its time relative to magpylib"): ("response.time_over_magpylib",),
-    ("README.md", "iron that saturates: 18 000 solves"): (
-        "nonlinear.seconds_18000", "nonlinear.speedup_vs_getdp_loop"),
-    ("README.md", "linear posterior with the model's own error"): (
-        "calibration.linear_p", "calibration.control_positions_p"),
     ("README.md", "effects hidden in magnets of ten"): (
         "diagnosis.naming_rate_single", "diagnosis.naming_rate_pairs",
         "diagnosis.false_alarm_rate"),
