@@ -125,7 +125,7 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     --posterior the bars are those of the measured magnet, otherwise those of the study's prior.
     With --inside points may lie inside blocks and iron. Writes field.csv, field_map.csv (B as a
     map, which halbach-fe export turns into other formats) and integrals.csv, and for a grid of
-    lines kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
+    lines in air kick_map.txt in the text format of Radia, with kicks in T^2 m^2.
     """
     import numpy as np
 
@@ -158,19 +158,23 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     hf.write_map(hf.field_map(lines.points.reshape(-1, 3), found.mean.reshape(-1, 3), attributes={
         "study": magnet.name}), folder / "field_map.csv")
     columns = _integrals(found, *np.meshgrid(*offsets, indexing="ij"))
+    without = 0
     if min(map(len, offsets)) > 1:
         kicks = found.kicks()
         for across, (kick, sd) in zip("uv", kicks, strict=True):
             columns |= {f"kick_{across}_T2_m2": kick.ravel(),
                         f"sd_kick_{across}_T2_m2": sd.ravel()}
-        write_text(folder / "kick_map.txt", kick_map(
-            found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
+        without = int(np.isnan(kicks[0][0]).sum())
+        if not without:
+            write_text(folder / "kick_map.txt", kick_map(
+                found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
     write_text(folder / "integrals.csv", csv_text(columns))
     doubt = disagreement_of(read)
     if arguments.json:
         common.print_json({"lines": len(lines.points), "points_per_line": lines.count,
                            "reservation": doubt or None, "folder": str(folder),
-                           **{name: values.tolist() for name, values in columns.items()}})
+                           **{name: np.where(np.isnan(values), None, values).tolist()
+                              for name, values in columns.items()}})
         return 0
     middle = len(columns["u_m"]) // 2
     common.print_table([{
@@ -185,6 +189,9 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
            f"v = {1e3 * columns['v_m'][middle]:.4g} mm"))
     if doubt:
         say(doubt)
+    if without:
+        say(f"No kick_map.txt: {without} of {len(lines.points)} lines go through or along blocks "
+            "or iron, where no particle flies, and have no kicks.")
     several = "1 line" if len(lines.points) == 1 else f"{len(lines.points)} lines"
     say(f"Wrote {several} of {lines.count} points: {folder}")
     return 0
