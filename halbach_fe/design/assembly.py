@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import typed
 from halbach_fe.core.arrays import Floats
@@ -114,9 +115,12 @@ class AssembledBlock:
         Serial number; empty if it is not known.
     measured_axes : ndarray, shape (3, 3), or None
         Axes in which the moment of a measured block is given, as columns; None for a block whose
-        magnetization is inverted.
+        magnetization is inverted. They are turned with the block.
     plate : Plate or None
         The plate that holds it.
+    turn_deg : tuple of 3 floats
+        Rotation vector, along its own axes, by which a sorted block is turned in its place from how
+        it was measured.
     """
 
     block: MagnetBlock
@@ -124,6 +128,16 @@ class AssembledBlock:
     serial: str
     measured_axes: Floats | None
     plate: Plate | None = None
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def up(self) -> str:
+        """Which of its measured axes is up; empty if that is not known."""
+        if not self.serial or self.measured_axes is None:
+            return ""
+        axis = int(np.argmax(np.abs(self.measured_axes[2])))
+        sign = "" if self.measured_axes[2, axis] > 0 else "−"
+        return f"{sign}{'xyz'[axis]}"
 
     @property
     def name(self) -> str:
@@ -165,7 +179,9 @@ class AssembledBlock:
 
     @property
     def way_round(self) -> str:
-        """Where the north pole of the block points, and which of its measured axes is up."""
+        """Where the north pole of the block points, which of its measured axes is up, and how it is
+        turned in its place.
+        """
         turn, rise = round(self.from_radius_deg, 1), round(self.elevation_deg, 1)
         if abs(rise) > 84:
             north = "up" if rise > 0 else "down"
@@ -175,11 +191,18 @@ class AssembledBlock:
                 -turn if turn == -180.0 else turn + 0.0, f"{abs(turn):g}° from outwards, {side}")
             if rise:
                 north += f", {abs(rise):g}° {'up' if rise > 0 else 'down'}"
-        if not self.serial or self.measured_axes is None:
-            return f"north {north}"
-        axis = int(np.argmax(np.abs(self.measured_axes[2])))
-        sign = "" if self.measured_axes[2, axis] > 0 else "−"
-        return f"north {north}; its {sign}{'xyz'[axis]} up"
+        turned = f"; turned by {turn_in_words(self.turn_deg)}" if any(self.turn_deg) else ""
+        return f"north {north}" + (f"; its {self.up} up" if self.up else "") + turned
+
+
+def turn_in_words(turn_deg: Sequence[float]) -> str:
+    """Return a rotation vector (3,) in degrees, along a block's own axes, in words."""
+    angle = float(np.linalg.norm(turn_deg))
+    axis = np.round(np.array(turn_deg) / angle, 6)
+    if np.count_nonzero(axis) == 1:
+        along = int(np.argmax(np.abs(axis)))
+        return f"{'−' * bool(axis[along] < 0)}{angle:.0f}° about its own {'xyz'[along]}"
+    return f"{angle:.0f}° about ({', '.join(f'{part:.3g}' for part in axis + 0.0)}) of its own axes"
 
 
 @dataclass(frozen=True)
@@ -275,18 +298,19 @@ def cad(magnet: Magnet, blocks: BlockTable | None = None) -> Assembly:
     if len(there) > most_blocks:
         raise StudyError(must_be("`array`", f"study {magnet.name}", f"of at most {most_blocks} "
                                  "blocks for solids", str(len(there))))
-    serials = _serials(magnet, blocks)
+    serials, turns = _of_table(magnet, blocks)
     table = blocks_table(magnet)
     own = blocks_of_table(table)
     kinds, members = _kinds(table, own)
-    axes = _measured_axes(magnet)
+    axes = _measured_axes(magnet, turns)
     solids = [upright(block) for block in own]
     found, reasons = _plates(magnet, own, solids)
     plate_of = {number: plate for plate in found for copy in plate.blocks for number in copy}
     return Assembly(
         magnet, magnet.study.holder or Holder(), kinds,
         tuple(AssembledBlock(block, kinds[members[number]], serials.get(original, ""),
-                             axes[original], plate_of.get(number))
+                             axes[original], plate_of.get(number),
+                             turns.get(original, (0.0, 0.0, 0.0)))
               for number, (block, original) in enumerate(zip(own, there, strict=True))),
         found, reasons, 0 if blocks is None else int(np.sum(blocks.ring == 0)))
 
@@ -338,8 +362,10 @@ def _z_limits(block: MagnetBlock) -> tuple[float, float]:
     return float(z.min()), float(z.max())
 
 
-def _serials(magnet: Magnet, table: BlockTable | None) -> dict[int, str]:
-    """Return the serial number of the block in every slot, by the number of the slot from 0.
+def _of_table(
+    magnet: Magnet, table: BlockTable | None
+) -> tuple[dict[int, str], dict[int, tuple[float, float, float]]]:
+    """Return serial number and turn of the block in every slot, by the number of the slot from 0.
 
     The table names the place that a block was made for.
 
@@ -349,26 +375,34 @@ def _serials(magnet: Magnet, table: BlockTable | None) -> dict[int, str]:
         If the table does not fit the study, or says nothing about places.
     """
     if table is None:
-        return {}
+        return {}, {}
     if not table.ring.any():
         raise MeasurementError(must_be(
             "ring and slot", table.source, "given, to know which block goes where", "none",
             "halbach-fe sort assigns blocks to slots: give its blocks.sorted.csv."))
     prior_from_blocks(magnet, table)  # which refuses blocks of another magnet
-    serial_of = dict(zip(table.places, table.serial, strict=True))
-    return {number: serial_of[magnet.blocks[source].ring, magnet.blocks[source].slot]
+    row_of = {place: row for row, place in enumerate(table.places)}
+    rows = {number: row_of[magnet.blocks[source].ring, magnet.blocks[source].slot]
             for number, (source, matrix) in enumerate(mountings(magnet)) if matrix.any()}
+    turns = {} if table.turn_deg is None else {
+        number: (float(x), float(y), float(z)) for number, row in rows.items()
+        for x, y, z in table.turn_deg[[row]]}
+    return {number: table.serial[row] for number, row in rows.items()}, turns
 
 
-def _measured_axes(magnet: Magnet) -> list[Floats | None]:
+def _measured_axes(
+    magnet: Magnet, turns: Mapping[int, tuple[float, float, float]]
+) -> list[Floats | None]:
     """Return the axes of every block in which its moment is measured, as columns (3, 3).
 
-    They are the axes of its shape, which turn with a block that is mounted elsewhere or rotated.
+    They are the axes of its shape, which turn with a block that is mounted elsewhere or rotated,
+    or that is turned in its place (``turns``, by its number).
     """
     meant, found = as_meant(magnet).blocks, []
-    for source, matrix in mountings(magnet):
+    for number, (source, matrix) in enumerate(mountings(magnet)):
         factor = np.cbrt(np.linalg.det(matrix))
-        found.append(matrix / factor @ meant[source].shape_axes if factor > 0 else None)
+        own = Rotation.from_rotvec(turns.get(number, np.zeros(3)), degrees=True).as_matrix()
+        found.append(matrix / factor @ meant[source].shape_axes @ own if factor > 0 else None)
     return found
 
 

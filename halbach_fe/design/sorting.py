@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
@@ -68,9 +69,6 @@ class SortedBlocks(ShownInNotebook):
     table : BlockTable
         The table of blocks with ring and slot of each; those of blocks left over are 0. Moments are
         those of the turned blocks.
-    turn_deg : ndarray, shape (blocks, 3)
-        Rotation vector in degrees, along its own axes, by which each block is to be turned in its
-        slot.
     best, numbered : Multipoles or Deviations
         Of this assignment, and of the blocks in the order of the given table.
     fields : tuple of two Homogeneity, or None
@@ -95,7 +93,6 @@ class SortedBlocks(ShownInNotebook):
     study: Study
     model: Objective
     table: BlockTable
-    turn_deg: Floats
     best: Any
     numbered: Any
     fields: tuple[Homogeneity, Homogeneity] | None
@@ -124,6 +121,14 @@ class SortedBlocks(ShownInNotebook):
         # part of their mean by which random orders differ at most where the order does not matter
         rounding = 1e-4
         return bool(np.ptp(self.random) > rounding * np.mean(self.random))
+
+    @property
+    def turn_deg(self) -> Floats:
+        """Rotation vectors (blocks, 3) in degrees, along its own axes, by which each block is to be
+        turned in its slot from how it was measured.
+        """
+        turns = self.table.turn_deg
+        return np.zeros((len(self.table), 3)) if turns is None else turns
 
     @property
     def turned(self) -> int:
@@ -215,12 +220,10 @@ def sort_blocks(
     unit = as_numbered.rms_of_mean / np.sqrt(in_these_units) if in_these_units else 1.0
     if (placed := _placed_order(table, magnet)) is not None:
         known = _assembled(magnet, _name_places(magnet, table, placed), model)
-    turned = np.zeros((len(table), 3))
-    turned[best.order] = np.array([rotation_deg(turn) for turn in mounts.turns])[best.turn]
     result = _name_places(magnet, table, best.order, mounts.turns[best.turn])
     after = _assembled(magnet, result, model)
     return SortedBlocks(
-        magnet.study, model, result, turned, model.of(after), model.of(known),
+        magnet.study, model, result, model.of(after), model.of(known),
         (model.homogeneity.of(after), model.homogeneity.of(known))
         if isinstance(model, DeviationModel) else None,
         unit * np.sqrt(random / count),
@@ -357,7 +360,7 @@ def _name_places(
 
     ``turns`` (slots, 3, 3) are the rotations of the blocks in their own axes. Ring and slot of
     blocks that are left over are 0, and their moments are in the axes of the first slot of their
-    type.
+    type. A turn that a block has already in the table remains.
     """
     ring, slot = np.zeros(len(table), int), np.zeros(len(table), int)
     first = first_of_types(as_meant(magnet))
@@ -368,7 +371,11 @@ def _name_places(
     for number, row in zip(present(magnet), order, strict=True):
         block = magnet.blocks[number]
         ring[row], slot[row], places[row] = block.ring, block.slot, number
-    return replace(table, ring=ring, slot=slot, moment=as_mounted(magnet, table, places, turned))
+    before = np.eye(3) if table.turn_deg is None else Rotation.from_rotvec(
+        table.turn_deg, degrees=True).as_matrix()
+    turn_deg = np.array([rotation_deg(turn) for turn in turned @ before])
+    return replace(table, ring=ring, slot=slot, turn_deg=turn_deg if turn_deg.any() else None,
+                   moment=as_mounted(magnet, table, places, turned))
 
 
 Change = tuple[float, tuple[tuple[int, int, int], ...]]

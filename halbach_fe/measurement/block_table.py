@@ -4,7 +4,8 @@ Each row is a single block that was measured in a Helmholtz coil. Its moment is 
 the block at its place in the magnet: x points radially outward through the middle of the block, z
 along the magnet's axis, and y azimuthally (z cross x). Ring and slot are counted from 1. If the
 place of a block is not known, ``type`` names the type of blocks of the magnet of which it is a
-sample.
+sample. A block that `halbach_fe.sort` turned in its slot has its moment as turned, and the turn in
+columns of their own.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from halbach_fe.measurement.tables import check_columns, csv_table, finite, writ
 MOMENT_COLUMNS = ("mx_A_m2", "my_A_m2", "mz_A_m2")
 REQUIRED_COLUMNS = ("serial", *MOMENT_COLUMNS, "sigma_A_m2")
 COLUMNS = ("serial", "type", "ring", "slot", *REQUIRED_COLUMNS[1:], "volume_m3", "temperature_C")
+TURN_COLUMNS = ("turn_x_deg", "turn_y_deg", "turn_z_deg")
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,9 @@ class BlockTable:
         Provenance, as free text by key.
     source : str
         Name of the table in error messages.
+    turn_deg : ndarray, shape (n, 3), in degrees, or None
+        Rotation vector along its own axes by which each block is turned in its slot from how it
+        was measured; the moment is that of the turned block. None if no block is turned.
 
     Examples
     --------
@@ -68,6 +73,7 @@ class BlockTable:
     temperature: Floats
     attributes: Mapping[str, str] = field(default_factory=dict)
     source: str = "block table"
+    turn_deg: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.serial)
@@ -86,7 +92,8 @@ def read_blocks(path: str | Path) -> BlockTable:
     """Read and validate a table of measured blocks.
 
     The header names the columns of `COLUMNS` in any order. The columns ring, slot, volume_m3 and
-    temperature_C may be missing or have empty cells, type too if ring and slot are given. Lines
+    temperature_C may be missing or have empty cells, type too if ring and slot are given, and so
+    may those of `TURN_COLUMNS`, which say how a block is turned in its slot. Lines
     ``# key: value`` are attributes.
 
     Parameters
@@ -113,7 +120,7 @@ def read_blocks(path: str | Path) -> BlockTable:
     path = as_path(path)
     where = f"block table {path}"
     attributes, header, rows = csv_table(file_bytes(path, where), where)
-    check_columns(header, COLUMNS, where)
+    check_columns(header, (*COLUMNS, *TURN_COLUMNS), where)
     missing = [name for name in REQUIRED_COLUMNS if name not in header]
     if missing:
         raise MeasurementError(must_be("header", where, f"complete with {', '.join(missing)}",
@@ -131,12 +138,15 @@ def read_blocks(path: str | Path) -> BlockTable:
             raise MeasurementError(must_be(f"serial in line {number}", where,
                                            "given, and not begin with #",
                                            f"'{serial}'" if serial else "an empty cell"))
+    turns = np.column_stack([
+        numbers(name, 0.0) if name in header else np.zeros(len(lines)) for name in TURN_COLUMNS])
     return BlockTable(
         tuple(row["serial"] for _, row in lines), tuple(row.get("type", "") for _, row in lines),
         _whole(numbers("ring", 0.0), "ring", lines, where),
         _whole(numbers("slot", 0.0), "slot", lines, where),
         np.column_stack([numbers(name) for name in MOMENT_COLUMNS]), numbers("sigma_A_m2"),
-        numbers("volume_m3", np.nan), numbers("temperature_C", np.nan), attributes, where)
+        numbers("volume_m3", np.nan), numbers("temperature_C", np.nan), attributes, where,
+        turns if turns.any() else None)
 
 
 def write_blocks(table: BlockTable, path: Path) -> None:
@@ -153,7 +163,8 @@ def write_blocks(table: BlockTable, path: Path) -> None:
         "serial": table.serial, "type": table.type, "ring": [n or "" for n in table.ring.tolist()],
         "slot": [n or "" for n in table.slot.tolist()],
         **dict(zip(MOMENT_COLUMNS, table.moment.T, strict=True)), "sigma_A_m2": table.sigma,
-        "volume_m3": table.volume, "temperature_C": table.temperature}
+        "volume_m3": table.volume, "temperature_C": table.temperature} | (
+        {} if table.turn_deg is None else dict(zip(TURN_COLUMNS, table.turn_deg.T, strict=True)))
     with atomic(path) as temporary:
         write_csv(columns, table.attributes, temporary)
 
@@ -179,8 +190,9 @@ def _check(table: BlockTable) -> None:
     smallest_sigma = 1e-9
     if not len(table):
         raise MeasurementError(must_be("content", table.source, "at least one block", "none"))
-    for name in ("type", "ring", "slot", "moment", "sigma", "volume", "temperature"):
-        wanted = (len(table), 3) if name == "moment" else (len(table),)
+    turned = () if table.turn_deg is None else ("turn_deg",)
+    for name in ("type", "ring", "slot", "moment", "sigma", "volume", "temperature", *turned):
+        wanted = (len(table), 3) if name in ("moment", "turn_deg") else (len(table),)
         if (found := np.shape(getattr(table, name))) != wanted:
             raise MeasurementError(must_be(name, table.source, f"of the shape {wanted}", found))
 
@@ -199,6 +211,9 @@ def _check(table: BlockTable) -> None:
     # laboratory, but below room temperature in kelvin
     coldest_C, hottest_C = -200.0, 200.0
     for number in range(len(table)):
+        if table.turn_deg is not None and not np.linalg.norm(table.turn_deg[number]) <= 360.0:
+            refuse(number, "turn_deg", "a rotation vector of at most 360°",
+                   str(table.turn_deg[number]))
         if not table.sigma[number] > 0:
             refuse(number, "sigma_A_m2", "positive", f"{table.sigma[number]:g}")
         if table.sigma[number] >= size[number]:

@@ -62,6 +62,7 @@ from halbach_fe.measurement.map_check import (
 )
 from halbach_fe.measurement.probe_in_field import (
     LAG,
+    MATRICES,
     MIXING,
     PRIOR_SD,
     SENSORS,
@@ -122,6 +123,9 @@ FEWEST_IN_LAYER, FEWEST_LAYERS = 8, 5
 """Smallest number of points in an overlap that are a layer, and of layers that are compared. Of
 four layers of a stage with a periodic error of 0.1 mm one seemed to be off the others, and the pose
 by these was 22 bars off."""
+
+OWN_GAIN = PLACED_SD[GAIN]
+"""Prior standard deviation of the gain of a component in one map only, relative to others."""
 
 TURNED_RAD = 0.5
 """Turn from which a stage has other axes than it states."""
@@ -676,7 +680,8 @@ def _fewest_shared(turn: Floats, sign: int) -> float:
 def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
     """Return the pose, from a first one, by which the readings of a map are those of another one.
 
-    Readings that are far off count less, by their first power.
+    Readings that are far off count less, by their first power. The map may have gains of its own
+    for each component: with 1 % in one of them its mirror image seemed to fit a symmetric magnet.
     """
     compared = 200  # largest number of points by which a pose is refined from the correlation
     middle, noise = np.mean(other.box, axis=0), float(np.hypot(one.floor_T, other.floor_T))
@@ -690,28 +695,37 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
 
         def left(values: Floats, start: Pose = pose, at: Floats = points,
                  read: Floats = read) -> Floats:
-            posed = PosedCharges.seen_from(one.charges, start.moved(middle, values[:3], values[3:]))
-            return np.asarray((posed.field(at, one.amplitudes) - read).ravel() / noise)
+            posed = PosedCharges.seen_from(one.charges, start.moved(middle, *_two(values)))
+            reads = posed.field(at, one.amplitudes) * (1 + values[6:])
+            return np.concatenate([(reads - read).ravel() / noise, values[6:] / OWN_GAIN])
 
         def by_pose(values: Floats, start: Pose = pose, at: Floats = points,
                     read: Floats = read) -> Floats:
-            posed = PosedCharges.seen_from(one.charges, start.moved(middle, values[:3], values[3:]))
+            posed = PosedCharges.seen_from(one.charges, start.moved(middle, *_two(values)))
+            field = posed.field(at, one.amplitudes)
             found = posed.by_pose(at, np.broadcast_to(np.eye(3), (len(at), 3, 3)),
-                                  at - middle, one.amplitudes)
-            return found.reshape(-1, 6) / noise
+                                  at - middle, one.amplitudes) * (1 + values[6:, None])
+            by_gain = field[:, :, None] * np.eye(3)
+            return np.vstack([np.concatenate([found, by_gain], axis=2).reshape(-1, 9) / noise,
+                              np.eye(9)[6:] / OWN_GAIN])
 
-        found = least_squares(left, np.zeros(6), by_pose, loss="soft_l1", f_scale=FAR_OFF,
-                              max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 3)
-        pose = pose.moved(middle, found.x[:3], found.x[3:])
+        found = least_squares(left, np.zeros(9), by_pose, loss="soft_l1", f_scale=FAR_OFF,
+                              max_nfev=40, x_scale=[other.check.spacing_m] * 3 + [0.01] * 6)
+        pose = pose.moved(middle, *_two(found.x))
     # at the edge of the other map its field is not known as well as the noise is
     # and of two components that agree, the third may have the opposite sign
-    medians = np.median(np.abs(found.fun.reshape(-1, 3)), axis=0)
+    medians = np.median(np.abs(found.fun[:-3].reshape(-1, 3)), axis=0)
     off = float(MAD_TO_SD * np.sqrt(np.mean(medians**2)))
     size = float(np.sqrt(np.mean(read**2))) / noise
     odds = float(3 * len(rows) * np.log(np.hypot(size, 1) / np.hypot(off, 1)))
-    if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:]).max() > 0.3:
+    if np.linalg.norm(found.x[:3]) > 10 * other.check.spacing_m or np.abs(found.x[3:6]).max() > 0.3:
         odds = -np.inf  # it has left the place
     return _Match(pose, sign, off, off * noise, odds)
+
+
+def _two(values: Floats) -> tuple[Floats, Floats]:
+    """Return shift (3,) and turn (3,) of the values of a fit."""
+    return values[:3], values[3:6]
 
 
 # --- one field for all --------------------------------------------------------------------------
@@ -785,6 +799,9 @@ class _Joined:
             # that one probe or its electronics has another gain in a map is likelier than anything
             # else that differs between maps, whatever the overlap alone can tell
             new, _ = selected(parameters, told, kept, with_rivals=False)
+            for number in range(1, len(self.maps)):  # those of components leave that of |B|
+                gains = _gains_of(self.model, number)
+                new[gains[0]] |= (new & ~kept)[gains[1:]].any()
             if (new & ~kept).any():
                 found = self._with(new)
         common = [found._stated(parameter) for parameter in _common_terms(
@@ -798,10 +815,15 @@ class _Joined:
 
         The displacement of a layer is fitted beside the field and all that is fitted already. What
         grows along an axis (a scale, a turn, a field that the charges do not follow) displaces all
-        layers, and is none of these.
+        layers, and is none of these. Where the field changes fast along an axis, a gain of 1 % of
+        one component displaced a layer by 0.5 mm: gains that a map may have of its own must not
+        explain the readings better, or the layer must be off beside them.
         """
-        state = State.of(self.model, self.at, self.rows, self.width2)
-        _, left, covariance = state.normal()
+        gains = self.model.prior_sd > 0
+        gains[np.concatenate([_gains_of(self.model, one) for one in range(1, len(self.maps))])
+              ] = True
+        plain, beside_gains = (_Told.of(self, kept) for kept in (self.model.prior_sd > 0, gains))
+        by_gains = beside_gains.gained - plain.gained
         places = [np.arange(len(self.model.any_sd))[self.model.placed(number)][:3]
                   for number in range(len(self.maps))]
         kept = self.model.prior_sd > 0
@@ -824,17 +846,14 @@ class _Joined:
                 for column, layer in enumerate(large):
                     of_layer = owner.ravel() == layer
                     columns[rows[of_layer], :, column] = along[of_layer, :, axis]
-                columns = columns.reshape(-1, len(large))
-                by_design = left.T @ columns
-                known = (np.sum(columns * state.free.left(columns), axis=0)
-                         - np.sum(by_design * (covariance @ by_design), axis=0))
-                off, sd = columns.T @ state.left / known, self.at.sigma / np.sqrt(known)
+                (off, sd), beside = (told.off(columns.reshape(-1, len(large)))
+                                     for told in (plain, beside_gains))
+                out = (_out_of_line(off, sd) & ((off / sd)**2 > by_gains)) | _out_of_line(*beside)
                 found += [Layer(
                     one.name, name, float(np.median(stated[rows][owner.ravel() == large[layer],
                                                                  axis])),
                     int(np.sum(one.layers(one.points)[:, axis] == layers[large[layer]])),
-                    float(off[layer]), float(sd[layer]))
-                    for layer in np.flatnonzero(_out_of_line(off, sd))]
+                    float(off[layer]), float(sd[layer])) for layer in np.flatnonzero(out)]
         return tuple(found)
 
     def _with(self, kept: NDArray[np.bool_]) -> _Joined:
@@ -1018,6 +1037,48 @@ class _Joined:
         return np.asarray(np.sqrt(np.vstack(squares)))
 
 
+@dataclass(frozen=True)
+class _Told:
+    """What the readings tell of other causes beside the field and some terms.
+
+    Attributes
+    ----------
+    state : State
+    left : ndarray, shape (m, p)
+        What the field leaves of the design of the terms.
+    covariance : ndarray, shape (p, p)
+        Of the terms, relative to sigma^2.
+    step : ndarray, shape (p,)
+        By which the terms fit best.
+    gained : float
+        By how much chi2 is smaller then.
+    """
+
+    state: State
+    left: Floats
+    covariance: Floats
+    step: Floats
+    gained: float
+
+    @classmethod
+    def of(cls, joined: _Joined, kept: NDArray[np.bool_]) -> _Told:
+        """Return it of a fit, with other terms ``kept`` (p,)."""
+        model = joined.model.with_terms(kept)
+        state = State.of(model, model.allowed(joined.at), joined.rows, joined.width2)
+        _, left, covariance = state.normal()
+        slope = left.T @ state.left - state.at.sigma**2 * state.at.instrument
+        step = covariance @ slope
+        return cls(state, left, covariance, step, float(slope @ step) / state.at.sigma**2)
+
+    def off(self, columns: Floats) -> tuple[Floats, Floats]:
+        """Return values (n,), and their standard deviations, of causes with derivatives (m, n)."""
+        by_design = self.left.T @ columns
+        known = (np.sum(columns * self.state.free.left(columns), axis=0)
+                 - np.sum(by_design * (self.covariance @ by_design), axis=0))
+        return ((columns.T @ self.state.left - by_design.T @ self.step) / known,
+                self.state.at.sigma / np.sqrt(known))
+
+
 def _as_stated(maps: Sequence[Checked], poses: Sequence[Pose]) -> list[Pose]:
     """Return poses that are turned by right angles only, with the overlaps where they are."""
     found = []
@@ -1079,12 +1140,17 @@ COMMON = np.zeros(TERMS, bool)
 COMMON[[*range(TERMS)[SENSORS], *range(TERMS)[MIXING], LAG]] = True
 
 
+GAINS_OF_AXES = range(MIXING.stop - 3, MIXING.stop)
+"""Gains of single components, without that of |B|."""
+
+
 def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
     """Return which terms are fitted: those of a probe that the checks have found, and the poses.
 
     What changes during a scan is not taken from the check of a map alone. A stage that goes along
     the magnet makes a drift of the gain one along the field, which what the charges do not follow
-    may feign: 3 % in a map of a dipole moved its neighbour by 0.2 mm, 7 bars.
+    may feign: 3 % in a map of a dipole moved its neighbour by 0.2 mm, 7 bars. A gain of a component
+    that another check contradicts is one of its map only, too.
     """
     kept = np.zeros(len(model.any_sd), bool)
     for number, one in enumerate(maps):
@@ -1092,9 +1158,28 @@ def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
             if any(term.found and term.name == parameter.name for term in one.check.terms):
                 own = list(parameter.own)
                 kept[own] |= COMMON[own]
+                if number and parameter.own[0] in GAINS_OF_AXES and _contradicted(
+                        parameter.name, one, maps):
+                    kept[_gains_of(model, number)] = True
         if number:
             kept[np.arange(len(kept))[model.placed(number)][:6]] = True
     return kept
+
+
+def _contradicted(name: str, one: Checked, maps: Sequence[Checked]) -> bool:
+    """Tell whether the check of another map has another value of a term of the probe."""
+    value, sd = next((term.value, term.sd) for term in one.check.terms if term.name == name)
+    return any(abs(term.value - value) > SIGNIFICANT * np.hypot(term.sd, sd)
+               for other in maps for term in other.check.terms if term.name == name)
+
+
+def _gains_of(model: JoinedModel, number: int) -> Ints:
+    """Return the places in the instrument of a map's gain of |B|, and of those of its components.
+
+    The latter leave the mean of all three as it is.
+    """
+    return np.array([model.placed(number).start + GAIN, *(
+        model.own(number).start + np.array(GAINS_OF_AXES))])
 
 
 def _own_terms(
@@ -1108,6 +1193,8 @@ def _own_terms(
         gain = model.placed(number).start + GAIN
         row = np.zeros(len(open_terms))
         row[gain] = 100 * model.any_sd[gain]
+        mixing = np.arange(len(row))[model.own(number)][MIXING]  # which change |B| too, if kept
+        row[mixing] = 100 * model.any_sd[mixing] * np.einsum("mij,ij->m", MATRICES, shares)
         found.append(Parameter(f"gain of {one.name} relative to {maps[0].name}", "%", row, (gain,)))
         open_terms[gain] = True
         first = model.own(number).start

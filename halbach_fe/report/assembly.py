@@ -232,7 +232,8 @@ def _label(one: AssembledBlock, several: bool, prefix: str) -> str:
     place = f"{block.ring}.{block.slot}" if several else str(block.slot)
     if one.has_own_name:
         place = block.name
-    return f"{place}: {one.serial.removeprefix(prefix)}" if one.serial else place
+    turned = f", {one.up or '−z'} up" if any(one.turn_deg) else ""
+    return f"{place}: {one.serial.removeprefix(prefix)}{turned}" if one.serial else place
 
 
 def labels_in_words(drawn: Sequence[Sheet], prefix: str) -> str:
@@ -242,7 +243,10 @@ def labels_in_words(drawn: Sequence[Sheet], prefix: str) -> str:
     serial = (", then its serial number"
               if any(one.serial for sheet in drawn for one in sheet.blocks) else "")
     without = f" without the {prefix} that all begin with" if serial and prefix else ""
-    return f"The label of a block is {' or '.join(sorted(places))}{serial}{without}."
+    turned = any(any(one.turn_deg) for sheet in drawn for one in sheet.blocks)
+    return (f"The label of a block is {' or '.join(sorted(places))}{serial}{without}"
+            + (", and of a block that is turned in its place, which of its axes is up." * turned
+               or "."))
 
 
 def _radial(
@@ -555,6 +559,8 @@ def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
         "magnetization_angle_deg": [one.magnetization_angle_deg for one in blocks],
         "from_radius_deg": [one.from_radius_deg for one in blocks],
         "elevation_deg": [one.elevation_deg for one in blocks],
+        **(columns_by_axis("turn_{}_deg", np.array([one.turn_deg for one in blocks]))
+           if any(any(one.turn_deg) for one in blocks) else {}),
         "way_round": [one.way_round for one in blocks]}
 
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from halbach_fe.design.assembly import turn_in_words
 from halbach_fe.design.objective import DeviationModel
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.sorting import SortedBlocks, types_in_words
@@ -76,12 +77,9 @@ def _turn_table(found: SortedBlocks) -> Rows:
     """Return the rows of the table of turned blocks, as text."""
     rows = []
     for row in _turned_rows(found):
-        vector = found.turn_deg[row]
-        angle = float(np.linalg.norm(vector))
-        axis = ", ".join(f"{part:.3g}" for part in vector / angle)
         rows.append({"block": found.table.serial[row], "ring": str(found.table.ring[row]),
                      "slot": str(found.table.slot[row]),
-                     "turn": f"{angle:.0f}° about ({axis}) of its own axes"})
+                     "turn": turn_in_words(found.turn_deg[row])})
     return rows
 
 
@@ -243,7 +241,9 @@ def page(found: SortedBlocks) -> Page:
         Section([_convention(found), Table(rows, aim.table)], aim.title),
         *([Section([
             "Each is put into its slot as it was measured, and then turned about its own axes. "
-            "The moments in blocks.sorted.csv are those of the turned blocks.",
+            "The moments in blocks.sorted.csv are those of the turned blocks, and its columns "
+            "turn_x_deg, turn_y_deg and turn_z_deg have the turns: `halbach-fe cad` says them in "
+            "the plan to assemble.",
             Table(_turn_table(found))], "Blocks that are turned in their slots")]
           if turned else [])], {aim.title: rows}, figures=figures, files=files)
 

@@ -343,7 +343,8 @@ def vector(values: Floats | tuple[float, ...]) -> Vector:
 def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> TrueMagnet:
     """Return the magnet with its blocks in the places of a table.
 
-    A block keeps its magnetization in the axes of its shape, which is seated as the new place asks.
+    A block keeps its magnetization in the axes of its shape, which is seated as the new place asks,
+    and turned there as the table says.
 
     Parameters
     ----------
@@ -357,7 +358,8 @@ def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> T
     Raises
     ------
     MeasurementError
-        If the tables are not of the same blocks, a block was turned, or a place remains empty.
+        If the tables are not of the same blocks, a block with parts is turned, or a place remains
+        empty.
     """
     drawn = {body.made_for or (body.ring, body.slot): body for body in single.bodies}
     rows = {serial: row for row, serial in enumerate(measured.serial)}
@@ -379,13 +381,16 @@ def in_places(single: TrueMagnet, measured: BlockTable, placed: BlockTable) -> T
         row, target = rows[serial], drawn[place]
         source = drawn[measured.places[row]]
         turn = target.carried_from(source)
+        if placed.turn_deg is not None and placed.turn_deg[number].any() and not source.parts:
+            own = Rotation.from_rotvec(placed.turn_deg[number], degrees=True)
+            turn = target.face_orientation * own * target.face_orientation.inv() * turn
         moment = turn.apply(measured.moment[row])
         difference = np.linalg.norm(placed.moment[number] - moment) / np.linalg.norm(moment)
         if difference > same:
             raise MeasurementError(must_be(
-                f"moment of block {serial}", placed.source, "that of the simulated block, which "
-                "is not turned in its slot", f"another one by {difference:.2g} of its size",
-                "Sort the blocks.csv of a simulation with the same seed, without --turns."))
+                f"moment of block {serial}", placed.source, "that of the simulated block in "
+                "its slot, turned as the table says", f"another one by {difference:.2g} of its "
+                "size", "Sort the blocks.csv of a simulation with the same seed."))
         there[place] = replace(
             target, remanence=vector(turn.apply(source.remanence)), parts=source.parts,
             easy_axis=vector(turn.apply(source.easy_axis)), along=source.along,

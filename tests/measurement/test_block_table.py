@@ -39,6 +39,11 @@ def test_round_trip(tmp_path):
             assert np.array_equal(getattr(found, name), value) or np.array_equal(
                 getattr(found, name), value, equal_nan=True)
     assert [one.name for one in tmp_path.iterdir()] == ["blocks.csv"]
+    turned = table(turn_deg=np.array([[0.0, 0, 0], [90, 0, 0], [0, 0, -180]]))
+    write_blocks(turned, path)
+    assert np.array_equal(read_blocks(path).turn_deg, turned.turn_deg)
+    with pytest.raises(MeasurementError, match="turn_deg of block A1"):
+        table(turn_deg=np.full((3, 3), np.nan))
     changed = table(moment=np.nextafter(table().moment, 2))  # the comparison sees the last bit
     write_blocks(changed, path)
     assert not np.array_equal(read_blocks(path).moment, table().moment)

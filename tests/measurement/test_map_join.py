@@ -250,6 +250,71 @@ def test_a_plane_that_the_stage_came_to_from_the_other_side(generator, monkeypat
         assert not joined_of(control).displaced
 
 
+def dipole_maps(gain, late=0.0, three=False):
+    """Maps of two rings of cubes that share 5 mm on either side of the middle plane, the last one
+    with gains (3,) of its own, and its first plane ``late`` in m; of ``three`` two are alike.
+    """
+    generator, magnet = np.random.default_rng(12), magpylib.Collection()
+    for z, angle in ((z, 2 * np.pi * slot / 8) for z in (-0.008, 0.008) for slot in range(8)):
+        turn = Rotation.from_euler("z", 2 * angle) * Rotation.from_rotvec(
+            np.radians(1.0) * generator.standard_normal(3))
+        magnet.add(magpylib.magnet.Cuboid(
+            dimension=(0.012,) * 3, position=(0.04 * np.cos(angle), 0.04 * np.sin(angle), z),
+            polarization=(1.3 * (1 + 0.01 * generator.standard_normal()), 0, 0), orientation=turn))
+    maps = {}
+    parts = (("here", -0.04, 0.0, (1, 1, 1), 0.0), ("beside", -0.005, 0.1, (1, 1, 1), 0.0),
+             ("there", -0.005, 0.1, gain, late))
+    for name, first, off, gains, step in parts if three else parts[::2]:
+        angles = off + 2 * np.pi * np.arange(12) / 12
+        points = np.array([[r * np.cos(a), r * np.sin(a), z] for z in first + 0.005 * np.arange(10)
+                           for r in (0.01, 0.02) for a in angles])
+        were = points + step * (points[:, 2:] < first + 1e-4) * [0, 0, 1]
+        maps[name] = field_map(points, gains * (
+            magnet.getB(were) + 2e-5 * generator.standard_normal(points.shape)))
+    return maps
+
+
+@pytest.mark.parametrize(("gain", "three"), [
+    ((1.01, 1, 1), True), ((1.01, 1, 1), False), ((1, 1, 0.99), False),
+    ((1.01, 1.01, 1.01), False)])
+def test_a_gain_of_one_component_of_one_map(gain, three):
+    """Of three maps its first plane seemed to be displaced, of two one seemed to be mirrored, or
+    the gain to be one of all maps. Each component is as it was made; |B| is nearly Bx.
+    """
+    joined = join_maps(dipole_maps(gain, three=three))
+    assert not joined.displaced
+    assert joined.agree
+    assert all(np.linalg.norm(one.shift_m) < 1e-4 for one in joined.poses)
+    terms = {term.name: term for term in joined.terms}
+    share = 0.967  # of Bx in the mean square of the field here
+    of_size = 100 * (share * (gain[0] - 1) + (1 - share) * ((gain[1] + gain[2]) / 2 - 1))
+    size = terms.get("gain of there relative to here")
+    assert abs(size.value - of_size if size else of_size) < 4 * np.hypot(
+        size.sd if size else 0.01, 0.005)
+    for axis, own in zip("xyz", gain, strict=True):
+        term = terms.get(f"gain of B{axis} relative to that of |B|, in there only")
+        if term is None:
+            assert len(set(gain)) == 1  # only then none differs
+        else:
+            assert abs(term.value - 100 * (own - 1) + of_size) < 4 * np.hypot(term.sd, 0.005)
+    for axis in "xz":
+        term = terms.get(f"gain of B{axis} relative to that of |B|, in all maps")
+        assert term is None or abs(term.value) < 4 * term.sd
+
+
+def test_a_displaced_plane_and_a_mirror_beside_a_gain():
+    """Control: a plane 1 mm off is named beside a gain too, and a mirrored map is refused."""
+    for gain in ((1, 1, 1), (1.01, 1, 1)):
+        (layer,) = join_maps(dipole_maps(gain, late=1e-3, three=True)).displaced
+        assert (layer.name, layer.axis, layer.place_m) == ("there", "z", pytest.approx(-0.005))
+        assert layer.off_m == pytest.approx(1e-3, rel=0.3)
+    maps, _, _ = campaign(0, maps=2)
+    gained = maps["part1"].assign(B_T=maps["part1"]["B_T"] * np.array([1.01, 1, 1]))
+    assert joined_of(maps | {"part1": gained}).agree
+    with pytest.raises(MeasurementError, match=r"mirror.*backwards"):
+        joined_of(maps | {"part1": mirrored(gained)})
+
+
 def test_a_shuffled_map_is_refused(generator):
     """By its own check, and with a sentence that names it; as it was read, it is accepted."""
     maps, _, _ = campaign(0, maps=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import tomllib
 from dataclasses import replace
 
@@ -12,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError
+from halbach_fe.design.assembly import cad
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import read_blocks, write_blocks
 from halbach_fe.measurement.field_map import points_of, read_map
 from halbach_fe.study.materials import MU_0
@@ -105,8 +108,93 @@ def test_the_map_is_that_of_the_sorted_magnet(campaign):
     assert np.abs(other).max() > 100 * tolerance
 
 
+@pytest.fixture(scope="module")
+def turned(campaign):
+    """The same with blocks that are turned in their slots, and its table."""
+    folder, delivered, _ = campaign
+    table = folder / "turned" / "blocks.sorted.csv"
+    assert main(["sort", str(folder / "study.toml"), str(delivered), "-o", str(table.parent),
+                 "--turns"]) == 0
+    return folder, delivered, table
+
+
+def up_by_moments(delivered, sorted_table, place, columns):
+    """Which of its own axes (3,), as measured, a block has along z of the magnet: by the turn of
+    ``columns`` of assembly.csv, if it carries the delivered moment to the one of the sorted table.
+    """
+    row = sorted_table.places.index(place)
+    blocks = {(block.ring, block.slot): block for block in build_magnet(study()).blocks}
+
+    def own(table, row, at):
+        radial = Rotation.from_euler("z", np.arctan2(*blocks[at].middle[1::-1]))
+        faces = Rotation.from_euler("z", blocks[at].facing_deg, degrees=True)
+        return faces.inv().apply(radial.apply(table.moment[row]))
+
+    before = delivered.serial.index(sorted_table.serial[row])
+    turn = Rotation.from_rotvec(columns, degrees=True)
+    # without a place the moment is in the axes of the first slot of its type
+    carried = turn.apply(own(delivered, before, (1, 1) if not delivered.ring[before]
+                             else delivered.places[before]))
+    np.testing.assert_allclose(carried, own(sorted_table, row, place), rtol=0,
+                               atol=1e-9 * np.linalg.norm(carried))
+    return turn.inv().apply([0.0, 0.0, 1.0])
+
+
+def test_turns_travel_with_the_sorted_table(turned, tmp_path):
+    """The plan to assemble says of each block which axis is up; all readers take the table."""
+    folder, delivered, path = turned
+    table = read_blocks(path)
+    assert main(["cad", str(folder / "study.toml"), "--blocks", str(path),
+                 "-o", str(tmp_path / "cad")]) == 0
+    with (tmp_path / "cad" / "assembly.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    count = 0
+    for row in rows:
+        columns = [float(row[f"turn_{axis}_deg"]) for axis in "xyz"]
+        up = up_by_moments(read_blocks(delivered), table, (int(row["ring"]), int(row["slot"])),
+                           columns)
+        axis = int(np.argmax(np.abs(up)))
+        assert f"; its {'' if up[axis] > 0 else '−'}{'xyz'[axis]} up" in row["way_round"]
+        assert ("turned by" in row["way_round"]) == any(columns)
+        count += any(columns)
+    assert count == np.sum(table.turn_deg.any(axis=1)) > 4  # a quarter of the cubes stays
+    html = (tmp_path / "cad" / "assembly.html").read_text()
+    assert html.count(" up</text>") == count
+    assert "turned by" in html
+    # the prior takes the moments as they are, and a block that is sorted again keeps its turn
+    assert np.array_equal(prior_from_blocks(build_magnet(study()), table).gaussian.mean,
+                          prior_from_blocks(build_magnet(study()), replace(
+                              table, turn_deg=None)).gaussian.mean)
+    assert main(["sort", str(folder / "study.toml"), str(path), "-o", str(tmp_path / "again"),
+                 "--turns"]) == 0
+    again = read_blocks(tmp_path / "again" / "blocks.sorted.csv")
+    turns = np.zeros((len(again), 3)) if again.turn_deg is None else again.turn_deg
+    for place, turn in zip(again.places, turns, strict=True):
+        up_by_moments(read_blocks(delivered), again, place, turn)
+    # control: the plan of the table without its turns says another axis, as it did
+    plain = cad(build_magnet(study()), replace(table, turn_deg=None))
+    assert sum(one.way_round != row["way_round"] for one, row in zip(
+        plain.blocks, rows, strict=True)) == count
+    with pytest.raises(AssertionError):
+        turned_row = int(np.flatnonzero(table.turn_deg.any(axis=1))[0])
+        up_by_moments(read_blocks(delivered), table, table.places[turned_row], [0.0, 0.0, 0.0])
+
+
+def test_a_campaign_of_turned_blocks(turned):
+    folder, _, path = turned
+    assert main(["simulate-measurement", str(folder / "study.toml"), "--coil-sd", str(COIL_SD),
+                 "--seed", "3", "--placed", str(path), "-o", str(folder / "of_turned")]) == 0
+    data, table = read_map(folder / "of_turned" / "map.csv"), read_blocks(path)
+    readings, points = data["B_T"].values, points_of(data)
+    tolerance = 3e-6 * np.abs(readings).max()  # as above
+    assert np.abs(field_of(table, points) - readings).max() < tolerance
+    # control: a table that does not say the turns is not of these blocks
+    with pytest.raises(MeasurementError, match="turned as the table says"):
+        simulate_campaign(study(), 3, COIL_SD, placed=replace(table, turn_deg=None))
+
+
 @pytest.mark.parametrize(("change", "said"), [
-    (lambda t: replace(t, moment=t.moment[::-1]), "moment of block .* without --turns"),
+    (lambda t: replace(t, moment=t.moment[::-1]), "moment of block .* turned as the table says"),
     (lambda t: replace(t, serial=("X1", *t.serial[1:])), "block X1 .* one of the simulated"),
     (lambda t: replace(t, ring=np.where(t.ring == 2, 3, t.ring)), "place of block"),
     (lambda t: replace(t, ring=0 * t.ring, slot=0 * t.slot), "16 empty ones, first ring 1, slot"),
