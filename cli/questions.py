@@ -173,7 +173,7 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     if arguments.json:
         common.print_json({"lines": len(lines.points), "points_per_line": lines.count,
                            "reservation": doubt or None, "folder": str(folder),
-                           **{name: np.where(np.isnan(values), None, values).tolist()
+                           **{name: [None if np.isnan(value) else float(value) for value in values]
                               for name, values in columns.items()}})
         return 0
     middle = len(columns["u_m"]) // 2
