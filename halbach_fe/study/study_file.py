@@ -366,6 +366,7 @@ def new_study(
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     text = environment.get_template(TEMPLATE).render(
         name=_name(name), magnet=magnet, table=table, half=half, around=around,
+        min_length=MIN_LENGTH_M,
         sphere=_sphere(points, flat=half is None and around > 0) if points else [])
     parse_new_study(text, folder, table)
     return text

@@ -14,6 +14,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 import halbach_fe as hf
+from halbach_fe.cli import main
 from halbach_fe.cli.verbs import VERBS
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError
@@ -111,6 +112,22 @@ def test_a_prism_that_is_not_convex_is_refused():
                 array__exceptions=[{"ring": 1, "slot": 1, "inner_corner_loss": 0.5}]))
     with pytest.raises(StudyError, match="cross-section"):
         hf.to_magpylib(hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04))
+
+
+@pytest.mark.parametrize("size", [1e-4, 3e-4, 1e-3, 2e-3, 3e-3])
+def test_a_small_magnet(tmp_path, size):
+    """One cube, whose mesh keeps to the limits of the study; its field against magpylib."""
+    table = tmp_path / "small.csv"
+    table.write_text("name,shape,x_m,y_m,z_m,size_x_m,size_y_m,size_z_m,remanence_T\n"
+                     f"a,cuboid,0,0,0,{size},{size},{size},1.3\n")
+    made = hf.magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [size],
+        "size_y_m": [size], "size_z_m": [size], "remanence_T": [1.3]})
+    assert main(["new", str(tmp_path / "new.toml"), "--free-blocks", str(table)]) == 0
+    point = np.array([[1.0, 0.7, 1.5]]) * size
+    expected = magpylib.magnet.Cuboid(polarization=(1.3, 0, 0), dimension=(size,) * 3).getB(point)
+    for magnet in (made, hf.build_magnet(hf.read_study(tmp_path / "new.toml"))):
+        np.testing.assert_allclose(magnet.field_T(point), [expected], atol=1e-12)
 
 
 def test_a_study_is_written_and_read_back(tmp_path):
