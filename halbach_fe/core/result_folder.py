@@ -1,12 +1,13 @@
 """A folder of results belongs to one command and one study, and to one run at a time.
 
 The file run.json in the folder names both, what the run read, and the results that runs have
-written there. A later run of the same command and study replaces them, and removes those that it
-did not write again: a table that the study no longer asks for would pass for a result of the study
-as it is. Another command or study is refused, and so is a folder with any other file of a name that
-the command writes, or with a result that somebody has changed. While a run goes on, it locks the
-file; functions of the Python interface lock it too. A single file, which some commands write, has
-its record beside it, see `single_file`.
+written there. A study is known by its name and its file: two files of one name are two studies, but
+a file may be changed. A later run of the same command and study replaces the results, and removes
+those that it did not write again: a table that the study no longer asks for would pass for a result
+of the study as it is. Another command or study is refused, and so is a folder with any other file
+of a name that the command writes, or with a result that somebody has changed. While a run goes on,
+it locks the file; functions of the Python interface lock it too. A single file, which some commands
+write, has its record beside it, see `single_file`.
 """
 
 from __future__ import annotations
@@ -286,9 +287,9 @@ def result_folder(
     Raises
     ------
     OutputError
-        If the folder cannot be written, another run is using it, it belongs to another command or
-        study, one of the files ``inputs`` is a result in it, which this run would replace, or it
-        has another file of a name that the command writes.
+        If the folder cannot be written, another run is using it, it belongs to another command,
+        study or study file, one of the files ``inputs`` is a result in it, which this run would
+        replace, or it has another file of a name that the command writes.
     """
     base, inputs = folder.absolute(), list(inputs)
     with _locked(folder) as file:
@@ -302,6 +303,12 @@ def result_folder(
                 f"Folder {folder} holds results of `{before.command}`{of_study}. A folder belongs "
                 "to one command and one study, so that results are not mixed up. Name another "
                 "folder, or remove this one.")
+        if other := _other_study(before, named):
+            raise OutputError(
+                f"Folder {folder} holds results of `{before.command}` of another study file, "
+                f"{other}, whose name is {study} too, but not its content. A folder belongs to "
+                "one study, so that results are not mixed up. Name another folder, or remove this "
+                "one.")
         for path in inputs:
             if any(path.resolve() == (base / name).resolve() for name in before.files):
                 raise OutputError(
@@ -322,6 +329,20 @@ def result_folder(
                 writer.remove_stale()
                 raise
         writer.remove_stale()
+
+
+def _other_study(before: Record, named: Mapping[str, Path]) -> str:
+    """Return the study file of an earlier run if that is another one than that of this run.
+
+    A study may be changed, moved, or copied as it is; a file that is there beside this one, with
+    another content, is another study. It is empty if nothing says so.
+    """
+    earlier, now = before.named.get("STUDY", ""), named.get("STUDY")
+    if not earlier or now is None or before.inputs.get(earlier) in (None, _digest(now)):
+        return ""
+    there = os.path.lexists(earlier)
+    same = Path(earlier).resolve() == now.resolve() if there else Path(earlier).name == now.name
+    return "" if same else earlier
 
 
 def _writable_paths(base: Path, results: Sequence[str], solving: bool) -> Iterator[Path]:

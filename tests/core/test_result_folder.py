@@ -65,6 +65,29 @@ def test_a_mixture_is_refused(tmp_path, owner):
     assert listed(tmp_path) == {RECORD, "prediction.csv"}
 
 
+def test_two_study_files_of_one_name(tmp_path):
+    """Are two studies. Controls: a file that was changed, moved, or copied is the same one."""
+    def run_of(study):
+        with result_folder(tmp_path / "out", "solve", "a", [study], {"STUDY": study}):
+            write_text(tmp_path / "out" / "report.html", study.read_text())
+
+    study, other = tmp_path / "study.toml", tmp_path / "other.toml"
+    study.write_text("one")
+    run_of(study)
+    study.write_text("one, changed")
+    run_of(study)
+    other.write_text("two")
+    with pytest.raises(OutputError, match=r"another study file, .*study\.toml, whose"):
+        run_of(other)
+    assert (tmp_path / "out" / "report.html").read_text() == "one, changed"
+    other.write_text("one, changed")  # a copy
+    run_of(other)
+    (tmp_path / "elsewhere").mkdir()
+    other.rename(tmp_path / "elsewhere" / "other.toml").write_text("moved, and changed")
+    run_of(tmp_path / "elsewhere" / "other.toml")
+    assert (tmp_path / "out" / "report.html").read_text() == "moved, and changed"
+
+
 def test_a_run_that_fails(tmp_path):
     """Its files are known, and removed once they are stale; without files nothing is left."""
     def failing(*names):
