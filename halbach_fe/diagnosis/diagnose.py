@@ -202,8 +202,9 @@ def diagnose(
         found = _Diagnosing(_Task(
             study, data, cached, blocks, catalogue() if effects is None else effects,
             validation_map, say, solver, floor_T, time_limit_s)).diagnosis()
-        return found if effects is None else replace(
-            found, looked_for=tuple(effect.name for effect in effects))
+        names = tuple(effect.name for effect in effects or ())
+        return found if effects is None or {one.name for one in catalogue()} <= {
+            *names} else replace(found, looked_for=names)
 
 
 @dataclass(frozen=True)

@@ -454,6 +454,13 @@ class Diagnosis(ShownInNotebook):
         return self.converged and self.answer in (0, self.rounds)
 
     @property
+    def is_partial(self) -> bool:
+        """Whether effects of the catalogue were not compared, as only some were asked for or the
+        time was up.
+        """
+        return self.looked_for is not None or bool(self.uncompared)
+
+    @property
     def found_anything(self) -> bool:
         """Whether the diagnosis found gross errors, poses, outliers, effects or position noise."""
         return bool(self.gross_errors or self.poses or self.outliers or self.identified

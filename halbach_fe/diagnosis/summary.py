@@ -14,6 +14,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL, decimals
 from halbach_fe.diagnosis.discriminating_measurements import Separation
+from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Parameter, Place
 from halbach_fe.diagnosis.gross_errors import GrossError
 from halbach_fe.diagnosis.map_conventions import MapConvention
@@ -386,6 +387,8 @@ def diagnosis_summary(
         "rounds": diagnosis.rounds, "at_rest": diagnosis.converged,
         "answer": diagnosis.answer or diagnosis.rounds,
         "cut": None if diagnosis.uncompared is None else {"uncompared": diagnosis.uncompared},
+        "compared": None if diagnosis.looked_for is None else {
+            "effects": list(diagnosis.looked_for), "of": len(catalogue())},
         "verdict": diagnosis.verdict,
         "held_out_conflict": diagnosis.after.held_out_conflict or None,
         "gross": [_gross(error) for error in diagnosis.gross_errors],

@@ -34,6 +34,7 @@ from halbach_fe.report.diagnosis_answer import (
     catalogue_titles,
     joined_by_or,
     more_readings,
+    outside,
     title_of,
     titles_of_rivals,
     unknown_advice,
@@ -193,10 +194,12 @@ def _what_is_missing(diagnosis: Diagnosis, rows: Sequence[Mapping[str, str]]) ->
             f"{math.exp(DETECTION_LOG_ODDS):.0f} times as probable as its absence. Each effect of "
             f"the catalogue has prior odds of 1\u00a0:\u00a0{1 / EFFECT_PRIOR_ODDS:.0f}, which "
             "its possible places share.")], "What is missing")
+    of = "that was compared" if diagnosis.is_partial else "of the catalogue"
     return Section([
-        "No effect of the catalogue explains the disagreement." if diagnosis.unknown is not None
-        else "No effect of the catalogue is certain enough to be added; what is suspected is said "
-        "above." if diagnosis.suspected else "No effect of the catalogue has to be added."],
+        f"No effect {of} explains the disagreement." if diagnosis.unknown is not None or (
+            diagnosis.verdict == "unexplained")
+        else f"No effect {of} is certain enough to be added; what is suspected is said "
+        "above." if diagnosis.suspected else f"No effect {of} has to be added."],
         "What is missing")
 
 
@@ -242,8 +245,8 @@ def _grounds(diagnosis: Diagnosis) -> list[Section]:
     shown = states(diagnosis)
     disagreeing = "; ".join(f"{state.when}: {_disagreement_summary(state.groups)}"
                             for state in shown)
-    outside = (" Because something outside the catalogue is missing, the probabilities are not to "
-               "be believed." if diagnosis.unknown and not diagnosis.unknown.ambiguous else "")
+    beyond = (f" Because something {outside(diagnosis)} is missing, the probabilities are not to "
+              "be believed." if diagnosis.unknown and not diagnosis.unknown.ambiguous else "")
     searched = " and the search for outliers" if diagnosis.outliers else ""
     floor = ("; the model-free floor is what a field that obeys Maxwell's equations leaves on "
              "held-out lines, whatever the magnet" if diagnosis.floor_T else "")
@@ -260,7 +263,7 @@ def _grounds(diagnosis: Diagnosis) -> list[Section]:
             "most one effect is missing. The search then put effects into the model in full: what "
             "it found is in the table above, also where the probabilities said something else. The "
             "Bayes factor of each effect is that with the other identified effects in the model."
-            f"{outside}", Drawn("diagnosis_probabilities.png")], "How sure that is", True),
+            f"{beyond}", Drawn("diagnosis_probabilities.png")], "How sure that is", True),
         Section([
             f"{' → '.join(state.when for state in shown).capitalize()}. Held-out readings were "
             f"used only for this table{searched}. The 95 % band of a training reading is that of "

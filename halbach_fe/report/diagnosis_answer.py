@@ -71,17 +71,40 @@ ADVICE_BY_COORDINATE = {
 """Further advice by the coordinate of an unlisted error of the instrument."""
 
 UNKNOWN_KINDS = {
-    "field": "a smooth field from a source that is not in the catalogue",
+    "field": "a smooth field from another source",
     "instrument": "something that the instrument does and no field could be",
     "either": "a field, or something that the instrument does"}
 """Description of an unknown cause by its kind."""
 
 
-def unknown_sentences(unknown: UnknownCause, beside_effects: bool) -> list[str]:
-    """Describe what is outside the catalogue."""
+def outside(diagnosis: Diagnosis) -> str:
+    """Return what an unknown cause is outside of: the catalogue, or what of it was compared."""
+    return "outside the catalogue" if not diagnosis.is_partial else (
+        "outside the effects that were compared")
+
+
+def not_compared(diagnosis: Diagnosis) -> str:
+    """Say what of the catalogue was compared; empty if all of it was."""
+    few = 6  # effects that are named
+    names, said = diagnosis.looked_for, []
+    if names is not None:
+        said.append(f"{len(names)} of {len(catalogue())}" + (
+            f": {', '.join(names)}" if len(names) <= few else ""))
+    if diagnosis.uncompared:
+        several = diagnosis.uncompared > 1
+        said.append(f"{diagnosis.uncompared} {'hypotheses were' if several else 'hypothesis was'} "
+                    "not compared for want of time")
+    return "; ".join(said)
+
+
+def unknown_sentences(diagnosis: Diagnosis, unknown: UnknownCause) -> list[str]:
+    """Describe what is outside the catalogue, or outside what of it was compared."""
+    where, beside_effects = outside(diagnosis), bool(diagnosis.identified)
+    if extent := not_compared(diagnosis):
+        where += f" ({extent})"
     x, y, z = (f"{1e3 * component:.0f}" for component in unknown.at_m)
-    start = ("A single cause outside the catalogue could equally well take the place of all of "
-             "them" if unknown.ambiguous else "Something outside the catalogue "
+    start = (f"A single cause {where} could equally well take the place of all of them"
+             if unknown.ambiguous else f"Something {where} "
              + ("remains" if beside_effects else "is missing"))
     sentences = [f"{start}: {UNKNOWN_KINDS[unknown.kind]}, largest at ({x}, {y}, {z}) mm with "
                  f"{decimals(1e3 * unknown.largest_T, 2)} mT (Bayes factor "
@@ -243,7 +266,7 @@ def _gist(diagnosis: Diagnosis) -> str:
     unknown = diagnosis.unknown
     if unknown is None or not unknown.parts or diagnosis.identified or diagnosis.gross_errors:
         return ""
-    return ("Something outside the catalogue is missing. It looks like "
+    return (f"Something {outside(diagnosis)} is missing. It looks like "
             f"{'; and '.join(map(_target, unknown.parts))}.")
 
 
@@ -284,6 +307,11 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
     again = _again(diagnosis)
     if diagnosis.solver_error:
         return "Refine `mesh` or move `open_boundary` outwards, and diagnose again.", again
+    if diagnosis.is_partial and not diagnosis.identified and not diagnosis.suspected and (
+            diagnosis.unknown is not None or _fails(diagnosis) or _is_restless(diagnosis)):
+        options = in_a_row(["--effects"] * (diagnosis.looked_for is not None)
+                           + ["--time-limit"] * bool(diagnosis.uncompared))
+        return (f"Compare all effects of the catalogue: diagnose again without {options}.", again)
     if diagnosis.unknown is not None:
         return unknown_advice(diagnosis.unknown), again
     suspicions = " ".join(map(more_readings, diagnosis.suspected))
@@ -422,6 +450,7 @@ def _found(diagnosis: Diagnosis) -> list[str]:
         fits = diagnosis.is_at_rest and not (
             _fails(diagnosis) or diagnosis.after.held_out_conflict)
         start = f"{_maps(diagnosis)} explained by" if fits else (
+            "The best explanation of those that were compared is" if diagnosis.is_partial else
             "The best explanation from the catalogue is")
         sentences.append(f"{start}: " + "; ".join(
             _effect_in_words(effect, titles) for effect in diagnosis.identified) + ".")
@@ -444,17 +473,21 @@ def _found(diagnosis: Diagnosis) -> list[str]:
                          f"{decimals(after.prior_conflict)}).")
     if not diagnosis.identified and _is_restless(diagnosis):
         sentences.append(
-            f"Nothing in the catalogue explains {'the maps' if after.is_campaign else 'the map'}: "
+            f"Nothing {'that was compared' if diagnosis.is_partial else 'in the catalogue'} "
+            f"explains {'the maps' if after.is_campaign else 'the map'}: "
             f"of {diagnosis.rounds} rounds the study without any effect predicts held-out readings "
             "best.")
     if unknown is not None:
-        sentences += unknown_sentences(unknown, bool(diagnosis.identified))
+        sentences += unknown_sentences(diagnosis, unknown)
     elif not diagnosis.identified and not diagnosis.suspected and _fails(diagnosis):
         disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
+        start = (f"{disagree} with the study (chi² per reading {decimals(after.prior_conflict)}, "
+                 f"where {after.conflict_limit:.3g} would be rare), and no")
         sentences.append(
-            f"{disagree} with the study (chi² per reading "
-            f"{decimals(after.prior_conflict)}, where {after.conflict_limit:.3g} would be rare), "
-            "and no effect of the catalogue explains the difference, nor does a smooth field or "
+            f"{start}ne of the effects that were compared explains the difference "
+            f"({not_compared(diagnosis)}): the cause may be another of the catalogue."
+            if diagnosis.is_partial else
+            f"{start} effect of the catalogue explains the difference, nor does a smooth field or "
             "sensor error. The readings scatter as if their noise were "
             f"{np.sqrt(after.prior_conflict):.2g} times as large as the study says: check that.")
     for suspicion in diagnosis.suspected:

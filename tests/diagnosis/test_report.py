@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 
@@ -117,7 +118,7 @@ def test_places_are_named_without_rounding_errors():
     assert Place(at_m=(-0.07566, 9.3e-18, -1e-17)).name == "at -0.07566, 0, 0 m"
 
 
-def test_verdicts(flat):
+def test_verdicts(flat, tmp_path):
     found, _ = flat
     unknown = UnknownCause("either", 40.0, False, False, 2e-4, (0.05, 0.0, 0.0), None)
     assert "nothing" not in verdict(found)
@@ -195,6 +196,25 @@ def test_verdicts(flat):
     assert "a fit rather than" not in verdict(replace(found, identified=found.identified[:1]))
     nothing = replace(found, identified=(), after=found.before)
     assert "no effect of the catalogue" in verdict(nothing)
+    some = replace(nothing, looked_for=("gain_x",))
+    none = f"none of the effects that were compared explains the difference (1 of {len(EFFECTS)}: "
+    assert none + "gain_x)" in verdict(some)
+    assert answer(some).step.endswith("diagnose again without --effects.")
+    cut = replace(nothing, uncompared=7)
+    assert "compared explains the difference (7 hypotheses were not compared" in verdict(cut)
+    assert answer(cut).step.endswith("diagnose again without --time-limit.")
+    for partial in (some, cut):
+        beyond = verdict(replace(partial, unknown=replace(unknown, alone=True)))
+        assert beyond.startswith("Something outside the effects that were compared (")
+        for said in (verdict(partial), beyond):
+            assert not re.search("of the catalogue explains|outside the catalogue", said)
+            assert "their noise" not in said
+    assert diagnosis_summary(some)["compared"] == {"effects": ["gain_x"], "of": len(EFFECTS)}
+    assert diagnosis_summary(nothing)["compared"] is None
+    (tmp_path / "some").mkdir()
+    write_result(some, tmp_path / "some")
+    page = (tmp_path / "some/diagnosis.html").read_text()
+    assert "No effect that was compared explains the disagreement." in page
     alone = replace(nothing, unknown=replace(unknown, alone=True, source_m=(0.2, 0.0, 0.0)))
     assert verdict(alone).startswith("Something outside the catalogue is missing")
     assert "near (200, 0, 0) mm" in verdict(alone)
