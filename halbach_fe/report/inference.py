@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -67,8 +68,13 @@ STUDY_FILE = "study.updated.toml"
 
 NOTE = "found by halbach-fe infer"
 
-UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3)}
-"""Unit that people read, and its factor, for the unit at the end of a term's name."""
+UNITS = {
+    "A_per_m": ("kA/m", 1e-3), "A_m2": ("A m²", 1.0), "m_per_H": ("m/H", 1.0),
+    "per_K": ("%/K", 100.0), "per_T2": ("%/T²", 100.0), "per_T": ("%/T", 100.0),
+    "1/T^2": ("%/T²", 100.0), "1/T": ("%/T", 100.0), "m": ("mm", 1e3), "rad": ("mrad", 1e3),
+    "deg": ("°", 1.0), "T": ("mT", 1e3), "K": ("K", 1.0), "C": ("°C", 1.0), "A": ("A", 1.0)}
+"""Unit that people read, and its factor, for the unit at the end of a term's or key's name; longer
+ones come before those that they end with."""
 
 COLOURS = (POSTERIOR, SECOND, MEASURED, PUBLISHED, PRIOR)
 
@@ -80,15 +86,35 @@ def term_table(result: InferenceResult) -> Rows:
     rows = []
     terms = [row for found in (result.terms, result.amplitudes) if found is not None
              for row in zip(found.names, found.change, found.sd, found.prior_sd, strict=True)]
+    changes = {one.name: one.change for one in result.study.uncertain}
     for name, change, sd, prior_sd in terms:
         owner, _, term = name.rpartition(".")
-        what, _, unit = term.rpartition("_")
+        unit = _unit_of(term)
+        what = term.removesuffix(f"_{unit}") if unit else term
+        if not unit:
+            unit = _unit_of_changes(changes.get(name, {}))
         shown, factor = UNITS.get(unit, ("%", 100.0))
-        what = what if unit in UNITS else term
         rows.append({"of": owner, "term": what.replace("_", " "),
                      "change from the study": f"{factor * change:+.4f} ± {factor * sd:.4f} {shown}",
                      "known before": f"± {factor * prior_sd:.3g} {shown}"})
     return rows
+
+
+def _unit_of(name: str) -> str:
+    """Return the unit, a key of `UNITS`, at the end of a name; empty if it has none."""
+    name = re.sub(r"(\[\d+\])+$", "", name)
+    return next((unit for unit in UNITS if name.endswith(f"_{unit}")), "")
+
+
+def _unit_of_changes(change: Mapping[str, float]) -> str:
+    """Return the unit of an amplitude that changes numbers of the study by as much as itself.
+
+    Empty if they have none or several, or change by another factor: the amplitude then is a part
+    of that.
+    """
+    units = {_unit_of(key) for key in change}
+    same = all(abs(factor) == 1.0 for factor in change.values())
+    return units.pop() if len(units) == 1 and same else ""
 
 
 def pose_table(result: InferenceResult) -> Rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT
-from halbach_fe.report.inference import score_table
+from halbach_fe.report.inference import score_table, term_table
 from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.words import flux_density
 from halbach_fe.study.reader import parse_study
@@ -104,3 +105,39 @@ def test_answer_and_table_have_the_same_numbers(campaign, session):
     assert flux_density(1.1e-4, zeros=True) == "110\u00a0µT"
     assert flux_density(0.0, zeros=True) == "0\u00a0mT"
     assert flux_density(6.1e-6) == "6.1\u00a0µT"
+
+
+@pytest.mark.parametrize(("name", "key", "said"), [
+    ("temperature.difference_K", "array.remanence_T", "-2.5000 ± 1.0000 K"),
+    ("2. temperature.difference_K", "array.remanence_T", "-2.5000 ± 1.0000 K"),
+    ("ring_shifted r01.x_m", "array.exceptions[1].shift_m[1]", "-2500.0000 ± 1000.0000 mm"),
+    ("ring_tilted r01.x_rad", "array.exceptions[1].tilt_rad[1]", "-2500.0000 ± 1000.0000 mrad"),
+    ("drift.x_T", "instrument.drift_T[1]", "-2500.0000 ± 1000.0000 mT"),
+    ("ferromagnetic_object.x_A_m2", "external.dipoles[1].moment_A_m2[1]", "-2.5000 ± 1.0000 A m²"),
+    ("planar_hall_x.coefficient_1/T", "instrument.planar_hall_per_T[1]",
+     "-250.0000 ± 100.0000 %/T"),
+    ("cubic_nonlinearity_x.coefficient_1/T^2", "instrument.cubic_per_T2[1]",
+     "-250.0000 ± 100.0000 %/T²"),
+    ("gain_x.gain", "instrument.gain[1]", "-250.0000 ± 100.0000 %"),
+    # names of one's own, without a unit: that of the key
+    ("current", "external.coils[1].current_A", "-2.5000 ± 1.0000 A"),
+    ("oven", "demagnetization.temperature_C", "-2.5000 ± 1.0000 °C"),
+    ("turned", "array.angle_deg", "-2.5000 ± 1.0000 °"),
+    ("glue", "array.exceptions[1].shift_m[3]", "-2500.0000 ± 1000.0000 mm"),
+    ("coercivity", "array.normal_coercivity_A_per_m", "-0.0025 ± 0.0010 kA/m"),
+    ("slope", "array.remanence_coefficient_per_K", "-250.0000 ± 100.0000 %/K"),
+    ("all", "array.magnetization_factor", "-250.0000 ± 100.0000 %")])
+def test_amplitudes_have_the_unit_of_their_key(name, key, said):
+    """By the unit at the end of the name, otherwise of the number that changes as they do."""
+    def table(change):
+        found = SimpleNamespace(names=(name,), change=[-2.5], sd=[1.0], prior_sd=[10.0])
+        return term_table(SimpleNamespace(
+            terms=None, amplitudes=found, study=SimpleNamespace(
+                uncertain=[SimpleNamespace(name=name, change=change)])))[0]
+
+    row = table({key: 1.0})
+    assert row["change from the study"] == said
+    assert row["known before"].endswith(said.rpartition("0 ")[2])
+    assert not re.search("_|/T|m2", row["term"])
+    if "." not in name:  # a share of another change
+        assert table({key: 3e-4})["change from the study"].endswith(" %")
