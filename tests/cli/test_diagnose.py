@@ -361,7 +361,7 @@ def test_the_documentation_says_what_is_in_the_file():
         position_noise=(), solver_error=None, unknown=None, suspected=(), found_anything=False,
         probabilities={}, groups_before=[], groups_after=[], loo_residuals_before=np.zeros(1),
         loo_residuals_after=np.zeros(1), rounds=1, answer=1, converged=True, positions=(),
-        limits=None, floor_T=None, uncompared=None, imitated=(), verdict="nothing")
+        limits=None, floor_T=None, uncompared=None, looked_for=None, imitated=(), verdict="nothing")
     assert keys == list(diagnosis_summary(nothing))
     assert all(f"`{name}`" in section for name in ERRORS_BY_PLAUSIBILITY)
     rows = [line.split("|") for line in section.splitlines()
