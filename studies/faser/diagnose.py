@@ -83,6 +83,11 @@ class Hypothesis:
     pose: PosePrior
 
 
+CERTAIN = 6
+"""Power of ten of the largest odds that are stated. Beyond it they are the noise model's: nobody
+knows its tails so far out.
+"""
+
 TERMINAL_COLUMNS = ("a profile of", "odds", "fringe", "homogeneous")
 """Columns of the table of hypotheses that fit a terminal of 80 characters."""
 ANSWER = 2
@@ -218,8 +223,15 @@ def column_table(fitted: list[Fitted], update: InferenceResult) -> list[dict[str
 
 
 def _power(exponent: float) -> str:
-    """Return a probability relative to the largest."""
+    """Return a probability relative to the largest: small ones are not stated, see `CERTAIN`."""
+    if exponent < -CERTAIN:
+        return f"< 10^-{CERTAIN}"
     return "1" if exponent == 0 else f"10^{exponent:.0f}"
+
+
+def _times(exponent: float) -> str:
+    """Return a ratio of probabilities in words."""
+    return "more than a million" if exponent > CERTAIN else f"{10**exponent:.2g}"
 
 
 def sentences(best: Answer, answers: list[Answer], fitted: list[Fitted],
@@ -244,12 +256,12 @@ def sentences(best: Answer, answers: list[Answer], fitted: list[Fitted],
         f"{paper[0]:.2f} in the paper to {here[0]:.3f}, and in the homogeneous field from "
         f"{paper[1]:.1e} to {here[1]:.1e}.",
         f"The best answer on the axis, {axis.hypothesis.name.partition('; ')[2]}, is less probable "
-        f"by a factor of 10^{log_odds:.0f}, and leaves {axis.medians()[0]:.3f} in the fringe, with "
-        f"blocks bent to chi² of {axis.registration.chi2:.2g} per reading.",
+        f"by a factor of {_times(log_odds)}, and leaves {axis.medians()[0]:.3f} in the fringe, "
+        f"with blocks bent to chi² of {axis.registration.chi2:.2g} per reading.",
     ]
     line = fitted[0] if fitted else None
     others = [f"{each.reading.name} by a factor of "
-              f"10^{(line.log_evidence - each.log_evidence) / np.log(10):.0f}"
+              f"{_times((line.log_evidence - each.log_evidence) / np.log(10))}"
               for each in fitted[1:] if line]
     if line:
         said.append(
@@ -321,7 +333,7 @@ def _step_or_length(answers: list[Answer]) -> list[str]:
             f"of them is not as assumed, either a step is {1e3 * step:.2f} mm, or the magnet is "
             f"{1e3 * array.rings * array.ring_length_m:.0f} mm long; by the stated noise and "
             f"errors of blocks the {'step' if apart > 0 else 'length'} is the likelier by a "
-            f"factor of 10^{abs(apart):.0f}."]
+            f"factor of {_times(abs(apart))}."]
 
 
 def profile_figure(answers: list[Answer], published: PublishedErrors) -> Figure:
