@@ -37,10 +37,10 @@ from halbach_fe.diagnosis.model_selection import (
     prior_log_odds,
     with_candidates,
 )
+from halbach_fe.diagnosis.naming import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.diagnosis.result import IdentifiedEffect, Suspicion
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import Search, identify_effects, score_hypotheses
-from halbach_fe.diagnosis.unknown_cause import SUSPECTED, Further, families_of, judge, suspicions
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult

@@ -33,7 +33,7 @@ from halbach_fe.core.errors import CommandLineError, MeasurementError, must_be
 
 if TYPE_CHECKING:
     from halbach_fe.core.arrays import Floats
-    from halbach_fe.measurement.formats.table import ImportedMap
+    from halbach_fe.measurement.formats.conversion import ImportedMap
 
 
 def _template(parser: argparse.ArgumentParser) -> None:

@@ -1,5 +1,8 @@
 """All verbs of the command line, how one is run, and those about the installation: its cache, its
 programs, the keys of studies.
+
+Verbs on maps and tables of measurements are in `halbach_fe.cli.measured`, those that ask of a study
+in `halbach_fe.cli.questions`, those that convert files in `halbach_fe.cli.files`.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ MODULES = (
     "measurement.field_map", "measurement.block_table", "measurement.campaign",
     "measurement.observation",
     "response.matrix", "inference.infer", "inference.result",
-    "diagnosis.diagnose", "diagnosis.result", "diagnosis.evidence", "diagnosis.model_selection",
-    "diagnosis.effects.base")
+    "diagnosis.diagnose", "diagnosis.result", "diagnosis.marginal_evidence",
+    "diagnosis.model_selection", "diagnosis.effects.base")
 """Modules documented after the API, in the order of the rooms."""
 
 

@@ -78,7 +78,7 @@ QUICK = {
     "cli": "completion dry_run explain export formats new",
     "core": "code_digest hdf5 pace result_folder",
     "design": "cad tolerance",
-    "diagnosis": "discriminating_measurements evidence smooth_discrepancy",
+    "diagnosis": "discriminating_measurements marginal_evidence smooth_discrepancy",
     "docs": "describe_your_magnet figures",
     "geometry": (
         "block_export blocks convex_pieces equal_blocks free_blocks iron neighbours "

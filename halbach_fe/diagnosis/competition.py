@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.flexible_causes import Family, Fitted, fit_family, largest_factor
+from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,

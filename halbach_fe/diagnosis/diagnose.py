@@ -41,7 +41,6 @@ from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
-from halbach_fe.diagnosis.evidence import Marginal, ResidualGroup, loo_residuals, residual_groups
 from halbach_fe.diagnosis.flexible_causes import Family
 from halbach_fe.diagnosis.linearization import (
     Linearization,
@@ -56,7 +55,23 @@ from halbach_fe.diagnosis.map_errors import (
     find_poses,
     possible_positions,
 )
+from halbach_fe.diagnosis.marginal_evidence import (
+    Marginal,
+    ResidualGroup,
+    loo_residuals,
+    residual_groups,
+)
 from halbach_fe.diagnosis.model_selection import EFFECT_PRIOR_ODDS, Candidate, probabilities
+from halbach_fe.diagnosis.naming import (
+    Further,
+    Judgement,
+    describe_unknown,
+    families_of,
+    imitated,
+    judge,
+    named_effects,
+    suspicions,
+)
 from halbach_fe.diagnosis.outliers import Outlier, excluding, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     PositionNoise,
@@ -88,16 +103,6 @@ from halbach_fe.diagnosis.search import (
 )
 from halbach_fe.diagnosis.summary import place_in_words
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
-from halbach_fe.diagnosis.unknown_cause import (
-    Further,
-    Judgement,
-    describe_unknown,
-    families_of,
-    imitated,
-    judge,
-    named_effects,
-    suspicions,
-)
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import InferenceResult

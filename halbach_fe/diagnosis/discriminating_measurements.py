@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, keys_of

@@ -29,7 +29,7 @@ import numpy as np
 from scipy import linalg, special
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.geometry.surface import is_in_plane
 
 DECAY_RATES = ((0.25, 0.125), (1.0, 0.4), (2.0, 1.0))

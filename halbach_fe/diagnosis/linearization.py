@@ -13,8 +13,8 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
-from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.flexible_causes import fields_of_rms, harmonic_fields
+from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, FieldAt, Scene

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.diagnosis.evidence import Evidence, Marginal
+from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 
 DETECTION_LOG_ODDS = 5.0
 """Log posterior odds above which an effect is selected."""

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.numbers import MAD_TO_SD
-from halbach_fe.diagnosis.evidence import Marginal, with_fewer_columns
+from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.inference.result import HELD_OUT_MAP, InferenceResult
 from halbach_fe.measurement.observation import TOTAL

@@ -19,8 +19,8 @@ from scipy import linalg, special
 from scipy.optimize import minimize_scalar
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import DECAY_RATES, harmonic_fields, sensor_errors
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.model_selection import DETECTION_LOG_ODDS, EFFECT_PRIOR_ODDS
 from halbach_fe.diagnosis.scene import Campaign, ScannedMap
 from halbach_fe.inference.result import InferenceResult

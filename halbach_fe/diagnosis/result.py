@@ -11,8 +11,13 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
-from halbach_fe.diagnosis.evidence import Evidence, Marginal, ResidualGroup, with_fewer_columns
 from halbach_fe.diagnosis.gross_errors import GrossError
+from halbach_fe.diagnosis.marginal_evidence import (
+    Evidence,
+    Marginal,
+    ResidualGroup,
+    with_fewer_columns,
+)
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.outliers import Outlier
 from halbach_fe.diagnosis.position_noise import PositionNoise

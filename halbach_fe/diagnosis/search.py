@@ -14,8 +14,8 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, HalbachWarning
 from halbach_fe.core.pace import Progress
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
-from halbach_fe.diagnosis.evidence import Evidence, Marginal
 from halbach_fe.diagnosis.linearization import Linearization, amplitude_scale, apply_effects
+from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     PINNED_SD,

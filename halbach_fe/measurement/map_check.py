@@ -14,7 +14,7 @@ magnet is as good as that of the magnet).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import permutations, product
 from typing import Any
@@ -187,7 +187,7 @@ class InstrumentTerm:
     plausible : bool
         Whether an instrument may have that value, see `halbach_fe.measurement.doubted_terms`.
     predictive : bool
-        Whether no part of the map contradicts the others about it, see `_term`.
+        Whether no part of the map contradicts the others about it, see `_shown`.
     rivals : tuple of str
         Other parameters of which each by itself explains the map as well: one of all these is off,
         and the map does not tell which.
@@ -955,6 +955,27 @@ class Parameter:
     beside: tuple[int, ...] = ()
 
 
+@dataclass(frozen=True)
+class EvidenceByPart:
+    """What a map tells of the instrument, and what each of pairs of halves of it does.
+
+    ``flat`` is what the half in which the field is flat tells; None if the map has no such half.
+    """
+
+    whole: Evidence
+    halves: tuple[tuple[Evidence, Evidence], ...]
+    flat: Evidence | None = None
+
+    @classmethod
+    def of(cls, told: Sequence[Evidence], flat: int | None = None) -> EvidenceByPart:
+        """Return what `Evidence.of` yields; ``flat`` is the number of the pair of halves of which
+        the first one is where the field is flat.
+        """
+        whole, *parts = told
+        pairs = tuple(zip(parts[::2], parts[1::2], strict=True))
+        return cls(whole, pairs, None if flat is None else pairs[flat][0])
+
+
 def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
     """Return all parameters of the instrument.
 
@@ -1080,12 +1101,13 @@ def _asked(
         model = fitted.model.with_terms(~no_terms)
         halves = _halves(model, fitted.at, rows)
         steps = 2 + 2 * len(halves)
-        told = []
-        for each in Evidence.of(model, rows, fitted.at, fitted.width2, halves):
+        told: list[Evidence] = []
+        for each in Evidence.of(model, rows, fitted.at, fitted.width2, list(halves.values())):
             told.append(each)
             advance(number * steps + len(told), ROUNDS * steps)
         parameters = all_parameters(model.prior_sd, model.shares(fitted.at))
-        kept, terms = selected(parameters, told, flat=len(told) - 2 if halves else 0)
+        kept, terms = selected(parameters, EvidenceByPart.of(
+            told, list(halves).index("steepness") if "steepness" in halves else None))
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
         advance((number + 1) * steps, ROUNDS * steps)
     return fitted, tuple(
@@ -1094,27 +1116,26 @@ def _asked(
 
 
 def selected(
-    parameters: list[Parameter], told: list[Evidence], known: NDArray[np.bool_] | None = None,
-    flat: int = 0, with_rivals: bool = True,
+    parameters: list[Parameter], told: EvidenceByPart, known: NDArray[np.bool_] | None = None,
+    with_rivals: bool = True,
 ) -> tuple[NDArray[np.bool_], tuple[InstrumentTerm, ...]]:
     """Return which parameters (p,) of a `ProbeFit` are found, and all terms.
 
-    ``told`` is what the whole map tells, and what its halves do. ``known`` (p,) are kept already,
-    ``flat`` is the number of the half in which the field is flat, see `_term`. Parameters of which
-    one is enough, and that explain the map about as well, are kept together: in the flat field of
-    an MRI magnet a gain that drifts along x is a gradient of the field and a sensor that is off
-    along x. None is found then, as none has a value without the others, unless later ones help.
-    Not ``with_rivals``, the most probable one is kept alone.
+    ``known`` (p,) are kept already. Parameters of which one is enough, and that explain the map
+    about as well, are kept together: in the flat field of an MRI magnet a gain that drifts along x
+    is a gradient of the field and a sensor that is off along x. None is found then, as none has a
+    value without the others, unless later ones help. Not ``with_rivals``, the most probable one is
+    kept alone.
     """
-    kept = np.zeros(len(told[0].sums), bool) if known is None else known.copy()
+    kept = np.zeros(len(told.whole.sums), bool) if known is None else known.copy()
     rivals: dict[str, tuple[str, ...]] = {}
     while True:
-        terms = [_term(parameter, kept, told, flat) for parameter in parameters]
+        terms = [_term(parameter, kept, told) for parameter in parameters]
         there = [bool(kept[list(parameter.own)].all()) for parameter in parameters]
-        new = {parameter.name: _most_probable(parameter, kept, told[0])
+        new = {parameter.name: _most_probable(parameter, kept, told.whole)
                for parameter, term, old in zip(parameters, terms, there, strict=True)
                if term.found and not old}
-        finer = [] if new else _finer(parameters, kept, told, flat)
+        finer = [] if new else _finer(parameters, kept, told)
         if finer:
             kept[finer] = True
         elif not new:
@@ -1125,7 +1146,7 @@ def selected(
                         else rivals.get(term.name, ()))
                 for term, old in zip(terms, there, strict=True))
         else:
-            alike = _alike(new, told[0])[:None if with_rivals else 1]
+            alike = _alike(new, told.whole)[:None if with_rivals else 1]
             rivals |= {name: tuple(other for other in alike if other != name) for name in alike}
             for parameter in parameters:
                 if parameter.name in alike:
@@ -1159,7 +1180,7 @@ def _alike(new: dict[str, NDArray[np.bool_]], whole: Evidence) -> list[str]:
 
 
 def _finer(
-    parameters: list[Parameter], kept: NDArray[np.bool_], told: list[Evidence], flat: int
+    parameters: list[Parameter], kept: NDArray[np.bool_], told: EvidenceByPart
 ) -> list[int]:
     """Return the finer parts of changes during the scan that are kept, which are found too.
 
@@ -1173,7 +1194,7 @@ def _finer(
             waves = _waves_of(parameter, parameters, most)
             for part in [each for each in waves if parameter.row[each] and not kept[each]]:
                 alone = np.where(np.arange(len(kept)) == part, parameter.row, 0.0)
-                if _shown(replace(parameter, row=alone, own=waves), kept, told, flat,
+                if _shown(replace(parameter, row=alone, own=waves), kept, told,
                           PARTS_OF_A_CHANGE).found:
                     found.append(part)
         if found:
@@ -1190,38 +1211,40 @@ def _waves_of(
     return tuple(every[:most].tolist())
 
 
-def _halves(model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def _halves(
+    model: ProbeModel, at: ProbeFit, rows: NDArray[np.bool_]
+) -> dict[str, NDArray[np.bool_]]:
     """Return one half of the map each along x, y and z, and by how steep the field is."""
     # Smallest number of readings of a part of the map that tells of the instrument by itself.
     fewest_in_part = 40
     steepness = np.linalg.norm(model.charges.gradient(model.points, at.amplitudes), axis=(1, 2))
-    found: list[NDArray[np.bool_]] = []
-    for values in (*model.points.T, steepness):
-        middle = (float(np.median(values[rows])) if values is steepness
+    found = {}
+    for name, values in zip((*COMPONENTS, "steepness"), (*model.points.T, steepness), strict=True):
+        middle = (float(np.median(values[rows])) if name == "steepness"
                   else (values[rows].max() + values[rows].min()) / 2)
         half = rows & (values <= middle)
         if min(half.sum(), rows.sum() - half.sum()) >= fewest_in_part:
-            found.append(half)
+            found[name] = half
     return found
 
 
 def _term(
-    parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int
+    parameter: Parameter, kept: NDArray[np.bool_], told: EvidenceByPart
 ) -> InstrumentTerm:
     """Return what the whole map and its halves show of a parameter, see `_shown`.
 
     A change during the scan that they do not show alike by itself is asked with its uneven part.
     """
-    even = _shown(parameter, kept, told, flat, ALIKE_PARTS)
+    even = _shown(parameter, kept, told, ALIKE_PARTS)
     if even.found or not parameter.beside:
         return even
-    uneven = _shown(replace(parameter, own=parameter.own + parameter.beside), kept, told, flat,
+    uneven = _shown(replace(parameter, own=parameter.own + parameter.beside), kept, told,
                     PARTS_OF_A_CHANGE)
     return uneven if uneven.found else even
 
 
 def _shown(
-    parameter: Parameter, kept: NDArray[np.bool_], told: list[Evidence], flat: int,
+    parameter: Parameter, kept: NDArray[np.bool_], told: EvidenceByPart,
     alike: tuple[float, float]
 ) -> InstrumentTerm:
     """Return what the whole map and its halves show of a parameter, besides those that are kept.
@@ -1229,7 +1252,7 @@ def _shown(
     If the halves scatter about the whole by more than their bars, its bar is as much longer. They
     support it if both of a pair could tell whether it is there, and none that could contradicts it.
     What the charges do not follow is where the field is steep, in both halves along other axes:
-    the ``flat`` half (its number in ``told``, 0 if there is none) must be able to tell, too.
+    the half in which it is flat must be able to tell, too.
     """
     # A parameter is determined if its standard deviation is below this part of its prior one.
     determined = 0.5
@@ -1237,19 +1260,23 @@ def _shown(
         return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True)
     used = np.flatnonzero(kept | np.isin(np.arange(len(kept)), parameter.own))
     row = parameter.row[used]
-    estimates = [each.estimate(used) for each in told]
-    value, *of_parts = (float(row @ mean) for mean, _ in estimates)
-    sd, *sd_of_parts = (float(np.sqrt(row @ covariance @ row)) for _, covariance in estimates)
-    values, sds = np.array(of_parts), np.array(sd_of_parts)
+    def of(part: Evidence) -> tuple[float, float]:
+        mean, covariance = part.estimate(used)
+        return float(row @ mean), float(np.sqrt(row @ covariance @ row))
+
+    value, sd = of(told.whole)
+    values, sds = np.array([[of(half) for half in pair] for pair in told.halves]).reshape(
+        -1, 2, 2).transpose(2, 0, 1)
     alone = np.sqrt(np.maximum(sds**2 - sd**2, 0.1 * sds**2))
-    beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if of_parts else 1.0
+    beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if sds.size else 1.0
     sees = SEEN * beyond * sds < abs(value)
-    share = values / value if value else np.zeros(len(values))
+    share = values / value if value else np.zeros(values.shape)
     off = (np.abs(values - value) > SEEN * sds) & ((share < alike[0]) | (share > alike[1]))
-    supported = bool((sees[::2] & sees[1::2]).any() and not (sees & off).any() and (
-        SEEN * ([sd, *sd_of_parts][flat] if flat else 0.0) < abs(value)))
+    supported = bool(sees.all(axis=1).any() and not (sees & off).any() and (
+        told.flat is None or SEEN * of(told.flat)[1] < abs(value)))
     prior = float(np.linalg.norm(row))
-    away = float(np.abs(estimates[0][0][np.isin(used, parameter.own)]).max())
+    own = told.whole.estimate(used)[0][np.isin(used, parameter.own)]
+    away = float(np.abs(own).max())
     return InstrumentTerm(
         parameter.name, parameter.unit, value, beyond * sd, beyond * sd < determined * prior,
         away <= doubted_from(len(kept)),

@@ -48,6 +48,7 @@ from halbach_fe.measurement.map_check import (
     SOME_POINTS,
     TOO_FAR_APART,
     WEIGHTINGS,
+    EvidenceByPart,
     InstrumentTerm,
     MapCheck,
     Parameter,
@@ -790,12 +791,13 @@ class _Joined:
     def with_terms(self) -> tuple[tuple[InstrumentTerm, ...], _Joined]:
         """Return the terms of the probe that are common, or of one map, and the fit with these."""
         open_terms, parameters = _own_terms(self.maps, self.model, self._shares())
-        told = list(self._evidence(open_terms, self._overlap))
+        (whole,) = self._evidence(open_terms, self._overlap)
         kept = self.model.prior_sd > 0
         found = self
         at = np.flatnonzero(kept)
-        if any(_stands_out(parameter, told[0], at) for parameter in parameters):
-            told = list(self._evidence(open_terms, self._overlap, self._halves()))
+        if any(_stands_out(parameter, whole, at) for parameter in parameters):
+            told = EvidenceByPart.of(
+                list(self._evidence(open_terms, self._overlap, self._halves())))
             # that one probe or its electronics has another gain in a map is likelier than anything
             # else that differs between maps, whatever the overlap alone can tell
             new, _ = selected(parameters, told, kept, with_rivals=False)

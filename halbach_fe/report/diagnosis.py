@@ -8,7 +8,7 @@ from functools import partial
 
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.diagnosis.discriminating_measurements import SEPARATING_GAIN, Separation
-from halbach_fe.diagnosis.evidence import DISCOVERIES, ResidualGroup
+from halbach_fe.diagnosis.marginal_evidence import DISCOVERIES, ResidualGroup
 from halbach_fe.diagnosis.model_selection import (
     DETECTION_LOG_ODDS,
     EFFECT_PRIOR_ODDS,

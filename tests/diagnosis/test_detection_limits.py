@@ -9,7 +9,7 @@ from halbach_fe.diagnosis.detection_limits import smallest_amplitude
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects.blocks import BlockDemagnetizedEffect
 from halbach_fe.diagnosis.effects.shape import BLOCK_DISPLACED
-from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.diagnosis.model_selection import Candidate, log_bayes_factors
 from halbach_fe.diagnosis.summary import limits_in_words
 from halbach_fe.geometry.magnet import build_magnet

@@ -21,7 +21,7 @@ from halbach_fe.diagnosis.discriminating_measurements import (
 )
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Place
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.result import Diagnosis, IdentifiedEffect

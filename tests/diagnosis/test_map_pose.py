@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
-from halbach_fe.diagnosis import unknown_cause
+from halbach_fe.diagnosis import naming
 from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
@@ -148,7 +148,7 @@ def test_a_shift_that_is_far_from_linear_is_named(generator, tmp_path, monkeypat
     (effect,) = named.identified
     assert effect.values == pytest.approx(shift, abs=4 * max(effect.sd))
     assert max(named.probabilities, key=named.probabilities.get) == "mapper_translation"
-    monkeypatch.setattr(unknown_cause, "FAR_BETTER", 0.9)
+    monkeypatch.setattr(naming, "FAR_BETTER", 0.9)
     other = diagnose(study, data, Session.open(tmp_path), effects=some)
     assert other.unknown is not None
     assert other.unknown.alone

@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sparse
 
 from halbach_fe.diagnosis.diagnose import vibration_beyond
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.outliers import Outlier, excluding, find_outliers, outliers_of
 from halbach_fe.diagnosis.position_noise import (
     PositionNoise,

@@ -9,7 +9,7 @@ import pytest
 
 from halbach_fe.diagnosis import model_selection
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.evidence import Marginal
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from halbach_fe.diagnosis.model_selection import (
     FEW_PLACES,
     NOTICEABLE_CHI2,

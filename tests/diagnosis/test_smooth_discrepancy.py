@@ -6,7 +6,6 @@ import magpylib
 import numpy as np
 import pytest
 
-from halbach_fe.diagnosis.evidence import Marginal
 from halbach_fe.diagnosis.flexible_causes import (
     field_family,
     fit_family,
@@ -14,6 +13,7 @@ from halbach_fe.diagnosis.flexible_causes import (
     instrument_families,
     sensor_errors,
 )
+from halbach_fe.diagnosis.marginal_evidence import Marginal
 from tests.conftest import circle
 
 STEP = 1e-5

@@ -12,12 +12,12 @@ from halbach_fe.diagnosis.competition import Competition, Explanation
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis
-from halbach_fe.diagnosis.evidence import Evidence
 from halbach_fe.diagnosis.flexible_causes import fit_family, instrument_families
 from halbach_fe.diagnosis.linearization import NominalSolver
+from halbach_fe.diagnosis.marginal_evidence import Evidence
+from halbach_fe.diagnosis.naming import are_scattered
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.search import possible
-from halbach_fe.diagnosis.unknown_cause import are_scattered
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer

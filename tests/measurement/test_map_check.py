@@ -364,7 +364,7 @@ def trust_white_noise(monkeypatch):
     """
     selected = map_check.selected
     monkeypatch.setattr(map_check, "selected", lambda parameters, told, **_: selected(
-        parameters, [told[0]] * 3))
+        parameters, map_check.EvidenceByPart.of([told.whole] * 3)))
 
 
 def far_dipole(points, place):
@@ -433,7 +433,7 @@ def test_edges_of_magnets_are_no_errors_of_the_probe(shape, monkeypatch):
         if shape is not sectors:
             with monkeypatch.context() as without:
                 without.setattr(map_check, "selected", lambda parameters, told, **_: selected(
-                    parameters, told))
+                    parameters, replace(told, flat=None)))
                 asked += [term.name for term in check_map(data).terms if term.found]
     assert shape is sectors or asked
 

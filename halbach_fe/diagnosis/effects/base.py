@@ -208,7 +208,7 @@ class Effect(ABC):
             Prior mean of the magnetizations.
         information, score : ndarray, shape (m, m) and (m,)
             H' S^-1 H and H' S^-1 r of the response matrix H of the magnetizations and the residual
-            r, with the blocks integrated out; see `halbach_fe.diagnosis.evidence`.
+            r, with the blocks integrated out; see `halbach_fe.diagnosis.marginal_evidence`.
         """
         return self.places(study)
 

@@ -16,11 +16,11 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.formats import columns
+from halbach_fe.measurement.formats import delimited_table
+from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import Line, is_comment, lines_of, uncommented
 from halbach_fe.study.types import COMPONENTS
 
@@ -56,7 +56,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
     rest = [line for line in lines if not KEY.fullmatch(line[1][:MAX_LINE])]
     header = next((uncommented(line).split() for _, line in rest
                    if line.lstrip().startswith("!")), [])
-    table = columns.read_lines(rest, declared, where)
+    table = delimited_table.read_lines(rest, declared, where)
     if not set(header) <= set(NAMES) or len(header) != table.values.shape[1]:
         raise MeasurementError(must_be(
             "header", where, "a line ! X Y Z Fx Fy Fz, of a field that does not change in time",

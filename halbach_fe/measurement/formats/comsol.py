@@ -20,11 +20,11 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
-from halbach_fe.measurement.formats import columns, names
+from halbach_fe.measurement.formats import delimited_table, names
+from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import points_on
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import (
     Line,
     comments_of,
@@ -64,7 +64,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
     _refuse_solutions(lines, where)
     sections = _sections(lines)
     if not sections:
-        table = columns.read_lines(lines, declared, where)
+        table = delimited_table.read_lines(lines, declared, where)
     else:
         read_points = {"Grid": _grid_points, "Coordinates": _listed_points}.get(sections[0][0])
         if not read_points:

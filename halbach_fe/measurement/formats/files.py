@@ -22,7 +22,15 @@ from halbach_fe.measurement.field_map import (
     warn_of_left_out,
     warn_of_millimetres,
 )
-from halbach_fe.measurement.formats import bdsim, columns, comsol, g4beamline, openpmd, opera
+from halbach_fe.measurement.formats import (
+    bdsim,
+    comsol,
+    delimited_table,
+    g4beamline,
+    openpmd,
+    opera,
+)
+from halbach_fe.measurement.formats.conversion import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.grid import (
     Grid,
@@ -32,14 +40,13 @@ from halbach_fe.measurement.formats.grid import (
     read_fluka,
     read_srw,
 )
-from halbach_fe.measurement.formats.table import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.text import Line, lines_of, text_of_table
 from halbach_fe.measurement.formats.units import unit_symbol
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
-    FORMATS, (columns.read, opera.read, comsol.read, openpmd.read, g4beamline.read, bdsim.read,
-              read_srw, read_fluka), strict=True))
+    FORMATS, (delimited_table.read, opera.read, comsol.read, openpmd.read, g4beamline.read,
+              bdsim.read, read_srw, read_fluka), strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 RECOGNIZED: dict[str, Callable[[Sequence[Line]], bool]] = {
@@ -122,7 +129,7 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
         If the file has no x, y and z with their units, or another number of rows.
     """
     where = f"table of positions {path}"
-    found = columns.read(file_bytes(path, where), DeclaredFormat(), where)
+    found = delimited_table.read(file_bytes(path, where), DeclaredFormat(), where)
     order = [[column.quantity for column in found.columns].index(name) for name in COMPONENTS
              if name in [column.quantity for column in found.columns]]
     if len(order) < len(COMPONENTS) or not all(

@@ -34,9 +34,9 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of, refuse_total_field
+from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import CARTESIAN, in_units
-from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import (
     Line,
     comments_of,

@@ -21,10 +21,10 @@ import numpy as np
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import in_units
-from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.study.types import COMPONENTS
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -28,10 +28,10 @@ from collections.abc import Iterator, Sequence
 
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.formats import names
+from halbach_fe.measurement.formats.conversion import ForeignTable
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.grid import Grid
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.table import ForeignTable
 from halbach_fe.measurement.formats.text import Line, lines_of, rows_of
 from halbach_fe.study.materials import MU_0
 

@@ -26,9 +26,9 @@ from halbach_fe.measurement.field_map import (
     SIGMA_COLUMNS,
 )
 from halbach_fe.measurement.formats import names
+from halbach_fe.measurement.formats.conversion import ForeignTable, with_units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.names import ColumnName
-from halbach_fe.measurement.formats.table import ForeignTable, with_units
 from halbach_fe.measurement.formats.text import (
     RUN_TOGETHER,
     Line,

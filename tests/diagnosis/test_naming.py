@@ -11,7 +11,7 @@ from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Place
-from halbach_fe.diagnosis.evidence import Evidence
+from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.diagnosis.model_selection import Candidate, SelectedEffect
 from halbach_fe.diagnosis.search import Search, amplitudes, with_further_causes, with_rivals
 from halbach_fe.geometry.magnet import build_magnet

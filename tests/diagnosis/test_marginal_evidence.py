@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from halbach_fe.diagnosis.evidence import (
+from halbach_fe.diagnosis.marginal_evidence import (
     Marginal,
     loo_residuals,
     residual_groups,

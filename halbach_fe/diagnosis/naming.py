@@ -1,8 +1,10 @@
-"""Judge whether effects of the catalogue explain the readings, or something that nobody listed.
+"""Decide which effects are named, which are suspected, and whether a cause is unknown.
 
-The effects that the catalogue alone would give compete with causes of any shape, see
-`halbach_fe.diagnosis.competition`. What wins beside the effects, or in their place, is described:
-what it acts on, along which coordinate it varies, and how large it is.
+Effects are selected by their odds (`halbach_fe.diagnosis.model_selection`: the thresholds, and when
+the amplitude that gives an effect its name is determined). They then compete with causes of any
+shape (`halbach_fe.diagnosis.competition`). Effects of the best explanation are named. What wins
+beside them, or in their place, is described: what it acts on, along which coordinate it varies, and
+how large it is.
 """
 
 from __future__ import annotations
