@@ -457,7 +457,8 @@ def multipoles(
     reference = reference or MultipoleReference()
     references = [reference]
     if magnet.dimension == 3:
-        references = [replace(reference, z_m=None), replace(reference, z_m=reference.z_m or 0.0)]
+        references = [replace(reference, z_m=None), replace(
+            reference, z_m=magnet.middle_z_m if reference.z_m is None else reference.z_m)]
     models, left_out = multipole_models(magnet, references, session)
     distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [

@@ -243,6 +243,17 @@ class Magnet(ShownInNotebook):
         return self.half_length + reach_per_radius * self.radius
 
     @cached_property
+    def middle_z_m(self) -> float:
+        """Place in m of the middle along z: 0 of rings, halfway between the ends of free blocks."""
+        if not self.array.free_blocks:
+            return 0.0
+        ends = [end for (along, _) in self.ring_sections for end in along]
+        middle = (min(ends) + max(ends)) / 2
+        # what is left of blocks about z = 0 by rounding, relative to their length
+        rounding = 1e-9
+        return 0.0 if abs(middle) < rounding * (max(ends) - min(ends)) else middle
+
+    @cached_property
     def bore_radius(self) -> float:
         """Radius in m of the largest cylinder about the z axis that the blocks leave free.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -35,7 +34,6 @@ from halbach_fe.report.page import (
 from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
 from halbach_fe.response.multipoles import (
     DEFAULT_ORDERS,
-    UNITS,
     MultipoleModel,
     Multipoles,
     met,
@@ -129,7 +127,9 @@ def write_multipole_csv(study: Study, tables: Sequence[MultipoleTable], path: Pa
     radii = dict.fromkeys(model.radius for model, _ in tables)
     with atomic(path) as temporary:
         write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
-            "study": study.name, "convention": CONVENTION,
+            "study": study.name, "convention": CONVENTION
+            + "; local ones are the Fourier coefficients of B_r on the circle, sum A_n cos(n phi) "
+            "+ B_n sin(n phi)" * any(_location(model) == "local" for model, _ in tables),
             "reference_radius_m": ", ".join(f"{radius:g}" for radius in radii),
             "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
             "which the nominal one is normal",
@@ -224,7 +224,8 @@ def answer(
     said += only_of_orders(tables[0][0])
     lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
     if all(lacking):
-        return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY")
+        return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY",
+                          list(tables[0][1].values())[-1])
     if any(lacking):
         said += " Where there is no main multipole, units of 1e-4 of it mean nothing."
     if not measured:
@@ -268,23 +269,34 @@ def _size_sd(known: Multipoles) -> Floats:
                               / np.maximum(square + total, np.finfo(float).tiny)))
 
 
-def of_no_main(question: str, said: str, trust: str, command: str) -> Answer:
+def of_no_main(
+    question: str, said: str, trust: str, command: str, known: Multipoles
+) -> Answer:
     """Return an answer in units of a main multipole that `lacks_main`; ``trust`` begins its trust.
 
-    ``command`` is that of the answer, a verb of halbach-fe with its inputs.
+    ``command`` is that of the answer, a verb of halbach-fe with its inputs. If one of the other
+    multipoles is the magnet's, as of a quadrupole whose order the study does not state, the advice
+    is to state it.
     """
+    others = known.absolute
+    largest = int(others.sizes.argmax())
+    # Size of another multipole relative to the main one, and to its own standard deviation, from
+    # which it is the magnet's: errors of blocks make all of them about as large.
+    far_above_main, certain = 10.0, 5.0
+    if others.sizes[largest] > max(far_above_main * 1e3 * known.main,
+                                   certain * float(_size_sd(others)[largest])):
+        order = known.orders[largest]
+        return Answer(
+            question, said, f"{trust}: the tables are in units of 1e-4 of a main multipole that "
+            f"is not there, and so is any limit in such units. That of order {order} is far "
+            "larger.", f"If this is a magnet of order {order}, state it in the study, "
+            f"multipole_order = {order} below [array], and ask again.",
+            f"halbach-fe {command} -o DIR", sound=False)
     return Answer(
         question, said, f"{trust}: the tables are in units of 1e-4 of a main multipole that "
         "cancels, as along an undulator, and so is any limit in such units.",
         "Ask on a circle where there is a main field: set Z to the middle of a pole.",
         f"halbach-fe {command} --at-z-m Z -o DIR", sound=False)
-
-
-def _absolute(known: Multipoles) -> Multipoles:
-    """Return multipoles in mT, or mT m if integrated, instead of units of the main one."""
-    each = 1e3 * known.main / UNITS
-    return replace(known, mean=each * known.mean, root=each * known.root,
-                   error=each * known.error)
 
 
 def only_of_orders(model: MultipoleModel) -> str:
@@ -312,7 +324,10 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     worst = int(np.argmax(np.hypot(known.sizes, spread)))  # of nominal magnets all means are small
     sd = float(spread[worst])
     if lacks_main(known):
-        size, own = (1e2 * known.main * float(each) for each in (known.sizes[worst], sd))
+        others = known.absolute
+        spread = _size_sd(others)
+        worst = int(np.argmax(np.hypot(others.sizes, spread)))
+        size, own = (1e3 * float(each[worst]) for each in (others.sizes, spread))
         place = place_of(model)
         return (f"{place[0].upper()}{place[1:]}: there is no main multipole, of order "
                 f"{model.main}, but for errors of the blocks, {main_in_words(model, known)}. "
@@ -354,7 +369,7 @@ def page(found: MultipoleTables) -> Page:
         limit, unit, file = found.limit, "units of 1e-4", f"multipoles_{_location(model)}.png"
         if lacks := lacks_main(list(magnets.values())[-1]):
             limit, unit = None, f"m{model.unit}"
-            magnets = {name: _absolute(known) for name, known in magnets.items()}
+            magnets = {name: known.absolute for name, known in magnets.items()}
         where = ("integrated along z" if model.integrated else
                  "of the cross-section" if model.z is None else f"on {place_of(model)}")
         rows = tables[f"Multipoles in {unit}, {where}"] = multipole_rows(magnets)

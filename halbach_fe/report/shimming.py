@@ -242,7 +242,8 @@ def answer(shim: Shim) -> Answer:
                       "Find out what the study lacks before any block is moved.",
                       "halbach-fe diagnose STUDY --measurements MAP -o DIR", sound=False)
     if shim.fields is None and lacks_main(shim.before):
-        return of_no_main(question, said, "Not in these units", "shim STUDY --measurements MAP")
+        return of_no_main(question, said, "Not in these units", "shim STUDY --measurements MAP",
+                          shim.before)
     make = ("Make the moves in their order, measure again, and update study.shimmed.toml."
             if shim.shimmed_study else "Make the moves in their order, and measure again.")
     if shim.result.reservation and shim.steps:

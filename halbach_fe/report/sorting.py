@@ -137,7 +137,7 @@ def _answer(found: SortedBlocks) -> Answer:
             f"{'is' if found.left_over == 1 else 'are'} left over.")
     if not isinstance(found.model, DeviationModel) and lacks_main(found.numbered):
         return of_no_main(question, f"Not known: {what} {text(own)} {unit}.", "Not in these units",
-                          "sort STUDY BLOCKS")
+                          "sort STUDY BLOCKS", found.numbered)
     turned = ("" if not found.turned else f" {counted(found.turned, 'block')} "
               f"{'is' if found.turned == 1 else 'are'} turned in the slot, as sort.csv says.")
     if found.has_choice and not _chose(found):

@@ -120,7 +120,8 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
                 f"have all unwanted multipoles within {found.limit:g} units. {said}")
     question = "Which multipoles do the tolerances of the blocks make?"
     if lacks_main(found.known):
-        return of_no_main(question, said, "Not in these units", "tolerance STUDY")
+        return of_no_main(question, said, "Not in these units", "tolerance STUDY",
+                          found.known)
     step = (_sorting(found) if found.table_doubts or share is None or share < ENOUGH else
             ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
              "halbach-fe infer STUDY --measurements MAP -o DIR"))

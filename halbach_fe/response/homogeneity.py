@@ -29,7 +29,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
-from halbach_fe.geometry.cells import distance_from_blocks, halved
+from halbach_fe.geometry.cells import Distance, distance_from_blocks, halved
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import observe
@@ -762,8 +762,11 @@ def _resolved(
     # distance up to which points are added, as if blocks that are nearer were so far away
     least = 1e-3 * magnet.bore_radius
 
+    from_zero = _distance_from_zero(region, base.points, blocks)
+
     def distance(points: Floats) -> Floats:
-        return np.maximum(distance_from_blocks(blocks, points, far), least)
+        near = np.maximum(distance_from_blocks(blocks, points, far), least)
+        return near if from_zero is None else np.minimum(near, from_zero(points))
 
     parts, resolved = [], True
     for kind, share in (("surface", NEAR_SHARE), ("volume", VOLUME_SHARE)):
@@ -800,6 +803,26 @@ def _resolved(
         steps=np.minimum(own[:, None] / axes, base.steps[0]), near_shims=near_shims,
         unresolved_m=0.0 if resolved and nearest >= least else max(nearest, 0.0))
     return _about_extremes(region, found, blocks)
+
+
+def _distance_from_zero(
+    region: Region, points: Floats, blocks: Sequence[MagnetBlock]
+) -> Distance | None:
+    """Return a function that bounds the distance in m from where B is 0, as on the axis of a
+    quadrupole: |B| is no smooth function there. None if the field of some blocks in vacuum is far
+    from 0 at points (n, 3) of the region.
+    """
+    some, small = 200, 0.3  # points that are asked; |B| there, relative to the largest
+    asked = points[::max(1, len(points) // some)]
+    size = np.linalg.norm(field_of(blocks, asked), axis=1)
+    if size.min() > small * size.max():
+        return None
+    # sizes of cells next to a zero: mean, rms and peak to peak of a quadrupole's |B| are then right
+    # to 5e-5, 3e-4 and 1e-4, beside cells of an eighth
+    least = max(min(region.half_axes_m) / 4, max(region.half_axes_m) / 12)
+    scale = max(region.half_axes_m) / float(size.max())
+    return lambda places: np.maximum(
+        scale * np.linalg.norm(field_of(blocks, places), axis=1), least)
 
 
 def _with_inner_sphere(

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
 
@@ -123,6 +123,9 @@ class Multipoles:
     error : ndarray, shape (2 k,)
         Error of the solver for the nominal magnet in the same units, which ``root`` does not
         include.
+    root_T : ndarray, shape (2 k, q), in T (integrated: T m)
+        Root of the covariance of B_n and A_n themselves, which are known where the main one, to
+        which ``root`` refers, is not.
     """
 
     orders: tuple[int, ...]
@@ -133,6 +136,14 @@ class Multipoles:
     mean: Floats
     root: Floats
     error: Floats
+    root_T: Floats
+
+    @property
+    def absolute(self) -> Multipoles:
+        """These multipoles in mT, or mT m if integrated, instead of units of the main one."""
+        each = 1e3 * self.main / UNITS
+        return replace(self, mean=each * self.mean, root=1e3 * self.root_T,
+                       error=each * self.error)
 
     @property
     def covariance(self) -> Floats:
@@ -264,7 +275,8 @@ class MultipoleModel:
             float(np.hypot(np.linalg.norm(across), error / strength)) / self.main,
             UNITS * np.concatenate([relative.real, relative.imag]),
             UNITS * np.vstack([own.real, own.imag]),
-            UNITS * np.tile(self.error[1:] / strength, 2))
+            UNITS * np.tile(self.error[1:] / strength, 2),
+            np.vstack([root[1:].real, root[1:].imag]))
 
     def units(self, coefficients: Complexes) -> Floats:
         """Return b_n, a_n (..., 2 k) of coefficients C (..., 1 + k), without linearization."""

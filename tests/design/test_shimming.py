@@ -203,7 +203,7 @@ def test_gains_are_those_of_samples(generator):
     for columns in (10, 12):
         root = generator.standard_normal((size, columns))
         known.append(Multipoles((2, 3, 4), 1.0, 0.0, 0.0, 0.0, generator.standard_normal(size),
-                                root, np.zeros(size)))
+                                root, np.zeros(size), root))
     z = generator.standard_normal((20_000, 12))
     fall = (np.sum((known[0].mean + z[:, :10] @ known[0].root.T) ** 2, axis=1)
             - np.sum((known[1].mean + z @ known[1].root.T) ** 2, axis=1))
@@ -212,7 +212,8 @@ def test_gains_are_those_of_samples(generator):
     assert sd == pytest.approx(fall.std(), rel=0.03)
     # negative control: roots that share no columns
     apart = Multipoles((2, 3, 4), 1.0, 0.0, 0.0, 0.0, known[1].mean,
-                       np.hstack([np.zeros((size, 12)), known[1].root]), np.zeros(size))
+                       np.hstack([np.zeros((size, 12)), known[1].root]), np.zeros(size),
+                       known[1].root_T)
     assert gain(known[0], apart)[1] != pytest.approx(fall.std(), rel=0.03)
 
 

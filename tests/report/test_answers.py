@@ -202,7 +202,7 @@ def test_a_field_that_cancels_has_no_direction(given):
 def test_error_of_a_multipoles_size(mean, root):
     """It is that of drawn magnets; parts across a large multipole only turn it."""
     known = Multipoles((3,), 1.0, 0.0, 0.0, 0.0, np.array(mean, float), np.array(root, float),
-                          np.zeros(2))
+                          np.zeros(2), np.array(root, float))
     drawn = known.sizes_of(np.random.default_rng(1).standard_normal((20_000, 2)))
     spread, = multipoles._size_sd(known)
     # where the mean is 0 the rms of a part is stated, 1.5 times the sd of a Rayleigh distribution
