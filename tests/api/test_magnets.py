@@ -218,11 +218,15 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": "30 mm"}), "inner_radius_m.*number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "a number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": None}), "inner_radius_m.*number"),
-    (lambda frame: hf.halbach_ring(**RING).field_T(frame[["z", "y", "x"]]), "z, y, x in place of"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.set_axis(["r", "phi", "z"], axis=1)),
+     "r, phi, z in place of x, y, z"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.rename(columns={"x": "time_s"})),
+     "time_s, y, z in place of"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.to_numpy().astype("M8[s]")), "times"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.to_numpy() > 0), "true and false"),
     (lambda frame: hf.halbach_ring(**RING).field_T(Quantity()), "unit of their own"),
-    (lambda frame: hf.field_map(frame, frame[["y", "x", "z"]]), "y, x, z in place of x, y, z"),
     (lambda frame: hf.field_map(frame, frame[["x", "y"]].rename(columns="B{}_T".format),
-                                components=["y", "x"]), "Bx_T, By_T in place of y, x"),
+                                components=["y", "z"]), "Bx_T, By_T, of which z is not there"),
     (lambda frame: hf.halbach_ring(**RING).field_T(frame.rename(columns="{}_mm".format)),
      "other units than m and T: x_mm, y_mm, z_mm"),
     (lambda frame: hf.field_map(frame, frame.rename(columns="B{} [mT]".format)), r"Bx \[mT\]"),
@@ -459,8 +463,35 @@ def test_labelled_arrays(generator):
         assert np.array_equal(hf.field_map(turned.T, one)["B_T"], field)
         assert np.array_equal(hf.field_map(points, one, components=["y"])["B_T"][:, 1], field[:, 1])
     for wrong in (read.sel(component=["x", "y"]), read.assign_attrs(units="mT")):
-        with pytest.raises(hf.HalbachError, match=r"labelled x, y, of which z|numbers in mT"):
+        with pytest.raises(hf.HalbachError, match=r"labelled x, y, of which z|m and T: mT"):
             hf.field_map(points, wrong)
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_points_that_say_which_way_they_lie(generator, count):
+    """By names of columns, rows or dimensions. Control: a bare array of (3, 3) is by rows, and one
+    of (3, 5) is refused.
+    """
+    ring = hf.halbach_ring(**RING)
+    points = 0.01 * generator.uniform(-1, 1, (count, 3)) * [1, 1, 0]
+    field = ring.field_T(points)
+    frame = pandas.DataFrame(points, columns=["x", "y", "z"])
+    for one in (frame[["z", "y", "x"]], frame.T, frame.T.loc[["y", "x", "z"]],
+                frame.rename(columns="{}_m".format),
+                *(xr.DataArray(points.T, dims=(name, "point")) for name in (
+                    "axis", "xyz", "coord", "component"))):
+        assert np.array_equal(ring.field_T(one), field)
+        assert np.array_equal(hf.field_map(points, one)["B_T"], points)
+    row = frame.iloc[0]
+    assert np.allclose(ring.field_T(row.iloc[::-1]), field[0], atol=1e-12)  # of one point alone
+    if count == 3:
+        assert np.array_equal(ring.field_T(points.T), ring.field_T([*points.T]))
+        assert not np.allclose(ring.field_T(points.T), field)
+    else:
+        for bare in (points.T, xr.DataArray(points.T, dims=("a", "b")), frame.T.reset_index(
+                drop=True)):
+            with pytest.raises(hf.HalbachError, match=r"\(3, 5\)"):
+                ring.field_T(bare)
 
 
 @pytest.mark.parametrize("labels", [
@@ -478,7 +509,7 @@ def test_labels_are_read_as_names_of_columns(generator, labels):
     assert np.array_equal(read([0, 1, 2]), field[:, ::-1])
     for wrong in (["u", "v", "w"], ["radial", "y", "x"], ["By", "By", "Bx"], [
             f"{one[0]}_mm" for one in "zyx"]):
-        with pytest.raises(hf.HalbachError, match=r"axis labelled|numbers in z_mm"):
+        with pytest.raises(hf.HalbachError, match=r"axis labelled|m and T: z_mm"):
             read(wrong)
 
 
