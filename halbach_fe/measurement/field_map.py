@@ -155,16 +155,17 @@ def field_map(
         except (TypeError, ValueError, OverflowError) as error:
             raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
                                            f"what is none: {error}")) from None
-        if (sigma <= 0).any():
-            raise MeasurementError(must_be("sigma_T", "field_map", "positive numbers in T",
-                                           f"{sigma.min():g}", "Leave it out if it is not known: "
-                                           "the study's [[noise.regions]] then hold."))
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
             raise MeasurementError(must_be(
                 "sigma_T", "field_map", f"one number, or of shape ({len(points)},) or "
                 f"{given.shape}", str(sigma.shape)))
+        sigma = np.broadcast_to(sigma, given.shape)
+        if (wrong := np.isfinite(given) & ~(np.isfinite(sigma) & (sigma > 0))).any():
+            raise MeasurementError(must_be("sigma_T", "field_map", "positive numbers in T",
+                                           f"{sigma[wrong][0]:g}", "Leave it out if it is not "
+                                           "known: the study's [[noise.regions]] then hold."))
         data["sigma_T"] = (("point", "component"), of_all(sigma), {"units": "T"})
     return data
 
@@ -434,6 +435,10 @@ def _read_hdf5(path: Path) -> xr.Dataset:
     except (OSError, ValueError) as error:
         raise MeasurementError(must_be("content", where, "a whole HDF5 file",
                                        f"'{error}'")) from None
+    if "B_T" not in data.variables and "study" in data.attrs:
+        raise MeasurementError(must_be(
+            "path", where, "a file of measurements", "a posterior of halbach-fe infer",
+            "Give the map that was measured; a verb with --posterior takes this file there."))
     return _labelled(data, where)
 
 

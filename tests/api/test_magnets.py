@@ -525,7 +525,32 @@ def test_a_table_that_was_written_and_read(tmp_path):
         hf.magnet_of_blocks(pandas.read_csv(path).assign(outline_m="0 0; 1"))
 
 
-@pytest.mark.parametrize("sigma", [0.0, -1e-5, [1e-5, -1e-5]])
+@pytest.mark.parametrize(("length", "said"), [
+    (0.05, "1, of which `inference.held_out.every` = 4"), (None, "scan_lines_every = 5")])
+def test_a_map_of_one_row(tmp_path, length, said):
+    """The advice of its refusal is followed; the files of its inference are no maps."""
+    ring = hf.halbach_ring(**RING | {"length_m": length})
+    one = ([[0.01, 0.0, 0.0]], 1.01 * ring.field_T([[0.01, 0.0, 0.0]]))
+    with pytest.raises(hf.HalbachError, match=rf"{said}.*with_\(inference__held_out=None\)"):
+        hf.infer(ring, *one, sigma_T=1e-5)
+    result = hf.infer(ring.with_(inference__held_out=None), *one, sigma_T=1e-5)
+    hf.write_report(result, tmp_path)
+    with pytest.raises(hf.HalbachError, match=r"a file of measurements; instead .* a posterior of"):
+        hf.read_map(tmp_path / "posterior.h5")
+
+
+def test_a_folder_in_place_of_a_file(tmp_path):
+    for write in (lambda: hf.export(hf.halbach_ring(**RING), tmp_path),
+                  lambda: hf.write_map(hf.field_map(POINTS, POINTS), tmp_path)):
+        with pytest.raises(hf.HalbachError, match="must be a file; instead received the folder"):
+            write()
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1e-5, [1e-5, -1e-5], np.nan, np.inf,
+                                   [1e-5, np.nan]])
 def test_noise_that_is_none(sigma):
+    """Control: a component without a reading may have none."""
+    read = np.array([[0.1, np.nan, 0.2]])
+    assert hf.field_map(POINTS[:1], read, sigma_T=[[1e-5, np.nan, 1e-5]])["sigma_T"][0, 0] == 1e-5
     with pytest.raises(hf.HalbachError, match="sigma_T of field_map must be positive"):
         hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)
