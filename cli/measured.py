@@ -397,7 +397,7 @@ def diagnose(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
                           arguments.json)
     # no process may take longer than GetDP's own limit, unless the whole diagnosis may
     arguments.time_limit = max(GETDP_LIMIT_S, arguments.diagnosis_limit or 0.0)
-    with common.session(arguments, study) as session:
+    with common.session(arguments, study, told=False) as session:
         diagnosis = hf.diagnose(magnet, data, session, blocks, arguments.effects, validation_map,
                                 common.say, floor, arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)
