@@ -554,3 +554,11 @@ def test_noise_that_is_none(sigma):
     assert hf.field_map(POINTS[:1], read, sigma_T=[[1e-5, np.nan, 1e-5]])["sigma_T"][0, 0] == 1e-5
     with pytest.raises(hf.HalbachError, match="sigma_T of field_map must be positive"):
         hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)
+
+
+def test_a_result_without_a_page(tmp_path):
+    """As docs/from-python.md says; the refusal names the command that writes its files."""
+    found = hf.field(hf.halbach_ring(**RING | {"length_m": 0.05}),
+                     hf.Lines((0, 0, -0.01), (0, 0, 0.01), count=3))
+    with pytest.raises(hf.HalbachError, match="and hf.field the commands"):
+        hf.write_report(found, tmp_path)

@@ -433,9 +433,9 @@ def test_too_little_memory_is_told_before_meshing(session, monkeypatch):
     """
     magnet = build_magnet(study_with(SPHERE, mesh={"block_size_m": 0.0005}))
     meshed = []
-    monkeypatch.setattr(iron_bodies, "assemble_bodies", lambda *asked: meshed.append(asked) or 1 / 0)
+    monkeypatch.setattr(iron_bodies, "assemble_bodies", lambda *of: meshed.append(of) or 1 / 0)
     monkeypatch.setattr(iron_bodies, "available_memory", lambda: 22.0)
-    with pytest.raises(StudyError, match=r"`mesh.block_size_m` .* GiB. Set mesh") as told:
+    with pytest.raises(StudyError, match=r"`mesh.block_size_m` .* GiB\. Set mesh") as told:
         solve_bodies(magnet, np.zeros_like, session)
     assert not meshed
     size = float(str(told.value).split("mesh.block_size_m = ")[1].rstrip("."))
