@@ -772,15 +772,15 @@ def check_magnitudes(data: xr.Dataset) -> None:
     by_row = np.nan_to_num(np.abs(values)).reshape(len(values), -1).max(axis=1)
     beyond, row = np.flatnonzero(by_row > MAX_FIELD_T), int(np.argmax(by_row)) + 1
     if len(beyond):
-        unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
-                               ("millitesla", "mT", 1e-3))
+        known = (("gauss", "G", "0.0001"), ("millitesla", "mT", "0.001"))[:1 + (largest <= 2000)]
+        unit, short, factor = (" or ".join(each) for each in zip(*known[::-1], strict=True))
+        columns = " or ".join(f"Bx_{one}, By_{one}, Bz_{one}" for one in short.split(" or "))
         wrong = by_component > MAX_FIELD_T
         some = "" if (wrong | (by_component == 0)).all() else " and ".join(
             column for column, too_large in zip(FIELD_COLUMNS, wrong, strict=True) if too_large)
         units = (
-            f"in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
-            f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
-            "halbach-fe import-map.")
+            f"in {unit}? Then set instrument.flux_density_unit_T = {factor} in the "
+            f"study, or name the columns {columns} and convert the map by halbach-fe import-map.")
         if is_placeholder(largest):
             raise MeasurementError(must_be(
                 f"reading {row}", where, f"below {MAX_FIELD_T:g} T",
@@ -796,7 +796,7 @@ def check_magnitudes(data: xr.Dataset) -> None:
         raise MeasurementError(must_be(
             some or "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they {units}" + (
-                f" If only {some} is in {unit}, multiply this column of the file by {factor:g}."
+                f" If only {some} is in {unit}, multiply this column of the file by {factor}."
                 if some else "")))
     if TOTAL_COLUMN in data:
         _check_length(data, where)

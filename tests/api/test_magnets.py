@@ -560,5 +560,27 @@ def test_a_result_without_a_page(tmp_path):
     """As docs/from-python.md says; the refusal names the command that writes its files."""
     found = hf.field(hf.halbach_ring(**RING | {"length_m": 0.05}),
                      hf.Lines((0, 0, -0.01), (0, 0, 0.01), count=3))
-    with pytest.raises(hf.HalbachError, match="and hf.field the commands"):
+    with pytest.raises(hf.HalbachError, match=r"and hf\.field the commands"):
         hf.write_report(found, tmp_path)
+
+
+def test_noise_that_a_plan_misses():
+    """Where there is no map yet, none is spoken of. Control: an inference asks for its sigma_T."""
+    ring = hf.halbach_ring(**RING | {"length_m": 0.05}).with_(noise=None)
+    with pytest.raises(hf.HalbachError, match=r"since no map is there .* to the study\.$"):
+        hf.plan(ring)
+    points = 0.01 * np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    with pytest.raises(hf.HalbachError, match=r"has no sigma_T; .* or sigma_T to the map\.$"):
+        hf.infer(ring, points, ring.field_T(points))
+
+
+@pytest.mark.parametrize(("factor", "said", "other"), [
+    (1e3, "in millitesla or gauss.* = 0.001 or 0.0001 .*Bx_mT, .* or Bx_G, ", "kT"),
+    (1e4, "in gauss.* = 0.0001 in", "millitesla")])
+def test_units_that_a_field_may_have(factor, said, other):
+    """88 mT and 880 gauss are 88 times 10 too much each; 8800 are gauss."""
+    points = 0.01 * np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    ring = hf.halbach_ring(**RING | {"length_m": 0.05})
+    with pytest.raises(hf.HalbachError, match=said) as told:
+        hf.check_map(hf.field_map(points, factor * ring.field_T(points), sigma_T=1e-3))
+    assert other not in str(told.value)
