@@ -46,7 +46,7 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     if any(hasattr(values, name) for name in ("magnitude", "to_value")):  # of pint, of astropy
         raise TypeError("numbers with a unit of their own; convert them to SI, and give their "
                         "values alone")
-    given = np.ma.asarray(values)
+    given: Any = np.ma.asarray(values)
     if given.dtype.kind in "Mmb":  # whose numbers are nanoseconds, or 0 and 1
         raise TypeError("times" if given.dtype.kind in "Mm" else "true and false")
     return np.array(np.ma.filled(given.astype(float), np.nan))
