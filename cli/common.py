@@ -45,6 +45,7 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import decimals
+from halbach_fe.core.pace import Pace
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
@@ -343,9 +344,9 @@ def _listed(arguments: argparse.Namespace, study: hf.Study) -> dict[str, InputFi
 
 @contextmanager
 def session(
-    arguments: argparse.Namespace, study: hf.Study | None = None
+    arguments: argparse.Namespace, study: hf.Study | None = None, told: bool = True
 ) -> Iterator[hf.Session]:
-    """Open a session in the output folder; show its progress on stderr if that is a terminal.
+    """Open a session in the output folder; show its progress, see `progress_bar`.
 
     The folder becomes that of this verb and ``study``; shipped studies own theirs already.
     """
@@ -357,7 +358,7 @@ def session(
     if study is not None:
         own_folder(arguments, study.name, solving=True)
     arguments.at_end.enter_context(known_inputs({"GetDP": getdp.version, **inputs_of_command()}))
-    with progress_bar("solving") as show, ExitStack() as stack:
+    with progress_bar("solving", told) as show, ExitStack() as stack:
         opened = hf.Session(
             getdp=getdp, folder=arguments.output, jobs=jobs(arguments),
             time_limit_s=arguments.time_limit, progress=show, cache=cache(arguments),
@@ -415,8 +416,9 @@ def jobs(arguments: argparse.Namespace) -> int:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar on stderr if that is a terminal.
+def progress_bar(label: str, told: bool = False) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar on stderr if that is a terminal; if not, tell the progress in lines if it
+    is to be ``told``.
 
     The context is a function that takes the number of steps done and the total.
     """
@@ -431,6 +433,8 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     )
 
     console = Console(stderr=True)
+    pace = Pace(say if told and not console.is_terminal else lambda text: None)
+    pace.begin(label)
     with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
                   MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
                   TimeRemainingColumn(), console=console, transient=True,
@@ -441,6 +445,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
             if not done:  # the next step has a pace of its own
                 bar.reset(task)
             bar.update(task, completed=done, total=total)
+            pace.advance(done, total)
 
         yield show
 

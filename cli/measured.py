@@ -44,7 +44,13 @@ from halbach_fe.cli.options import (
     whole,
     within,
 )
-from halbach_fe.core.errors import CommandLineError, MeasurementError, StudyError, must_be
+from halbach_fe.core.errors import (
+    CommandLineError,
+    MeasurementError,
+    OutputError,
+    StudyError,
+    must_be,
+)
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import parse_number
 from halbach_fe.measurement.formats.declared import DeclaredFormat
@@ -102,6 +108,11 @@ def check(arguments: argparse.Namespace) -> int:
         arguments.listed_maps = _by_name(files)
     maps = [common.read_one(arguments, file) for file in files]
     if arguments.output is not None:  # before the check, which may take a minute
+        other = "check.json" if arguments.others else "joined.json"
+        if (arguments.output / other).exists():
+            raise OutputError(f"Folder {arguments.output} has {other}, of a check of "
+                              f"{'a single map' if arguments.others else 'several maps'}, which "
+                              "this one would remove. Name another folder, or remove this one.")
         common.own_folder(arguments)
     say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
     with common.progress_bar("checking") as show:
@@ -397,7 +408,7 @@ def diagnose(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
                           arguments.json)
     # no process may take longer than GetDP's own limit, unless the whole diagnosis may
     arguments.time_limit = max(GETDP_LIMIT_S, arguments.diagnosis_limit or 0.0)
-    with common.session(arguments, study) as session:
+    with common.session(arguments, study, told=False) as session:
         diagnosis = hf.diagnose(magnet, data, session, blocks, arguments.effects, validation_map,
                                 common.say, floor, arguments.diagnosis_limit)
         separating = separations(diagnosis, data, session, arguments.effects)

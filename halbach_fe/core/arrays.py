@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from itertools import chain
+from numbers import Number
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
@@ -21,47 +23,60 @@ OTHER_UNIT = re.compile(r"(?<![A-Za-z])(mm|cm|um|inch|mT|uT|nT|k?G|gauss)\W?$")
 """How such a name ends that states another unit than m or T: x_mm, Bx [mT]."""
 
 
+AXIS_DIMENSION = re.compile(r"components?|ax[ei]s|xyz|coord\w*|cartesian|directions?|space")
+"""Names of the dimension along which a DataArray without labels has x, y and z."""
+
+
 def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     """Return a copy of numbers as floats, NaN where an array is masked.
 
-    A DataArray whose labels name x, y and z has those of ``axes`` along the last dimension.
+    A DataArray, DataFrame or Series whose labels name x, y and z has those of ``axes`` along the
+    last dimension; so has a DataArray without labels if a dimension is called component or axis.
+    Whatever says nothing of itself is taken as it is: x, y and z along its last dimension.
 
     Raises
     ------
     TypeError, ValueError
-        If they are no real numbers, have a unit of their own, are a DataFrame whose columns are
-        named after other axes than ``axes``, are in another order, or state a unit but m or T, or
-        a DataArray that lacks one of the axes or has labels of another meaning.
+        If they are no real numbers, have a unit of their own, or are labelled by a unit but m or T,
+        by only some of the axes, or by something else.
     """
-    values = _by_labels(values, axes)
+    values = _by_labels(_labelled(values), axes)
     if np.iscomplexobj(values):
         raise TypeError("complex numbers")
     if any(hasattr(values, name) for name in ("magnitude", "to_value")):  # of pint, of astropy
         raise TypeError("numbers with a unit of their own; convert them to SI, and give their "
                         "values alone")
-    named = [AXIS.match(str(name)) for name in getattr(values, "columns", ())]
-    if named and all(named) and [one[1].lower() for one in named if one] != list(axes):
-        raise ValueError(f"columns named {', '.join(map(str, values.columns))} in place of "  # type: ignore[union-attr]
-                         f"{', '.join(axes)}, in this order")
-    if scaled := [name for name in map(str, getattr(values, "columns", ()))
-                  if OTHER_UNIT.search(name)]:
-        raise ValueError(f"columns in other units than m and T: {', '.join(scaled)}; convert them "
-                         "and name them anew")
-    return np.array(np.ma.filled(np.ma.asarray(values, float), np.nan))
+    given: Any = np.ma.asarray(values)
+    if given.dtype.kind in "Mmb":  # whose numbers are nanoseconds, or 0 and 1
+        raise TypeError("times" if given.dtype.kind in "Mm" else "true and false")
+    return np.array(np.ma.filled(given.astype(float), np.nan))
+
+
+def _labelled(values: Any) -> Any:
+    """Return a table or series (of pandas, polars) as a DataArray; anything else as it is."""
+    if isinstance(values, xr.DataArray) or not hasattr(values, "to_numpy"):
+        return values
+    numbers = values.to_numpy()
+    labels = [getattr(values, "index", ()), getattr(values, "columns", ())]
+    return xr.DataArray(numbers, dims=("row", "column")[:numbers.ndim], coords={
+        name: [one if isinstance(one, Number) else str(one) for one in found]
+        for name, found in zip(("row", "column")[:numbers.ndim], labels, strict=False)
+        if len(found)})
 
 
 def _by_labels(values: Any, axes: Sequence[str]) -> Any:
-    """Return an array whose labels name axes (a DataArray), as columns of a DataFrame do, with
-    ``axes`` along its last dimension; anything else as it is. Numbers as labels say nothing.
+    """Return an array whose labels name axes (a DataArray) with ``axes`` along its last dimension;
+    anything else as it is. Numbers as labels say nothing.
     """
-    if not (hasattr(values, "dims") and hasattr(values, "coords")):
+    if not isinstance(values, xr.DataArray):
         return values
     labels = {name: [str(label) for label in values.coords[name].values]
               for name in values.dims if name in values.coords
-              and any(isinstance(label, str) for label in values.coords[name].values)}
-    for text in (str(values.attrs.get("units", "")), *chain(*labels.values())):
-        if OTHER_UNIT.search(text):
-            raise ValueError(f"numbers in {text}; convert them to m and T")
+              and not all(isinstance(label, Number) for label in values.coords[name].values)}
+    if scaled := [text for text in (str(values.attrs.get("units", "")), *chain(*labels.values()))
+                  if OTHER_UNIT.search(text)]:
+        raise ValueError(f"numbers in other units than m and T: {', '.join(scaled)}; convert them "
+                         "and name them anew")
     for name in [*values.dims][::-1]:
         found = [AXIS.match(label) for label in labels.get(name, [])]
         named = [one[1].lower() for one in found if one]
@@ -70,8 +85,9 @@ def _by_labels(values: Any, axes: Sequence[str]) -> Any:
                 raise ValueError(f"{name} labelled {', '.join(labels[name])}, of which "
                                  f"{lacking[0]} is not there once")
             return values.isel({name: [named.index(axis) for axis in axes]}).transpose(..., name)
-    last = "component" if "component" in values.dims else ["", *values.dims][-1]
+    last = next((name for name in values.dims if AXIS_DIMENSION.fullmatch(str(name).lower())),
+                ["", *values.dims][-1])
     if last in labels and (last == "component" or len(labels[last]) == len(axes)):
         raise ValueError(f"{last} labelled {', '.join(labels[last])} in place of "
                          f"{', '.join(axes)}; name or drop these labels")
-    return values.transpose(..., "component") if last == "component" else values
+    return values.transpose(..., last) if last else values

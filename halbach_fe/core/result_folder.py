@@ -374,8 +374,11 @@ def single_file(path: Path, command: str, *beside: Path) -> Iterator[None]:
     Raises
     ------
     OutputError
-        If the file is a result of a run, or the command has not written it as it is.
+        If the file is a result of a run or a folder, or the command has not written it as it is.
     """
+    if path.is_dir():
+        raise OutputError(must_be("output", f"`{command}`", "a file", f"the folder '{path}'",
+                                  "Name a file in it, with its suffix."))
     if is_told():
         yield
         return

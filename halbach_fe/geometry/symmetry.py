@@ -182,11 +182,12 @@ def _apart(corners: Floats, others: Floats) -> float:
     return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
 
 
-def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
+def block_images(magnet: Magnet, turn: Floats, sign: int = 1) -> tuple[int, ...] | None:
     """Return the number from 0 of the equal block onto which each block is turned.
 
-    ``turn`` (3, 3) is a rotation about the origin of the magnet. None if a block has no equal one
-    there. Magnets with iron or fields from outside, cross-sections and blocks of uneven
+    ``turn`` (3, 3) is a rotation about the origin of the magnet. With a ``sign`` of -1 the turned
+    block must have the reversed magnetization of the one that is there. None if a block has no
+    equal one there. Magnets with iron or fields from outside, cross-sections and blocks of uneven
     magnetization are never said to be equal to themselves after a turn.
     """
     blocks = magnet.blocks
@@ -203,7 +204,7 @@ def block_images(magnet: Magnet, turn: Floats) -> tuple[int, ...] | None:
     for number, block in enumerate(blocks):
         there = int(np.linalg.norm(middles - turn @ middles[number], axis=1).argmin())
         if (_apart(corners[number] @ turn.T, corners[there]) > same_m
-                or np.abs(turn @ moments[number] - moments[there]).max() > same_T
+                or np.abs(sign * turn @ moments[number] - moments[there]).max() > same_T
                 or _permeabilities(block) != _permeabilities(blocks[there])):
             return None
         found.append(there)

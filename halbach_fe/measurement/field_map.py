@@ -155,16 +155,17 @@ def field_map(
         except (TypeError, ValueError, OverflowError) as error:
             raise MeasurementError(must_be("sigma_T", "field_map", "numbers in T",
                                            f"what is none: {error}")) from None
-        if (sigma <= 0).any():
-            raise MeasurementError(must_be("sigma_T", "field_map", "positive numbers in T",
-                                           f"{sigma.min():g}", "Leave it out if it is not known: "
-                                           "the study's [[noise.regions]] then hold."))
         if sigma.shape == (len(points),) != (len(components),):
             sigma = sigma[:, None]
         elif sigma.shape not in ((), (len(components),), (len(points), 1), given.shape):
             raise MeasurementError(must_be(
                 "sigma_T", "field_map", f"one number, or of shape ({len(points)},) or "
                 f"{given.shape}", str(sigma.shape)))
+        sigma = np.broadcast_to(sigma, given.shape)
+        if (wrong := np.isfinite(given) & ~(np.isfinite(sigma) & (sigma > 0))).any():
+            raise MeasurementError(must_be("sigma_T", "field_map", "positive numbers in T",
+                                           f"{sigma[wrong][0]:g}", "Leave it out if it is not "
+                                           "known: the study's [[noise.regions]] then hold."))
         data["sigma_T"] = (("point", "component"), of_all(sigma), {"units": "T"})
     return data
 
@@ -434,6 +435,10 @@ def _read_hdf5(path: Path) -> xr.Dataset:
     except (OSError, ValueError) as error:
         raise MeasurementError(must_be("content", where, "a whole HDF5 file",
                                        f"'{error}'")) from None
+    if "B_T" not in data.variables and "study" in data.attrs:
+        raise MeasurementError(must_be(
+            "path", where, "a file of measurements", "a posterior of halbach-fe infer",
+            "Give the map that was measured; a verb with --posterior takes this file there."))
     return _labelled(data, where)
 
 
@@ -767,15 +772,15 @@ def check_magnitudes(data: xr.Dataset) -> None:
     by_row = np.nan_to_num(np.abs(values)).reshape(len(values), -1).max(axis=1)
     beyond, row = np.flatnonzero(by_row > MAX_FIELD_T), int(np.argmax(by_row)) + 1
     if len(beyond):
-        unit, short, factor = (("gauss", "G", 1e-4) if largest > 2000 else
-                               ("millitesla", "mT", 1e-3))
+        known = (("gauss", "G", "0.0001"), ("millitesla", "mT", "0.001"))[:1 + (largest <= 2000)]
+        unit, short, factor = (" or ".join(each) for each in zip(*known[::-1], strict=True))
+        columns = " or ".join(f"Bx_{one}, By_{one}, Bz_{one}" for one in short.split(" or "))
         wrong = by_component > MAX_FIELD_T
         some = "" if (wrong | (by_component == 0)).all() else " and ".join(
             column for column, too_large in zip(FIELD_COLUMNS, wrong, strict=True) if too_large)
         units = (
-            f"in {unit}? Then set instrument.flux_density_unit_T = {factor:g} in the "
-            f"study, or name the columns Bx_{short}, By_{short}, Bz_{short} and convert the map by "
-            "halbach-fe import-map.")
+            f"in {unit}? Then set instrument.flux_density_unit_T = {factor} in the "
+            f"study, or name the columns {columns} and convert the map by halbach-fe import-map.")
         if is_placeholder(largest):
             raise MeasurementError(must_be(
                 f"reading {row}", where, f"below {MAX_FIELD_T:g} T",
@@ -791,7 +796,7 @@ def check_magnitudes(data: xr.Dataset) -> None:
         raise MeasurementError(must_be(
             some or "flux densities", where, f"below {MAX_FIELD_T:g} T", f"{largest:g}",
             f"Are they {units}" + (
-                f" If only {some} is in {unit}, multiply this column of the file by {factor:g}."
+                f" If only {some} is in {unit}, multiply this column of the file by {factor}."
                 if some else "")))
     if TOTAL_COLUMN in data:
         _check_length(data, where)

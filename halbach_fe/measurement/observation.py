@@ -429,6 +429,8 @@ def held_out_readings(
     """
     settings = study.inference.held_out
     chosen = np.zeros(len(observation), bool)
+    remove = ("Remove inference.held_out (in Python magnet.with_(inference__held_out=None)) to "
+              "update by all readings.")
     if settings is None:
         return chosen
     z = observation.positions[:, 2]
@@ -438,8 +440,8 @@ def held_out_readings(
         if not chosen.any():
             raise MeasurementError(must_be(
                 "readings", where, "at enough z positions for the study to hold some out",
-                f"{rank.max() + 1} positions",
-                "Remove inference.held_out, or make its window smaller."))
+                f"{rank.max() + 1}, of which `inference.held_out.every` = {settings.every} with "
+                f"window = {settings.window} holds out none", remove))
     # largest distance in m of a reading from a held-out radius. Coordinates of maps are rounded,
     # and the radii of circles differ by more than this tolerance.
     same_radius_m = 1e-4
@@ -461,11 +463,12 @@ def held_out_readings(
             raise MeasurementError(must_be(
                 "readings", where, f"such that `inference.held_out.{name}` holds some of them out",
                 f"none, at radii from {observation.radii.min():g} to {observation.radii.max():g} m "
-                f"and z from {z.min():g} to {z.max():g} m", "Correct or remove this key. Or are "
-                "they in mm? Then set `instrument.length_unit_m`."))
+                f"and z from {z.min():g} to {z.max():g} m", f"{remove} Or correct it" + (
+                    "." if name.startswith("scan") else
+                    "; or are they in mm? Then set `instrument.length_unit_m`.")))
         chosen = chosen | mask
     if chosen.all():
         raise MeasurementError(must_be(
             "readings", where, "enough for the study to leave some for the update",
-            f"{len(chosen)}, all held out", "Change inference.held_out."))
+            f"{len(chosen)}, all held out", remove))
     return chosen

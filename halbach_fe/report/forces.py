@@ -104,16 +104,21 @@ def _as_large(found: Forces, worst: int) -> str:
     """Name the other blocks whose force is as large as that of the block ``worst``, by symmetry."""
     size = found.in_place.magnitude
     slots: dict[int, list[str]] = {}
+    labels: list[str] = []
     # part of the largest force by which others may be smaller that are as large for who assembles
     equal = 1e-3
     for number in np.flatnonzero(size >= (1 - equal) * size[worst]).tolist():
-        if number != worst:
-            slots.setdefault(found.blocks[number].ring, []).append(str(found.blocks[number].slot))
-    count = sum(map(len, slots.values()))
+        block = found.blocks[number]
+        if number != worst and block.label:
+            labels.append(block.label)
+        elif number != worst:
+            slots.setdefault(block.ring, []).append(str(block.slot))
+    count = len(labels) + sum(map(len, slots.values()))
     if not count:
         return ""
-    named = "; ".join(f"ring {ring}, slot{'s' if len(own) > 1 else ''} {in_a_row(own)}"
-                      for ring, own in slots.items())
+    places = {f"ring {ring}, slot": own for ring, own in slots.items()}
+    named = "; ".join(f"{noun}{'s' if len(own) > 1 else ''} {in_a_row(own)}"
+                      for noun, own in (places | {"block": labels}).items() if own)
     return (f" It is as large on {counted(count, 'other block')}"
             f"{f': {named}' if count < LISTED else ''}.")
 

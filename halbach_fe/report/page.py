@@ -223,7 +223,8 @@ def page_of(result: object) -> Page:
         return page
     raise StudyError(must_be(
         "result", "write_report", "what a function such as hf.solve or hf.infer has returned",
-        f"a {type(result).__name__}"))
+        f"a {name}", "Of hf.prior, hf.check_map, hf.register and hf.field the commands of these "
+        "names write the files."))
 
 
 def csv_file(

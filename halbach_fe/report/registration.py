@@ -137,7 +137,7 @@ def answer(
     if alike:
         said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
                  "likely.")
-    trust = [*_other_poses(found), _fit(best, before)]
+    trust = [*_other_poses(found), *_reversed(best, assumed), _fit(best, before)]
     sound = is_sound(best)
     maps = "" if name else " --measurements MAP"
     own = f" --measurements DIR/{MAP_FILE}" if best.component else maps
@@ -404,6 +404,17 @@ def is_symmetric_to(one: Registration, other: Registration) -> bool:
                                other.translation_sd_m)).any():
         return False
     return block_images(build_magnet(one.study), turn) is not None
+
+
+def _reversed(best: Registration, assumed: Instrument | None) -> list[str]:
+    """Name reversed signs as the rival of a turn after which the nominal field is the opposite."""
+    turn = _axes(best) @ nearest_right_angles(assumed or Instrument()).T
+    if best.component or np.trace(turn) > 3 - 1e-9 or (
+            block_images(build_magnet(best.study), turn, -1) is None):
+        return []
+    return ["A map that is not turned, but whose readings all have the other sign (a probe the "
+            "other way round, say), would read the same: this magnet's field is the opposite after "
+            "that turn. Decide by how the map was measured."]
 
 
 def _axes(one: Registration) -> np.ndarray:

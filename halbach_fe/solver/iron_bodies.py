@@ -406,11 +406,24 @@ def solve_bodies(
     coarseness : float
         Factor to the sizes of elements.
     """
-    problem = start.problem if start else assemble_bodies(magnet, session, coarseness)
-    own = problem.source_potential(source(problem.points)[..., None])
-    total, residuals = newton(problem, own, start.total if start else None)
-    coarse = solve_bodies(magnet, source, session.within("coarse"), False,
+    def advance(share: int) -> None:
+        """Report the percentage of the time that is over: as measured, if sources are few."""
+        if session.progress is not None:
+            session.progress(share, 100)
+
+    advance(0)
+    quiet = replace(session, progress=None)
+    if not start:
+        _check_memory(magnet, coarseness)
+    coarse = solve_bodies(magnet, source, quiet.within("coarse"), False,
                           coarseness=COARSER * coarseness) if estimate else None
+    advance(8)
+    problem = start.problem if start else assemble_bodies(magnet, quiet, coarseness)
+    advance(50)
+    own = problem.source_potential(source(problem.points)[..., None])
+    advance(70)
+    total, residuals = newton(problem, own, start.total if start else None)
+    advance(100)
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
 
 
@@ -431,13 +444,14 @@ def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Prob
     """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
     from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 
-    _check_memory(magnet, size_of(magnet, coarseness).unknowns)
     sizes = Sizes.of(magnet.study.mesh, coarseness)
     key = magnet.study.iron, magnet.array_half_length, sizes, session.getdp
-    return _assembled(_Asked(key, partial(_assemble, magnet, session, sizes)))
+    return _assembled(_Asked(key, partial(_assemble, magnet, session, sizes, coarseness)))
 
 
-def _assemble(magnet: Magnet, session: Session, sizes: Sizes) -> Problem:
+def _assemble(
+    magnet: Magnet, session: Session, sizes: Sizes, coarseness: float
+) -> Problem:
     """Assemble the problem for elements of some sizes, as `assemble_bodies` does."""
     from halbach_fe.geo.iron_bodies import mesh_iron  # imports Gmsh
 
@@ -450,7 +464,7 @@ def _assemble(magnet: Magnet, session: Session, sizes: Sizes) -> Problem:
 
     mesh = verify_mesh(write_files(session.folder, "iron", draw))
     count = mesh.inner.nodes
-    _check_memory(magnet, count)  # gaps between bodies are not in the estimate
+    _check_memory(magnet, coarseness, count)  # gaps between bodies are not in the estimate
     (shell,), numbers = shells, ("CX", "CY", "CZ")
     job = Job(problem=PROBLEM, mesh=MESH, resolution="Vacuum", outputs=(),
               solutions=SOLUTIONS_FILE, unknowns=count, time_limit_s=session.time_limit_s,
@@ -498,22 +512,37 @@ def size_of(magnet: Magnet, coarseness: float) -> RunSize:
     return RunSize("scalar_potential", elements, unknowns, 1)
 
 
-def _check_memory(magnet: Magnet, unknowns: int) -> None:
-    """Refuse iron whose mesh would not fit into memory.
+def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -> None:
+    """Refuse iron whose mesh would not fit into memory, with a size of elements that would.
+
+    ``known`` is the number of unknowns once it is meshed. Before, the estimate may be a third low.
 
     Raises
     ------
     StudyError
     """
-    bytes_each = 16_000  # memory in bytes per unknown
-    needed, available = bytes_each * unknowns / 2**30, available_memory()
-    if available is not None and needed > available:
-        raise StudyError(must_be(
-            "`mesh.growth`", f"study {magnet.name}",
-            f"so large that the mesh of the iron fits into the {available:.2g} GiB of memory that "
-            f"are left", f"{magnet.study.mesh.growth:g}, for some {unknowns:.2g} unknowns and "
-            f"{needed:.2g} GiB", "Enlarge it and mesh.block_size_m, or leave out thin bodies of "
-            "iron."))
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+
+    gib_each, mesh = 16_000 / 2**30, magnet.study.mesh  # memory per unknown
+    estimate, available = size_of(magnet, coarseness).unknowns, available_memory()
+    unknowns = known or round(4 / 3 * estimate)
+    if available is None or gib_each * unknowns <= available:
+        return
+    hint, key = "Leave out thin bodies of iron.", "growth"
+    # half the memory is left to others
+    enough = available / gib_each / 2 * estimate / unknowns
+    tried = [("block_size_m", magnet.study.array.outer_radius_m), ("growth", 3.0)]
+    for name, most in tried:
+        values = (float(f"{one:.2g}") for one in np.geomspace(getattr(mesh, name), most, 30)[1:-1])
+        if found := next((one for one in values if Sizes.of(mesh.with_(**{name: one}), coarseness)
+                          .count(magnet.iron)[1] <= enough), None):
+            key, hint = name, f"Set mesh.{name} = {found:g}."
+            break
+    raise StudyError(must_be(
+        f"`mesh.{key}`", f"study {magnet.name}",
+        f"so large that the mesh of the iron fits into the {available:.2g} GiB of memory that "
+        f"are left", f"{getattr(mesh, key):g}, for some {unknowns:.2g} unknowns and "
+        f"{gib_each * unknowns:.2g} GiB", hint))
 
 
 def _problem(bodies: tuple[IronSolid, ...], mesh: VerifiedMesh, index: Ints,

@@ -218,11 +218,15 @@ RING = {"order": 1, "blocks": 8, "inner_radius_m": 0.03, "outer_radius_m": 0.05}
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": "30 mm"}), "inner_radius_m.*number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": Quantity()}), "a number"),
     (lambda frame: hf.halbach_ring(**RING | {"inner_radius_m": None}), "inner_radius_m.*number"),
-    (lambda frame: hf.halbach_ring(**RING).field_T(frame[["z", "y", "x"]]), "z, y, x in place of"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.set_axis(["r", "phi", "z"], axis=1)),
+     "r, phi, z in place of x, y, z"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.rename(columns={"x": "time_s"})),
+     "time_s, y, z in place of"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.to_numpy().astype("M8[s]")), "times"),
+    (lambda frame: hf.halbach_ring(**RING).field_T(frame.to_numpy() > 0), "true and false"),
     (lambda frame: hf.halbach_ring(**RING).field_T(Quantity()), "unit of their own"),
-    (lambda frame: hf.field_map(frame, frame[["y", "x", "z"]]), "y, x, z in place of x, y, z"),
     (lambda frame: hf.field_map(frame, frame[["x", "y"]].rename(columns="B{}_T".format),
-                                components=["y", "x"]), "Bx_T, By_T in place of y, x"),
+                                components=["y", "z"]), "Bx_T, By_T, of which z is not there"),
     (lambda frame: hf.halbach_ring(**RING).field_T(frame.rename(columns="{}_mm".format)),
      "other units than m and T: x_mm, y_mm, z_mm"),
     (lambda frame: hf.field_map(frame, frame.rename(columns="B{} [mT]".format)), r"Bx \[mT\]"),
@@ -459,8 +463,35 @@ def test_labelled_arrays(generator):
         assert np.array_equal(hf.field_map(turned.T, one)["B_T"], field)
         assert np.array_equal(hf.field_map(points, one, components=["y"])["B_T"][:, 1], field[:, 1])
     for wrong in (read.sel(component=["x", "y"]), read.assign_attrs(units="mT")):
-        with pytest.raises(hf.HalbachError, match=r"labelled x, y, of which z|numbers in mT"):
+        with pytest.raises(hf.HalbachError, match=r"labelled x, y, of which z|m and T: mT"):
             hf.field_map(points, wrong)
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_points_that_say_which_way_they_lie(generator, count):
+    """By names of columns, rows or dimensions. Control: a bare array of (3, 3) is by rows, and one
+    of (3, 5) is refused.
+    """
+    ring = hf.halbach_ring(**RING)
+    points = 0.01 * generator.uniform(-1, 1, (count, 3)) * [1, 1, 0]
+    field = ring.field_T(points)
+    frame = pandas.DataFrame(points, columns=["x", "y", "z"])
+    for one in (frame[["z", "y", "x"]], frame.T, frame.T.loc[["y", "x", "z"]],
+                frame.rename(columns="{}_m".format),
+                *(xr.DataArray(points.T, dims=(name, "point")) for name in (
+                    "axis", "xyz", "coord", "component"))):
+        assert np.array_equal(ring.field_T(one), field)
+        assert np.array_equal(hf.field_map(points, one)["B_T"], points)
+    row = frame.iloc[0]
+    assert np.allclose(ring.field_T(row.iloc[::-1]), field[0], atol=1e-12)  # of one point alone
+    if count == 3:
+        assert np.array_equal(ring.field_T(points.T), ring.field_T([*points.T]))
+        assert not np.allclose(ring.field_T(points.T), field)
+    else:
+        for bare in (points.T, xr.DataArray(points.T, dims=("a", "b")), frame.T.reset_index(
+                drop=True)):
+            with pytest.raises(hf.HalbachError, match=r"\(3, 5\)"):
+                ring.field_T(bare)
 
 
 @pytest.mark.parametrize("labels", [
@@ -478,7 +509,7 @@ def test_labels_are_read_as_names_of_columns(generator, labels):
     assert np.array_equal(read([0, 1, 2]), field[:, ::-1])
     for wrong in (["u", "v", "w"], ["radial", "y", "x"], ["By", "By", "Bx"], [
             f"{one[0]}_mm" for one in "zyx"]):
-        with pytest.raises(hf.HalbachError, match=r"axis labelled|numbers in z_mm"):
+        with pytest.raises(hf.HalbachError, match=r"axis labelled|m and T: z_mm"):
             read(wrong)
 
 
@@ -494,7 +525,62 @@ def test_a_table_that_was_written_and_read(tmp_path):
         hf.magnet_of_blocks(pandas.read_csv(path).assign(outline_m="0 0; 1"))
 
 
-@pytest.mark.parametrize("sigma", [0.0, -1e-5, [1e-5, -1e-5]])
+@pytest.mark.parametrize(("length", "said"), [
+    (0.05, "1, of which `inference.held_out.every` = 4"), (None, "scan_lines_every = 5")])
+def test_a_map_of_one_row(tmp_path, length, said):
+    """The advice of its refusal is followed; the files of its inference are no maps."""
+    ring = hf.halbach_ring(**RING | {"length_m": length})
+    one = ([[0.01, 0.0, 0.0]], 1.01 * ring.field_T([[0.01, 0.0, 0.0]]))
+    with pytest.raises(hf.HalbachError, match=rf"{said}.*with_\(inference__held_out=None\)"):
+        hf.infer(ring, *one, sigma_T=1e-5)
+    result = hf.infer(ring.with_(inference__held_out=None), *one, sigma_T=1e-5)
+    hf.write_report(result, tmp_path)
+    with pytest.raises(hf.HalbachError, match=r"a file of measurements; instead .* a posterior of"):
+        hf.read_map(tmp_path / "posterior.h5")
+
+
+def test_a_folder_in_place_of_a_file(tmp_path):
+    for write in (lambda: hf.export(hf.halbach_ring(**RING), tmp_path),
+                  lambda: hf.write_map(hf.field_map(POINTS, POINTS), tmp_path)):
+        with pytest.raises(hf.HalbachError, match="must be a file; instead received the folder"):
+            write()
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1e-5, [1e-5, -1e-5], np.nan, np.inf,
+                                   [1e-5, np.nan]])
 def test_noise_that_is_none(sigma):
+    """Control: a component without a reading may have none."""
+    read = np.array([[0.1, np.nan, 0.2]])
+    assert hf.field_map(POINTS[:1], read, sigma_T=[[1e-5, np.nan, 1e-5]])["sigma_T"][0, 0] == 1e-5
     with pytest.raises(hf.HalbachError, match="sigma_T of field_map must be positive"):
         hf.field_map(POINTS[:2], POINTS[:2], sigma_T=sigma)
+
+
+def test_a_result_without_a_page(tmp_path):
+    """As docs/from-python.md says; the refusal names the command that writes its files."""
+    found = hf.field(hf.halbach_ring(**RING | {"length_m": 0.05}),
+                     hf.Lines((0, 0, -0.01), (0, 0, 0.01), count=3))
+    with pytest.raises(hf.HalbachError, match=r"and hf\.field the commands"):
+        hf.write_report(found, tmp_path)
+
+
+def test_noise_that_a_plan_misses():
+    """Where there is no map yet, none is spoken of. Control: an inference asks for its sigma_T."""
+    ring = hf.halbach_ring(**RING | {"length_m": 0.05}).with_(noise=None)
+    with pytest.raises(hf.HalbachError, match=r"since no map is there .* to the study\.$"):
+        hf.plan(ring)
+    points = 0.01 * np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    with pytest.raises(hf.HalbachError, match=r"has no sigma_T; .* or sigma_T to the map\.$"):
+        hf.infer(ring, points, ring.field_T(points))
+
+
+@pytest.mark.parametrize(("factor", "said", "other"), [
+    (1e3, "in millitesla or gauss.* = 0.001 or 0.0001 .*Bx_mT, .* or Bx_G, ", "kT"),
+    (1e4, "in gauss.* = 0.0001 in", "millitesla")])
+def test_units_that_a_field_may_have(factor, said, other):
+    """88 mT and 880 gauss are 88 times 10 too much each; 8800 are gauss."""
+    points = 0.01 * np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    ring = hf.halbach_ring(**RING | {"length_m": 0.05})
+    with pytest.raises(hf.HalbachError, match=said) as told:
+        hf.check_map(hf.field_map(points, factor * ring.field_T(points), sigma_T=1e-3))
+    assert other not in str(told.value)

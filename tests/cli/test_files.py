@@ -21,7 +21,7 @@ from halbach_fe.core.files import InputFile
 from halbach_fe.core.result_folder import RECORD, WRITES
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.block_table import write_blocks
-from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import read_study
@@ -300,3 +300,19 @@ def test_single_files_of_commands(paths, tmp_path, capsys):
     code, said = refused(of(paths, "import-map", "map", "-o", "posterior"), capsys)
     assert code == 8
     assert "a result of `halbach-fe infer`" in said
+
+
+def test_a_check_of_one_map_and_of_several(paths, tmp_path, capsys):
+    """Neither removes the other's files. Control: a check of the same kind replaces its own."""
+    out, other = tmp_path / "out", tmp_path / "other.csv"
+    write_map(read_map(paths["volume"]).isel(point=slice(32, None)), other)
+    for _ in range(2):
+        assert main(["check", str(paths["volume"]), "-o", str(out)]) == 0
+    files = {path: path.read_bytes() for path in out.iterdir()}
+    capsys.readouterr()
+    assert main(["check", str(paths["volume"]), str(other), "-o", str(out)])
+    assert "has check.json, of a check of a single map, which" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in out.iterdir()} == files
+    (out / "check.json").rename(out / "joined.json")
+    assert main(["check", str(paths["volume"]), "-o", str(out)])
+    assert "has joined.json, of a check of several maps" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import magpylib
 import numpy as np
@@ -11,6 +12,7 @@ import tomlkit
 from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
+import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
 from halbach_fe.design import forces as forces_room
@@ -459,3 +461,17 @@ def test_page(tmp_path):
         if key not in ("rings", "ring_length_m")}})
     with pytest.raises(StudyError, match="3, for the forces"):
         forces(build_magnet(flat), Session.open(tmp_path))
+
+
+def test_blocks_that_are_as_large_are_named_as_in_the_table():
+    """By their own labels. Control: blocks of a ring by ring and slot."""
+    cubes = hf.magnet_of_blocks({
+        "name": ["left", "right"], "shape": ["cuboid"] * 2, "x_m": [-0.02, 0.02], "y_m": [0.0] * 2,
+        "z_m": [0.0] * 2, "size_x_m": [0.01] * 2, "size_y_m": [0.01] * 2, "size_z_m": [0.01] * 2,
+        "remanence_T": [1.3] * 2})
+    said = page(hf.forces(cubes)).answer.said
+    assert re.search("as large on 1 other block: block (left|right)[.]", said)
+    ring = hf.halbach_ring(order=1, blocks=4, inner_radius_m=0.03, outer_radius_m=0.05,
+                           length_m=0.05)
+    assert re.search("as large on 1 other block: ring 1, slot [0-9]",
+                     page(hf.forces(ring)).answer.said)

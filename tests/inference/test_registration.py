@@ -171,6 +171,16 @@ def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path
     assert "diagnose DIR/study.registered.toml" in answer([unexplained], assumed=far).command
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_signs_that_are_all_reversed(magnet, generator, tmp_path, sign):
+    """They look like half a turn, which reverses this magnet's field. Control: the right signs."""
+    data = measured(truth(generator, 0.0), generator, Rotation.identity(), np.zeros(3))
+    data["B_T"] *= sign
+    trust = answer(register(magnet, data, Session.open(tmp_path))).trust
+    assert trust.startswith(AT_REST)
+    assert ("whose readings all have the other sign" in trust) is (sign < 0)
+
+
 def test_sensors_that_a_map_does_not_have_are_not_in_its_table(magnet, generator, tmp_path):
     data = measured(truth(generator, 0.0), generator, Rotation.identity(), np.zeros(3))
     best = register(magnet, data, Session.open(tmp_path))[0]

@@ -424,3 +424,32 @@ def test_iron_that_does_not_answer_to_external_fields_is_told(iron, answers):
         check_points(magnet, POINTS[:1])
     assert ["up to 0.05 mT at the points, is added as if the iron" in str(one.message)
             for one in told] == [True] * (not answers)
+
+
+def test_too_little_memory_is_told_before_meshing(session, monkeypatch):
+    """A cube of 4 mm beside a sphere of 40 mm, whose elements are the cube's: 22 GiB by the
+    estimate, which may be a third low, and 28 by the mesh, after 138 s. What is advised is followed
+    until it is enough. Control: with enough memory it is meshed.
+    """
+    magnet = build_magnet(study_with(SPHERE, mesh={"block_size_m": 0.0005}))
+    meshed = []
+    monkeypatch.setattr(iron_bodies, "assemble_bodies", lambda *of: meshed.append(of) or 1 / 0)
+    monkeypatch.setattr(iron_bodies, "available_memory", lambda: 22.0)
+    with pytest.raises(StudyError, match=r"`mesh.block_size_m` .* GiB\. Set mesh") as told:
+        solve_bodies(magnet, np.zeros_like, session)
+    assert not meshed
+    size = float(str(told.value).split("mesh.block_size_m = ")[1].rstrip("."))
+    assert 0.0005 < size < 0.002
+    with pytest.raises(ZeroDivisionError):
+        solve_bodies(magnet.with_(mesh__block_size_m=size), np.zeros_like, session)
+    monkeypatch.setattr(iron_bodies, "available_memory", lambda: 60.0)
+    with pytest.raises(ZeroDivisionError):
+        solve_bodies(magnet, np.zeros_like, session)
+
+
+def test_progress_of_iron(session, coarse_mesh):
+    shares = []
+    magnet = build_magnet(study_with(SPHERE))
+    solve_bodies(magnet, lambda points: np.broadcast_to([0.0, 0.0, 1.0], points.shape),
+                 replace(session, progress=lambda *of: shares.append(of)))
+    assert shares == [(share, 100) for share in (0, 8, 50, 70, 100)]
