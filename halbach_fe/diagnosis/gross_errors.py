@@ -655,7 +655,8 @@ class _Nominal:
         block_magnetization_sd = 0.02
         points = _probe_points(study.instrument, shown)
         magnet = build_magnet(study)
-        if any(body.contains(points).any() for body in (*blocks, *(magnet.iron if iron else ()))):
+        if any(block.contains(points).any() for block in blocks) or (
+                iron is not None and any(body.contains(points).any() for body in magnet.iron)):
             return None
         external = external_field(magnet, points) + (iron(points) if iron else 0.0)
         field, across, variance = (np.zeros_like(points) for _ in range(3))
