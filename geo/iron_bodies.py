@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import gmsh
@@ -162,8 +162,15 @@ def _draw(name: str, bodies: Sequence[IronSolid]) -> tuple[list[list[int]], Shel
     iron = {tag for part in pieces[:-2] for tag in part}
     overlapping = 1e-6  # part of the iron's volume that rounding of coordinates may take
     if sum(occ.getMass(3, tag) for tag in iron) < (1 - overlapping) * whole:
-        raise StudyError(must_be("`iron.bodies`", f"study {name}", "bodies that do not overlap",
-                                 "bodies that do", "Move them apart, or let them touch."))
+        volume, tag, both = max((occ.getMass(3, tag), tag, (first + 1, second + 1))
+                                for (first, one), (second, other) in combinations(
+                                    enumerate(pieces[:-2]), 2) for tag in {*one} & {*other})
+        x, y, z = (1e3 * np.array(occ.getCenterOfMass(3, tag))).round(3) + 0.0
+        raise StudyError(must_be(
+            "`iron.bodies`", f"study {name}", "bodies that do not overlap",
+            f"bodies {both[0]} and {both[1]}, which share {1e9 * volume:.3g} mm^3 about "
+            f"({x:g}, {y:g}, {z:g}) mm (every copy, repeat and mirror image counts as one)",
+            "Move them apart, or let them touch."))
     return pieces, shell
 
 

@@ -20,6 +20,7 @@ from halbach_fe.diagnosis.map_errors import (
     MIN_MISFIT_OF_A_POSE,
     blocks_of,
     correct_map_errors,
+    iron_anywhere,
     misfits_of,
 )
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -96,8 +97,10 @@ def estimate_diagnosis(
         If a map does not lie where the study says: a diagnosis would register it first.
     """
     data = check_maps(study, data)
-    _, corrected, starts = correct_map_errors(study, data, blocks, catalogue())
-    if study.dimension == 3 and not starts and (
+    known = not iron_anywhere(build_magnet(study.with_(maps=())))  # without a solve
+    _, corrected, starts = correct_map_errors(
+        study, data, blocks, catalogue()) if known else ((), study, ())
+    if known and study.dimension == 3 and not starts and (
             max(misfits_of(corrected, data).values()) > MIN_MISFIT_OF_A_POSE):
         raise MeasurementError(must_be(
             "map", f"study {study.name}", "where the study says, for an estimate", "elsewhere",

@@ -52,6 +52,7 @@ from halbach_fe.diagnosis.map_errors import (
     beside_amplitudes,
     blocks_of,
     correct_map_errors,
+    field_of_iron,
     find_poses,
     possible_positions,
 )
@@ -260,15 +261,16 @@ class _Diagnosing:
             task, session=replace(task.session, progress=self.pace.advance))
         self.left, self.say = left, task.say
         self.pace.begin("looking for gross errors of the map")
+        iron = field_of_iron(task.study, self._subsession("nominal"))
         self.gross_errors, self.corrected, starts = correct_map_errors(
-            task.study, task.data, task.blocks, task.effects)
+            task.study, task.data, task.blocks, task.effects, iron)
         for error in self.gross_errors:
             self.say(f"gross error: {error.text}")
         self.poses: tuple[FoundPose, ...] = ()
         if not starts:  # which are places that explain the map
             self.pace.begin("looking where the map lies")
             self.poses, self.corrected = find_poses(
-                self.corrected, task.data, self._subsession("pose"), self.say)
+                self.corrected, task.data, self._subsession("pose"), self.say, iron)
         self.blocks = blocks_of(task.blocks, task.study, self.corrected)
         self.campaign = replace(
             Campaign.of(self.corrected, task.data, task.validation_map),

@@ -3,7 +3,8 @@
 Gross errors are too large for a linearized model, and must be corrected before any inference. Some
 points of the map are compared with the field of the nominal blocks in vacuum, first as the map
 stands and then with every gross error corrected in turn, single errors before combinations. A
-common factor near 1 is fitted, which absorbs iron, permeability and temperature.
+common factor near 1 is fitted, which absorbs coaxial iron, permeability and temperature. What iron
+of any shape adds is no factor: it is given, and with it no other magnet is tried.
 
 The misfit that tolerances of blocks and effects of usual size cause is known. A gross error is
 reported only if the misfit is far larger, and if correcting the error removes nearly all of it.
@@ -47,6 +48,7 @@ from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
 from halbach_fe.measurement.instrument import probe_points, sensor_matrix, to_magnet_axes
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
+from halbach_fe.solver.separate_blocks import Field
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -157,7 +159,7 @@ NOT_COMPARED = np.zeros(0), _Misfit(np.inf, np.inf)
 
 
 def find_gross_errors(
-    study: Study, data: xr.Dataset, blocks: BlockTable | None = None
+    study: Study, data: xr.Dataset, blocks: BlockTable | None = None, iron: Field | None = None
 ) -> tuple[GrossError, ...]:
     """Find the gross errors of a map, in the order in which they are to be corrected.
 
@@ -169,10 +171,12 @@ def find_gross_errors(
     blocks : BlockTable, optional
         Measured blocks, which decide between errors that the nominal magnet's symmetry makes
         equivalent.
+    iron : callable, optional
+        What iron of any shape adds to the field (n, 3) in T at points (n, 3) in m.
     """
     found: list[GrossError] = []
     while len(found) < MAX_ERRORS:
-        error = _search(study, data, blocks).find()
+        error = _search(study, data, blocks, iron).find()
         if error is None:
             break
         found.append(error)
@@ -180,21 +184,23 @@ def find_gross_errors(
     return tuple(found)
 
 
-def misfit_of(study: Study, data: xr.Dataset) -> float:
+def misfit_of(study: Study, data: xr.Dataset, iron: Field | None = None) -> float:
     """Return the rms difference of a map from the nominal magnet, relative to the map's rms.
 
     Infinite if the study places points of the map inside material.
     """
-    return _search(study, data).misfit(MapConvention()).relative
+    return _search(study, data, None, iron).misfit(MapConvention()).relative
 
 
-def _search(study: Study, data: xr.Dataset, blocks: BlockTable | None = None) -> _Search:
+def _search(study: Study, data: xr.Dataset, blocks: BlockTable | None, iron: Field | None
+            ) -> _Search:
     """Return the search with some points of a map."""
     # number of points of the map that are compared
     most_points = 160
     rows = np.unique(np.linspace(0, data.sizes["point"] - 1, most_points).round().astype(int))
     thinned = data.isel(point=rows)
-    return _Search(study, points_of(thinned), np.asarray(thinned["B_T"].values, float), blocks)
+    return _Search(study, points_of(thinned), np.asarray(thinned["B_T"].values, float), blocks,
+                   iron)
 
 
 class _Search:
@@ -208,13 +214,17 @@ class _Search:
     values : ndarray, shape (n, 3)
         Readings as the map's file lists them; NaN where a component is missing.
     table : BlockTable, optional
+    iron : callable, optional
+        See `find_gross_errors`.
     """
 
     def __init__(
-        self, study: Study, points: Floats, values: Floats, table: BlockTable | None = None
+        self, study: Study, points: Floats, values: Floats, table: BlockTable | None,
+        iron: Field | None,
     ) -> None:
         self.study, self.points, self.values, self.table = study, points, values, table
-        others = array_variants(study)
+        self.iron = iron
+        others = array_variants(study) if iron is None else ()
         self.turned = tuple(variant for variant in others if variant.turn_rad is not None)
         self.other = tuple(variant for variant in others if variant.turn_rad is None)
         self.observed = np.array([name in _observed(study) for name in COMPONENTS])
@@ -578,7 +588,8 @@ class _Search:
         blocks = build_magnet(study).blocks
         mean = np.pad(measured.reshape(len(blocks), -1), ((0, 0), (0, 3 - study.dimension)))
         points = _probe_points(study.instrument, self.points)
-        total = external_field(build_magnet(study), points)
+        total = external_field(build_magnet(study), points) + (
+            self.iron(points) if self.iron else 0.0)
         for block, magnetization, unit in zip(blocks, mean, unit_fields(blocks, points),
                                               strict=True):
             total += unit @ (MU_0 * block.recoil_tensor @ magnetization)
@@ -607,7 +618,7 @@ class _Search:
                 if source.magnet not in self.blocks:
                     self.blocks[source.magnet] = build_magnet(study).blocks
                 self.computed[source] = _Nominal.of(
-                    study, self.blocks[source.magnet], self.points)
+                    study, self.blocks[source.magnet], self.points, self.iron)
             except HalbachError:
                 self.computed[source] = None
         return self.computed[source]
@@ -624,7 +635,7 @@ class _Nominal:
     across : ndarray, shape (n, 3), in T
         The same with the magnetization of all blocks turned by 90 deg.
     external : ndarray, shape (n, 3), in T
-        Field of external sources.
+        Field of external sources and of iron of any shape.
     variance : ndarray, shape (n, 3), in T^2
         Variance that the tolerances of the blocks cause.
     """
@@ -636,15 +647,18 @@ class _Nominal:
 
     @classmethod
     def of(
-        cls, study: Study, blocks: Sequence[MagnetBlock], shown: Floats
+        cls, study: Study, blocks: Sequence[MagnetBlock], shown: Floats, iron: Field | None
     ) -> _Nominal | None:
         """Compute it at the points (n, 3) of a map's file; None if a point is inside material."""
         # Standard deviation of a block's magnetization along each axis, relative to its nominal
         # magnitude.
         block_magnetization_sd = 0.02
         points = _probe_points(study.instrument, shown)
-        if any(block.contains(points).any() for block in blocks):
+        magnet = build_magnet(study)
+        if any(block.contains(points).any() for block in blocks) or (
+                iron is not None and any(body.contains(points).any() for body in magnet.iron)):
             return None
+        external = external_field(magnet, points) + (iron(points) if iron else 0.0)
         field, across, variance = (np.zeros_like(points) for _ in range(3))
         for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             x, y, _ = block.easy_axis
@@ -652,8 +666,7 @@ class _Nominal:
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)
             variance += np.sum((block_magnetization_sd * block.remanence * unit) ** 2, axis=2)
         sensors = sensor_matrix(study.instrument).T
-        return cls(field @ sensors, across @ sensors,
-                   external_field(build_magnet(study), points) @ sensors, variance)
+        return cls(field @ sensors, across @ sensors, external @ sensors, variance)
 
     def field(self, turn: float) -> Floats:
         """Return B (n, 3) in T with the magnetization of all blocks turned by an angle in rad."""

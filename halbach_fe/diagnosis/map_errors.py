@@ -30,12 +30,13 @@ from halbach_fe.diagnosis.model_selection import (
 )
 from halbach_fe.diagnosis.result import FoundPose, IdentifiedEffect, PossiblePosition
 from halbach_fe.diagnosis.scene import Campaign
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.campaign_registration import register_maps, registered_study
 from halbach_fe.inference.registration import odds, register
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import Data, maps_of
+from halbach_fe.solver.separate_blocks import Field, applies, solve_separate
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study
 
@@ -120,8 +121,11 @@ def _refined(
 
 def correct_map_errors(
     study: Study, data: Data, blocks: BlockTable | None, effects: Sequence[Effect],
+    iron: Field | None = None,
 ) -> tuple[tuple[GrossError, ...], Study, tuple[Start, ...]]:
     """Find the gross errors of all maps and correct the study for them.
+
+    ``iron`` is what `field_of_iron` returns.
 
     Returns
     -------
@@ -143,7 +147,7 @@ def correct_map_errors(
     kept: list[GrossError] = []
     displaced: list[GrossError] = []
     for name in [None] if isinstance(data, xr.Dataset) else list(data):
-        found = _errors_of(study, data, name, blocks)
+        found = _errors_of(study, data, name, blocks, iron)
         for error in found:
             others = [] if isinstance(data, xr.Dataset) or error.convention.magnet is None else [
                 other for other in data if other != name]
@@ -177,14 +181,16 @@ def beside_amplitudes(blocks: BlockTable | None, study: Study) -> BlockTable | N
 
 
 def _errors_of(
-    study: Study, data: Data, name: str | None, blocks: BlockTable | None
+    study: Study, data: Data, name: str | None, blocks: BlockTable | None,
+    iron: Field | None = None,
 ) -> tuple[GrossError, ...]:
     """Return the gross errors of a map; ``name`` is None for the only one."""
     if isinstance(data, xr.Dataset) or name is None:
         assert isinstance(data, xr.Dataset)
-        return find_gross_errors(study, data, blocks)
+        return find_gross_errors(study, data, blocks, iron)
     own = study.of_map(list(data).index(name))
-    return tuple(replace(error, map=name) for error in find_gross_errors(own, data[name], blocks))
+    return tuple(replace(error, map=name) for error in find_gross_errors(
+        own, data[name], blocks, iron))
 
 
 def _check_same_magnet(
@@ -227,17 +233,34 @@ def with_poses(study: Study, poses: Sequence[FoundPose]) -> Study:
     return study.with_(**tables[""]) if "" in tables else study.with_tables(tables)
 
 
-def misfits_of(study: Study, data: Data) -> dict[str, float]:
+def field_of_iron(study: Study, session: Session) -> Field | None:
+    """Return what iron of any shape adds to the field of the blocks, see `find_gross_errors`.
+
+    None if the study has none, or if no function of the points has its field.
+    """
+    magnet = build_magnet(study.with_(maps=()))
+    if not iron_anywhere(magnet):
+        return None
+    return solve_separate(magnet, session, estimate=False).field
+
+
+def iron_anywhere(magnet: Magnet) -> bool:
+    """Tell whether iron of any shape is solved for beside blocks that no mesh follows."""
+    return applies(magnet) and bool(magnet.iron) and not magnet.iron_is_axisymmetric
+
+
+def misfits_of(study: Study, data: Data, iron: Field | None = None) -> dict[str, float]:
     """Return the `misfit_of` of each map in its stated place, by name.
 
     It is 0 for maps with so few readings that some pose would fit any of them.
     """
-    return {one.name: misfit_of(one.study, one.data) if one.data["B_T"].notnull().sum()
+    return {one.name: misfit_of(one.study, one.data, iron) if one.data["B_T"].notnull().sum()
             >= MIN_READINGS else 0.0 for one in maps_of(study, data)}
 
 
 def find_poses(
-    study: Study, data: Data, session: Session, say: Callable[[str], None]
+    study: Study, data: Data, session: Session, say: Callable[[str], None],
+    iron: Field | None = None,
 ) -> tuple[tuple[FoundPose, ...], Study]:
     """Register the maps if one of them is far from the magnet's field where the study states it.
 
@@ -252,6 +275,8 @@ def find_poses(
     session : Session
     say : callable
         Called with a description of each step before it starts.
+    iron : callable, optional
+        What `field_of_iron` returns.
 
     Returns
     -------
@@ -263,7 +288,7 @@ def find_poses(
     """
     possible = 0.05  # odds from which another pose is named beside the best one
     min_reduction = 3.0  # factor by which the registered pose must reduce the misfit to be believed
-    before = misfits_of(study, data)
+    before = misfits_of(study, data, iron)
     if study.dimension == 2 or max(before.values()) < MIN_MISFIT_OF_A_POSE:
         return (), study
     several, maps = isinstance(data, dict), maps_of(study, data)
@@ -279,7 +304,7 @@ def find_poses(
     except MeasurementError as error:
         say(f"no pose explains the map: {error}")
         return (), study
-    after = misfits_of(registered, data)
+    after = misfits_of(registered, data, iron)
     # misfit that is good enough even if it was not larger in the stated place: of a map that lies
     # right beside another one that does not
     good = 0.05

@@ -319,8 +319,7 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             "noise",
             "The solver's own error explains the misfit: chi² per reading is "
             f"{decimals(cause.chi2_noise)} for the noise alone and "
-            f"{decimals(cause.chi2_errors)} with that error. Refine `mesh` or move "
-            "`open_boundary` outwards, and diagnose the map again."))
+            f"{decimals(cause.chi2_errors)} with that error."))
     for noise in diagnosis.position_noise:
         size, where = f"{1e3 * noise.sd_m:.2g} mm", f"map {noise.map}" if noise.map else ""
         found.append(OtherFinding(

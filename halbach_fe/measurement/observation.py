@@ -167,6 +167,17 @@ class Observation:
             result[~single] = np.repeat(np.hypot(*parts.swapaxes(0, 1))[:, None], 2, axis=1).ravel()
         return result
 
+    def largest(self, lengths: Floats) -> Floats:
+        """Return the largest readings (readings,) in T of fields of given lengths (n,) in T.
+
+        Their directions are any: error bars have none.
+        """
+        entries = self.operator.tocoo()
+        rows, columns = entries.coords
+        weights = sparse.csr_array(  # adds up the squares of one point's components
+            (entries.data**2, (rows, columns // len(COMPONENTS))), (len(self), len(lengths)))
+        return np.asarray(np.sqrt(weights) @ lengths)
+
 
 def flux_density_at(points: Floats) -> Observation:
     """Return the readings Bx, By and Bz at points (n, 3) in m, by exact sensors."""

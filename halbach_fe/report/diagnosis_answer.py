@@ -36,6 +36,7 @@ from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.inference_answer import distances
 from halbach_fe.report.words import bayes_factor, decimals, in_a_row
+from halbach_fe.solver.formulation_choice import Route, choose_route, finer_in_words
 
 COORDINATES = {
     "z": "z", "angle": "the azimuth", "radius": "the radius", "time": "the time",
@@ -306,7 +307,13 @@ def _next(diagnosis: Diagnosis) -> tuple[str, str]:
     infer = f"halbach-fe infer DIR/{STUDY_FILE}{maps} -o DIR"
     again = _again(diagnosis)
     if diagnosis.solver_error:
-        return "Refine `mesh` or move `open_boundary` outwards, and diagnose again.", again
+        before = diagnosis.before
+        place = before.magnet, before.observation.points
+        keys = finer_in_words(*place)
+        boundary = ", or move `open_boundary` outwards" * (
+            choose_route(*place) is not Route.MOMENTS)
+        return (f"Take {keys}{boundary}, and diagnose again." if keys else "No key of the mesh "
+                "lowers it: the grid of the iron is fixed on this route."), again
     if diagnosis.is_partial and not diagnosis.identified and not diagnosis.suspected and (
             diagnosis.unknown is not None or _fails(diagnosis) or _is_restless(diagnosis)):
         options = in_a_row(["--effects"] * (diagnosis.looked_for is not None)

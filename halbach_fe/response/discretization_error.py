@@ -119,9 +119,10 @@ def reading_errors(
         unknown = np.isnan(known).any(axis=1)
         if unknown.any():  # these points were solved for by another route, see `ElementFields`
             known = known.copy()
-            known[unknown] = np.abs(_changes_of_modes(
-                magnet, observation.points[unknown], nominal[unknown], session)).sum(axis=0)
-        return observation.magnitude(known)
+            known[unknown] = np.linalg.norm(np.abs(_changes_of_modes(
+                magnet, observation.points[unknown], nominal[unknown], session)).sum(axis=0),
+                axis=1, keepdims=True)
+        return observation.largest(known.max(axis=1))
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
         return np.zeros(len(observation))  # the field is exact: finite elements add nothing
     route = choose_route(magnet, observation.points)

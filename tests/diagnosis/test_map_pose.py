@@ -17,9 +17,19 @@ from halbach_fe.diagnosis import naming
 from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.map_errors import find_poses, with_poses
+from halbach_fe.diagnosis.map_errors import (
+    MIN_MISFIT_OF_A_POSE,
+    correct_map_errors,
+    field_of_iron,
+    find_poses,
+    misfits_of,
+    with_poses,
+)
 from halbach_fe.diagnosis.result import FoundPose
+from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument
@@ -103,15 +113,15 @@ def test_a_map_on_a_stage_is_registered_first(study, generator, tmp_path):
     assert "The map is not where the study says" in page
 
 
+def fail(text: str) -> None:
+    raise AssertionError(text)
+
+
 def test_what_lies_where_the_study_says_is_not_searched(study, generator, tmp_path):
     """A few millimetres are left to the catalogue."""
     data = measured(truth(generator), generator, Rotation.identity(),
                     np.array([0.002, 0.0, -0.045]))
     study = study.with_(instrument__translation_m=(0.0, 0.0, -0.045))
-
-    def fail(text: str) -> None:
-        raise AssertionError(text)
-
     assert find_poses(study, data, Session.open(tmp_path), fail) == ((), study)
 
 
@@ -169,3 +179,38 @@ def test_poses_of_maps_that_share_stage_and_probe_are_stated_together():
         with_poses(study, poses[:1])
     alone = with_poses(parse_study(tomllib.loads(TEXT)), [replace(poses[0], map=None)])
     assert alone.instrument_sd.gain == 3e-3
+
+
+PLATES = {"name": "plates", "mesh": {"block_size_m": 0.02, "growth": 2.6}, "array": {
+    "free_blocks": {
+        "name": ["left", "right"], "shape": ["cuboid"] * 2, "x_m": [-0.05, 0.05], "y_m": [0.0] * 2,
+        "z_m": [0.0, 0.0], "size_x_m": [0.02] * 2, "size_y_m": [0.04] * 2, "size_z_m": [0.04] * 2,
+        "remanence_x_T": [0.0] * 2, "remanence_y_T": [1.2] * 2, "remanence_z_T": [0.0] * 2}},
+    "noise": {"regions": [{"name": "all", "sigma_T": 1e-4}]},
+    "iron": {"relative_permeability": 1000.0, "bodies": [{
+        "kind": "box", "size_m": [0.12, 0.01, 0.05], "centre_m": [0.003, 0.026, 0.0],
+        "mirrored": ["y"]}]},
+    "observation": {"quantity": "flux_density", "positions": {
+        "kind": "grid", "start_m": [-0.02, -0.01, -0.02], "end_m": [0.02, 0.01, 0.02],
+        "count": [4, 3, 4]}}}
+
+
+def test_iron_of_any_shape_is_no_pose(session):
+    """Two plates multiply the field between them: the map lies where it should, whatever the field
+    of the blocks in vacuum is like. An error of its axes is found beside them, and only with them.
+    """
+    study = parse_study(PLATES)
+    points = points_from(study.observation.positions)
+    truth = solve_nominal(build_magnet(study.with_(mesh__growth=1.8)), points, session.within("t"))
+    data = field_map(points, truth)
+    assert misfits_of(study, data)["map"] > MIN_MISFIT_OF_A_POSE  # as if there were no iron
+    iron = field_of_iron(study, session.within("iron"))
+    assert misfits_of(study, data, iron)["map"] < 0.05  # two meshes, 0.8 % were measured
+    assert find_poses(study, data, session, fail, iron) == ((), study)
+    assert estimate_diagnosis(study, data, effects=[]).signatures == 0  # it refuses no map
+    assert correct_map_errors(study, data, None, [], iron)[0] == ()
+    turned = field_map(points, truth[:, [1, 0, 2]])
+    (error,), corrected, _ = correct_map_errors(study, turned, None, [], iron)
+    assert corrected.instrument.field_axes == ("y", "x", "z")
+    assert error.misfit_after < 0.05
+    assert correct_map_errors(study, turned, None, [])[0] == ()

@@ -11,6 +11,7 @@ from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.summary import diagnosis_summary, other_findings
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
+from halbach_fe.report import diagnosis_answer
 from halbach_fe.report.diagnosis_answer import answer
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.study.reader import parse_study
@@ -41,6 +42,14 @@ def test_a_coarse_mesh_is_no_effect(session, generator):
     assert diagnosis_summary(diagnosis)["verdict"] == "numerical"
     assert [one.name for one in other_findings(diagnosis)] == ["solver_error"]
     assert answer(diagnosis).said.startswith("The solver's own error explains the misfit")
+    assert answer(diagnosis).step.startswith("Take a smaller mesh.block_size_m (now ")
+    assert ", or move `open_boundary` outwards, and diagnose again" in answer(diagnosis).step
+    # blocks by moments have cells, and no boundary
+    cubes = build_magnet(parse_study(changed(
+        DIPOLE, dimension=3, array__ring_length_m=0.05, solver={"route": "moments"})))
+    moved = replace(diagnosis, before=replace(diagnosis.before, magnet=cubes))
+    assert diagnosis_answer._next(moved)[0] == (
+        "Take a larger mesh.cells_per_side (now 2), and diagnose again.")
 
 
 @pytest.mark.parametrize(("method", "gain"), [("reaction", 0.0), ("direct", 0.1)])

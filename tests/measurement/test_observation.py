@@ -8,7 +8,12 @@ import pytest
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map
-from halbach_fe.measurement.observation import concatenate, held_out_readings, observe
+from halbach_fe.measurement.observation import (
+    concatenate,
+    flux_density_at,
+    held_out_readings,
+    observe,
+)
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.solver.exact_block_field import field_of
@@ -64,6 +69,24 @@ def test_circles_of_several_radii(dipole, generator):
         observe(study, circle(0.06), np.ones((24, 3), bool))
     with pytest.raises(MeasurementError, match=r"circle of radius 0\.05 m at z = -0\.1 m"):
         observe(study, np.delete(points, 60, axis=0), np.ones((95, 3), bool))
+
+
+def test_largest_readings(dipole, generator):
+    """No field of given lengths is read larger, in any order; one along the sensors is as large."""
+    order = generator.permutation(24)
+    circle_of = observe(dipole(observation=FOURIER), circle(0.075)[order], np.ones((24, 3), bool))
+    points = flux_density_at(circle(0.075))
+    lengths = generator.uniform(0.5, 2.0, 24)
+    directions = generator.normal(size=(500, 24, 3))
+    fields = directions / np.linalg.norm(directions, axis=2)[..., None] * lengths[:, None]
+    assert points.largest(lengths) == pytest.approx(np.repeat(lengths, 3))
+    assert (np.abs(circle_of.apply(fields)) <= circle_of.largest(lengths)).all()
+    for harmonic in (1, 2, 5):
+        row = circle_of.labels.index(f"A{harmonic}")
+        radial = multipole_field(circle_of.points, harmonic, 1.0, 0.0)
+        radial = circle_of.points * [1, 1, 0] / 0.075 * np.sign(
+            np.sum(radial * circle_of.points, axis=1))[:, None] * lengths[:, None]
+        assert circle_of.apply(radial)[row] == pytest.approx(circle_of.largest(lengths)[row])
 
 
 def test_grid_of_points(dipole):

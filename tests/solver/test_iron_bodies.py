@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 import warnings
 from dataclasses import replace
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from halbach_fe.core.errors import GetDPError, StudyError
-from halbach_fe.geo.iron_bodies import Sizes, mesh_iron
+from halbach_fe.geo.iron_bodies import Sizes, check_apart, mesh_iron
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
@@ -343,6 +344,21 @@ def test_a_dry_run_refuses_bodies_that_overlap(first, second):
         estimate(first, second)
     apart = [0.15, 0.0, 0.0] if first["kind"] == "box" else [0.0, 0.0, 0.03]
     assert estimate(first, second | {"centre_m": apart}).seconds > 0
+
+
+def test_bodies_that_overlap_are_named():
+    """By their numbers, with what they share and where: also mirror images, and a body in one."""
+    box = {"kind": "box", "size_m": [0.02, 0.02, 0.02], "centre_m": [0.05, 0.0, 0.03]}
+    low = box | {"centre_m": [0.05, 0.009, 0.06], "mirrored": ["y"]}
+    ball = {"kind": "sphere", "radius_m": 0.005, "centre_m": [0.1, 0.01, 0.06]}
+    for bodies, said in (
+            ((box, low), "bodies 2 and 3, which share 800 mm^3 about (50, 0, 60) mm (every copy"),
+            ((box, box | {"centre_m": [0.1, 0.01, 0.06]}, ball),
+             f"bodies 2 and 3, which share {4 / 3 * np.pi * 125:.3g} mm^3 about (100, 10, 60) mm")):
+        with pytest.raises(StudyError, match=re.escape(said)):
+            check_apart("test", build_magnet(study_with(*bodies)).iron)
+    apart = low | {"centre_m": [0.05, 0.01, 0.06]}  # moved apart until they touch
+    check_apart("test", build_magnet(study_with(box, apart, ball)).iron)
 
 
 def test_other_refusals(session, monkeypatch):
