@@ -1161,18 +1161,37 @@ def _kept(maps: Sequence[Checked], model: JoinedModel) -> NDArray[np.bool_]:
                 own = list(parameter.own)
                 kept[own] |= COMMON[own]
                 if number and parameter.own[0] in GAINS_OF_AXES and _contradicted(
-                        parameter.name, one, maps):
+                        one, maps, parameter.own[0] - GAINS_OF_AXES.start):
                     kept[_gains_of(model, number)] = True
         if number:
             kept[np.arange(len(kept))[model.placed(number)][:6]] = True
     return kept
 
 
-def _contradicted(name: str, one: Checked, maps: Sequence[Checked]) -> bool:
-    """Tell whether the check of another map has another value of a term of the probe."""
-    value, sd = next((term.value, term.sd) for term in one.check.terms if term.name == name)
-    return any(abs(term.value - value) > SIGNIFICANT * np.hypot(term.sd, sd)
-               for other in maps for term in other.check.terms if term.name == name)
+def _contradicted(one: Checked, maps: Sequence[Checked], axis: int) -> bool:
+    """Tell whether the check of another map has another gain of a component of the probe.
+
+    Gains are compared with those of the other components: that of |B| is of the component along
+    which the field is, in the bore of a dipole another one than at its end.
+    """
+    value, variance = _gains(one)
+    for theirs, their_variance in map(_gains, maps):
+        off, variances = value - theirs, variance + their_variance
+        if (np.abs(off[axis] - off) > SIGNIFICANT * np.sqrt(variances[axis] + variances)).any():
+            return True
+    return False
+
+
+def _gains(one: Checked) -> tuple[Floats, Floats]:
+    """Return the gain of each component relative to that of |B| in %, and its variance, (3,) each.
+
+    A component along which the field is has none: it is that of |B|.
+    """
+    terms = {term.name: term for term in one.check.terms}
+    value, sd = np.array([(terms[name].value, terms[name].sd) if name in terms else (0.0, 0.0)
+                          for name in (f"gain of B{axis} relative to that of |B|"
+                                       for axis in COMPONENTS)]).T
+    return value, sd**2
 
 
 def _gains_of(model: JoinedModel, number: int) -> Ints:

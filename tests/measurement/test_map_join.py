@@ -250,9 +250,11 @@ def test_a_plane_that_the_stage_came_to_from_the_other_side(generator, monkeypat
         assert not joined_of(control).displaced
 
 
-def dipole_maps(gain, late=0.0, three=False):
+def dipole_maps(gain, late=0.0, three=False, here=(1, 1, 1), starts=(-0.04, -0.005)):
     """Maps of two rings of cubes that share 5 mm on either side of the middle plane, the last one
     with gains (3,) of its own, and its first plane ``late`` in m; of ``three`` two are alike.
+
+    The first one has the gains ``here`` (3,); ``starts`` are where it and the others begin, in m.
     """
     generator, magnet = np.random.default_rng(12), magpylib.Collection()
     for z, angle in ((z, 2 * np.pi * slot / 8) for z in (-0.008, 0.008) for slot in range(8)):
@@ -262,8 +264,8 @@ def dipole_maps(gain, late=0.0, three=False):
             dimension=(0.012,) * 3, position=(0.04 * np.cos(angle), 0.04 * np.sin(angle), z),
             polarization=(1.3 * (1 + 0.01 * generator.standard_normal()), 0, 0), orientation=turn))
     maps = {}
-    parts = (("here", -0.04, 0.0, (1, 1, 1), 0.0), ("beside", -0.005, 0.1, (1, 1, 1), 0.0),
-             ("there", -0.005, 0.1, gain, late))
+    parts = (("here", starts[0], 0.0, here, 0.0), ("beside", starts[1], 0.1, (1, 1, 1), 0.0),
+             ("there", starts[1], 0.1, gain, late))
     for name, first, off, gains, step in parts if three else parts[::2]:
         angles = off + 2 * np.pi * np.arange(12) / 12
         points = np.array([[r * np.cos(a), r * np.sin(a), z] for z in first + 0.005 * np.arange(10)
@@ -300,6 +302,20 @@ def test_a_gain_of_one_component_of_one_map(gain, three):
     for axis in "xz":
         term = terms.get(f"gain of B{axis} relative to that of |B|, in all maps")
         assert term is None or abs(term.value) < 4 * term.sd
+
+
+@pytest.mark.parametrize("other", [1.01, 1.0])
+def test_one_gain_where_the_field_has_another_direction(other):
+    """One probe in the bore and at the end: what its gain is of |B| differs, and is no gain of one
+    map. The two maps of a dipole had it, and lay 0.7 mm off. Control: a gain of the other map.
+    """
+    maps = dipole_maps((1, 1, 1.01), here=(1, 1, other), starts=(-0.025, 0.01))
+    joined = join_maps(maps)
+    own = [term.name for term in joined.terms if "in there only" in term.name
+           or term.name == "gain of there relative to here"]
+    assert bool(own) == (other == 1.0), own
+    (pose,) = joined.poses
+    assert np.linalg.norm(pose.shift_m) < 1e-4
 
 
 def test_a_displaced_plane_and_a_mirror_beside_a_gain():
