@@ -43,7 +43,9 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.sentences import ABSOLUTE_ZERO_C
 
 ACROSS = 6
-"""Default number of cells across the radial thickness of a block."""
+"""Default number of cells across the radial thickness of a block, and least one along its other
+sides.
+"""
 
 SHARES = (0.0, 0.01)
 """Shares of the magnet's volume for which the limit temperature is reported."""
@@ -93,8 +95,8 @@ class DemagnetizationMap(ShownInNotebook):
         H along the magnetization; negative where H opposes the magnetization.
     margin : ndarray, shape (cells,), in A/m
         Margin between H and the knee; negative past the knee.
-    share_beyond_now : float
-        Share of the volume, from 0 to 1, that is past the knee at the material's temperature.
+    coarse_share : float
+        `share_beyond_now` by cells of about twice the length.
     """
 
     magnet: Magnet
@@ -102,11 +104,17 @@ class DemagnetizationMap(ShownInNotebook):
     blocks: tuple[MagnetBlock, ...]
     cells: Cells
     along: Floats
+    coarse_share: float
 
     @property
     def study(self) -> Study:
         """The study of the magnet."""
         return self.magnet.study
+
+    @property
+    def share_error(self) -> float:
+        """By how much `share_beyond_now` depends on the size of the cells."""
+        return abs(self.share_beyond_now - self.coarse_share)
 
     @property
     def margin(self) -> Floats:
@@ -219,7 +227,7 @@ def demagnetization_map(magnet: Magnet, session: Session,
     session : Session
     across : int
         Number of cells across the radial thickness of a block. In the other directions the cells
-        have about the same length.
+        have about the same length, but are no fewer: through a thin block H varies most.
 
     Raises
     ------
@@ -240,11 +248,14 @@ def demagnetization_map(magnet: Magnet, session: Session,
     warm = at_temperature(magnet, material)
     blocks = warm.blocks
     magnetized = [number for number, block in enumerate(blocks) if block.remanence]
-    cells = cut(blocks, magnetized, across)
-    field = _field_strength(warm, blocks, cells, session)
+    cells, coarse = cut(blocks, magnetized, across), cut(blocks, magnetized, max(1, across // 2))
+    number = np.append(cells.block, coarse.block)
+    field = _field_strength(
+        warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
-    return DemagnetizationMap(magnet, material, blocks, cells,
-                              np.einsum("nc,nc->n", field, easy[cells.block]))
+    along, rest = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
+    found = DemagnetizationMap(magnet, material, blocks, coarse, rest, np.nan)
+    return DemagnetizationMap(magnet, material, blocks, cells, along, found.share_beyond_now)
 
 
 def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
@@ -283,8 +294,9 @@ def _cut_block(block: MagnetBlock, across: int) -> Cut:
     """
     outline = block.outline
     if len(outline) == 4 and not (outline[0].arc or outline[2].arc):
-        return _cut_part(block, partial(places_in, outline), across)
-    return _joined([_cut_part(block, place, max(1, across // 2)) for place in corner_parts(block)])
+        return _cut_part(block, partial(places_in, outline), across, across)
+    return _joined([_cut_part(block, place, max(1, across // 2), across)
+                    for place in corner_parts(block)])
 
 
 def corner_parts(block: MagnetBlock) -> list[Callable[[Floats, Floats], Floats]]:
@@ -326,16 +338,19 @@ def corner_parts(block: MagnetBlock) -> list[Callable[[Floats, Floats], Floats]]
 
 
 def _cut_part(
-    block: MagnetBlock, place: Callable[[Floats, Floats], Floats], across: int
+    block: MagnetBlock, place: Callable[[Floats, Floats], Floats], across: int, fewest_high: int
 ) -> Cut:
-    """Return the cells of a part of a block, as `_cut_block`; ``place`` is like `places_in`."""
+    """Return the cells of a part of a block, as `_cut_block`; ``place`` is like `places_in`.
+
+    They are at least ``across`` in thickness and width, and ``fewest_high`` along z.
+    """
     half = np.array([0.5])
     (inner,), (outer,) = place(np.array([0.0, 1.0]), half)
     size = float(np.hypot(*(outer - inner))) / across
     start, stop = place(half, np.array([0.0, 1.0]))[0]
-    wide = _count(float(np.hypot(*(stop - start))), size)
+    wide = max(across, _count(float(np.hypot(*(stop - start))), size))
     infinite = np.isinf(block.z_max)
-    high = 0 if infinite else _count(block.z_max - block.z_min, size)
+    high = 0 if infinite else max(fewest_high, _count(block.z_max - block.z_min, size))
     z = np.zeros(1) if infinite else np.linspace(block.z_min, block.z_max, high + 1)
 
     def lattice(depth: Floats, width: Floats, height: Floats) -> Floats:
@@ -362,10 +377,9 @@ def _count(length: float, size: float) -> int:
 
 
 def _field_strength(
-    magnet: Magnet, blocks: Sequence[MagnetBlock], cells: Cells, session: Session
+    magnet: Magnet, blocks: Sequence[MagnetBlock], points: Floats, number: Ints, session: Session
 ) -> Floats:
-    """Return H (cells, 3) in A/m at the centres of the cells."""
-    points = cells.middles
+    """Return H (n, 3) in A/m at points (n, 3) in m inside the blocks of some numbers (n,)."""
     field = field_of(blocks, points)  # mu_0 H in vacuum
     reacting = magnet.with_(solver__method="reaction")
     if not magnet.is_vacuum and _by_moments(reacting):
@@ -381,7 +395,7 @@ def _field_strength(
             # In 2D the vector potential gives the reaction as the change of B, so that ``field`` is
             # mu_0 H_vacuum + (mu_0 mu_r H + B_r) - (mu_0 H_vacuum + B_r) = mu_0 mu_r H. The scalar
             # potential of 3D gives mu_0 H itself.
-            tensors = np.array([block.recoil_tensor for block in blocks])[cells.block]
+            tensors = np.array([block.recoil_tensor for block in blocks])[number]
             field = np.linalg.solve(tensors, field[..., None])[..., 0]
     return (field + external_field(magnet, points)) / MU_0
 

@@ -347,14 +347,14 @@ class MapCheck:
     @property
     def suffices(self) -> bool:
         """Whether the map has enough readings to tell, and near enough to each other."""
-        return self.redundancy >= ENOUGH and not self.is_too_coarse
+        return bool(self.redundancy >= ENOUGH and not self.is_too_coarse)
 
     @property
     def is_too_coarse(self) -> bool:
         """Whether a large residual changes sign from point to point, as of a field that varies more
         than the spacing shows.
         """
-        return self.structure < ALTERNATES and self.floor_rms_T > VIOLATED * self.size_T
+        return bool(self.structure < ALTERNATES and self.floor_rms_T > VIOLATED * self.size_T)
 
     @property
     def floor_rms_T(self) -> float:  # noqa: N802 - a unit

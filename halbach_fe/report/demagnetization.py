@@ -61,7 +61,7 @@ def demagnetization_summary(found: DemagnetizationMap) -> Plain:
         "least_margin_A_per_m": float(found.margin[worst]),
         "at_m": found.cells.middles[worst].tolist(), "block": block.name, "ring": block.ring,
         "slot": block.slot,
-        "share_beyond_knee": found.share_beyond_now,
+        "share_beyond_knee": found.share_beyond_now, "share_error": found.share_error,
         "limit_temperature_C": {share: limit if math.isfinite(limit) else None
                                 for share, limit in limits.items()},
         "cells": len(found.along),
@@ -126,8 +126,14 @@ def _past_the_knee(found: DemagnetizationMap) -> str:
     lost = found.share_beyond_now
     if not lost:
         return "no cell is past the knee of the demagnetization curve"
-    return (f"{100 * lost:.3g} % of the magnet's volume is past the knee of its demagnetization "
-            "curve and loses magnetization for good")
+    error = f" ± {_percent(found.share_error)}" if found.share_error else ""
+    return (f"{100 * lost:.3g}{error} % of the magnet's volume is past the knee of its "
+            "demagnetization curve and loses magnetization for good")
+
+
+def _percent(share: float) -> str:
+    """Return an error of a share in per cent."""
+    return f"{100 * share:.1g}"
 
 
 def _worst_block(found: DemagnetizationMap) -> str:
@@ -160,7 +166,9 @@ def _trust(found: DemagnetizationMap, state: _Losses) -> str:
         first = ("Yes, as far as coercivity and coefficients of the study are right: data sheets "
                  "state them within some per cent.")
     sentences = [first, "The very edges of blocks are worse than any cell (the option --across "
-                 "makes them smaller); shares of the volume hardly depend on that."]
+                 "makes them smaller)." + ("" if not found.share_error else
+                                           f" ± {_percent(found.share_error)} % is what cells of "
+                                           "twice the length change of the share of the volume.")]
     if is_nonlinear(found.study):
         sentences.append("At other temperatures the field of the iron is scaled with the "
                          "remanence.")
@@ -214,7 +222,7 @@ def page(found: DemagnetizationMap) -> Page:
             f"by {100 * material.coercivity_coefficient_per_K:g} % per kelvin (the remanence by "
             f"{100 * material.remanence_coefficient_per_K:g} %).",
             Text("H diverges logarithmically at the edges of blocks, so that the smallest margin "
-                 "falls slightly with smaller cells (--across); shares of the volume do not. Not "
+                 "falls slightly with smaller cells (--across); shares of the volume converge. Not "
                  "modelled: fields across the easy axis, which demagnetize less, and the field "
                  "change that the loss of one cell causes in others"
                  f"{_SCALED if is_nonlinear(found.study) else ''}.", "small"),

@@ -555,7 +555,7 @@ def test_a_component_alone_in_another_unit_is_named(generator, axes, named):
     assert ("multiply this column" in str(refusal.value)) == (len(axes) < 3)
 
 
-def test_a_map_that_is_too_coarse_cannot_tell(generator):
+def test_a_map_that_is_too_coarse_cannot_tell(generator, tmp_path):
     """A multipole of order 9 at 16 angles: the field obeys, but its neighbours do not show it.
 
     That a map with a curl is refused whatever it is, `test_what_no_magnet_makes_is_not_fitted`
@@ -570,6 +570,10 @@ def test_a_map_that_is_too_coarse_cannot_tell(generator):
     assert not check.suffices
     assert "cannot tell: with a spacing of 11.7 mm" in verdict(check)
     assert not answer(check).sound
+    for name, rows in (("coarse", slice(None)), ("few", slice(None, None, 2))):
+        write_map(field_map(points[rows], field[rows]), tmp_path / f"{name}.csv")
+        main(["check", str(tmp_path / f"{name}.csv"), "-o", str(tmp_path / name)])
+        assert json.loads((tmp_path / name / "check.json").read_text())["suffices"] is False
 
 
 def test_command(generator, tmp_path, capsys):

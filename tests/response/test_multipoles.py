@@ -8,11 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from halbach_fe import api
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.multipoles import answer
 from halbach_fe.response import multipoles
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.multipoles import (
@@ -164,6 +166,35 @@ def test_blocks_without_symmetry_integrated_along_all_z(session, table):
     assert 0 < known.error.max() < 1e-6  # units: it is stated, and what the quadrature leaves
     _, short = summed([*steps, magnet.field_reach])
     assert np.abs(short - truth).max() > 1
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_quadrupole_of_free_blocks_whose_order_was_forgotten(session, order):
+    """Its order 2 has the bar that it has where the order is stated, not that of a quotient by a
+    dipole that is not there; the advice is to state it. The circle is about its middle.
+    """
+    angle = 2 * np.pi * np.arange(8) / 8
+    magnet = magnet_of_blocks({
+        "shape": ["cuboid"] * 8, "x_m": 0.06 * np.cos(angle), "y_m": 0.06 * np.sin(angle),
+        "z_m": [0.7] * 8, "size_x_m": [0.02] * 8, "size_y_m": [0.02] * 8, "size_z_m": [0.04] * 8,
+        "rotation_z_deg": np.degrees(3 * angle) % 360,
+        "remanence_T": 1.3 + 1e-3 * np.arange(8)}, order=order)
+    found = api.multipoles(magnet, session, MultipoleReference(0.02))
+    said = answer(found.tables, None)
+    stated = api.multipoles(magnet.with_(array__multipole_order=2), session,
+                            MultipoleReference(0.02))
+    for (model, magnets), (right, others) in zip(found.tables, stated.tables, strict=True):
+        known, quadrupole = magnets["prior"], others["prior"]
+        assert model.z == right.z in (None, 0.7)
+        if order == 1:
+            normal, skew = known.absolute.mean.reshape(2, -1)[:, 0]
+            size = np.hypot(normal, skew)
+            along = np.array([normal, skew]) / size @ known.absolute.root.reshape(2, 9, -1)[:, 0]
+            assert size == pytest.approx(1e3 * quadrupole.main, rel=1e-9)
+            assert np.linalg.norm(along) == pytest.approx(1e3 * quadrupole.main_sd, rel=0.01)
+            by_quotient = 1e3 * known.main / UNITS * known.sd[0]  # the control
+            assert by_quotient > 10 * np.linalg.norm(along)
+    assert ("multipole_order = 2 below [array]" in said.step) == (order == 1)
 
 
 def test_the_integral_of_external_fields(session):
