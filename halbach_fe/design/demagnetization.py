@@ -254,8 +254,8 @@ def demagnetization_map(magnet: Magnet, session: Session,
         warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
     along, rest = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
-    found = DemagnetizationMap(magnet, material, blocks, coarse, rest, np.nan)
-    return DemagnetizationMap(magnet, material, blocks, cells, along, found.share_beyond_now)
+    by_coarse = DemagnetizationMap(magnet, material, blocks, coarse, rest, np.nan)
+    return DemagnetizationMap(magnet, material, blocks, cells, along, by_coarse.share_beyond_now)
 
 
 def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
