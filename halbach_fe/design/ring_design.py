@@ -182,7 +182,9 @@ def design_rings(
         moved = _judged(catalogue, region, moved_radii(
             catalogue, best.rings, reaction @ direction, task), reaction)
         best = moved if not reached else _least([moved, best], design.objective)
-    result = designed(study, tables_of(study, catalogue.z_m, best.rings))
+    # what is asked of the study next, such as its tolerances, is asked of the same region
+    result = designed(study, tables_of(study, catalogue.z_m, best.rings)).with_(
+        homogeneity=region.table)
     return Designed(result, region, best, _not_beaten([best, *judged], design.objective),
                     reached, _slices(result, region, session))
 

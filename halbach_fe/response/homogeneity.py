@@ -166,6 +166,16 @@ class Region:
         return None if sphere_m is None else cls.sphere(sphere_m, centre)
 
     @property
+    def table(self) -> dict[str, float | Sequence[float]]:
+        """The keys of [homogeneity] that state the region; the inverse of `of`."""
+        radius, other, height = self.half_axes_m
+        sizes: dict[str, dict[str, float | Sequence[float]]] = {
+            "sphere": {"sphere_m": radius},
+            "ellipsoid": {"ellipsoid_m": (radius, other, height)},
+            "cylinder": {"cylinder_m": (radius, 2 * height)}}
+        return sizes[self.shape] | {"centre_m": self.centre_m}
+
+    @property
     def text(self) -> str:
         """The region in words, in mm."""
         x, y, z = (1e3 * value for value in self.half_axes_m)

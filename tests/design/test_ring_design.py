@@ -23,6 +23,7 @@ from halbach_fe.report.ring_design import STUDY_FILE, answer
 from halbach_fe.response.homogeneity import PPM, Region
 from halbach_fe.solver.session import Session
 from halbach_fe.study.array import Ring
+from halbach_fe.study.design import HomogeneityRegion
 from halbach_fe.study.reader import parse_study, read_study
 
 REGION = Region.sphere(0.025)
@@ -275,16 +276,24 @@ def test_command_line(tmp_path):
     path.write_text(tomlkit.dumps(study(rings=4).model_dump(
         mode="json", exclude_defaults=True)), encoding="utf-8")
     output = tmp_path / "results"
-    assert main(["design", str(path), "-o", str(output), "--sphere-m", "0.025"]) == 0
+    assert main(["design", str(path), "-o", str(output), "--cylinder-m", "0.02", "0.05"]) == 0
     summary = json.loads((output / "design.json").read_text(encoding="utf-8"))
     again = read_study(output / STUDY_FILE)
     assert len(build_magnet(again).blocks) == summary["best"]["blocks"]
-    assert main(["homogeneity", str(output / STUDY_FILE), "-o", str(tmp_path / "h"), "--sphere-m",
-                 "0.025"]) == 0
+    # as advised: of the region that was asked for, which the study states now
+    assert main(["homogeneity", str(output / STUDY_FILE), "-o", str(tmp_path / "h")]) == 0
     known = json.loads((tmp_path / "h" / "homogeneity.json").read_text(encoding="utf-8"))
     # the search has the points of more angles, 7.5 degrees apart, besides
     assert known["prior"]["peak_to_peak_ppm"] == pytest.approx(
         summary["best"]["peak_to_peak_ppm"], rel=2e-3)
+
+
+@pytest.mark.parametrize("region", [
+    Region.sphere(0.01, (0.0, 0.0, 0.02)), Region("ellipsoid", (0.01, 0.02, 0.03)),
+    Region("cylinder", (0.01, 0.01, 0.03))])
+def test_a_region_is_stated_as_it_is_read(region):
+    table = HomogeneityRegion(**region.table)
+    assert Region.of(table.sphere_m, table.ellipsoid_m, table.cylinder_m, table.centre_m) == region
 
 
 def test_pages(designed, tmp_path):
