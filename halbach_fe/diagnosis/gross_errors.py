@@ -255,32 +255,43 @@ class _Search:
         if before.relative < min_misfit_of_wrong_unit:
             self.lengths = self.flux_densities = (1.0,)
         combined = before.relative > min_misfit_of_several_errors
-        without_error = self.with_a_wrong_block(MapConvention())
-        for level in range(1, MAX_ERRORS + 1 if combined else 2):
+        good = next(filter(None, self.explaining(before, MAX_ERRORS if combined else 1)), None)
+        if good is None or self.is_a_wrong_block(before, good):
+            return None
+        equivalent = _best(good)
+        if self.table and len(equivalent) > 1:
+            equivalent = _best([
+                (self.misfit(each, measured_blocks=True), each) for _, each in equivalent])
+        (_, convention), *others = sorted(
+            equivalent, key=lambda trial: (rank(trial[1]), trial[0].standard))
+        if _small(convention):
+            return None
+        after = self.misfit(convention)
+        return GrossError(
+            convention, self.distinct(convention, [each for _, each in others]),
+            before.relative, after.relative,
+            factor=self.factor_as_good(after) if convention.is_only_elsewhere else None)
+
+    def explaining(
+        self, before: _Misfit, most_errors: int
+    ) -> Iterator[list[tuple[_Misfit, MapConvention]]]:
+        """Yield the conventions that explain the map, with their misfits: of ever more errors, and
+        of as many those with points at other positions last.
+        """
+        for level in range(1, most_errors + 1):
             for conventions in (self.conventions(level), self.elsewhere(level)):
                 tried = [(self.misfit(each), each) for each in conventions]
-                good = [trial for trial in tried if self.explains(before, *trial)]
-                good = good or self.beside_a_wrong_block(before, tried)
-                if good:
-                    break
-            if good:
-                if self.explains(before, without_error, MapConvention()) and (
-                        without_error.standard <= INDISTINGUISHABLE_MISFIT_RATIO * min(
-                            misfit.standard for misfit, _ in good)):
-                    return None  # a single block is the simpler cause
-                equivalent = _best(good)
-                if self.table and len(equivalent) > 1:
-                    equivalent = _best([
-                        (self.misfit(each, measured_blocks=True), each) for _, each in equivalent])
-                (_, convention), *others = sorted(
-                    equivalent, key=lambda trial: (rank(trial[1]), trial[0].standard))
-                if _small(convention):
-                    return None
-                return GrossError(convention, self.distinct(convention, [
-                    each for _, each in others]), before.relative,
-                    (after := self.misfit(convention)).relative,
-                    factor=self.factor_as_good(after) if convention.is_only_elsewhere else None)
-        return None
+                yield [trial for trial in tried if self.explains(before, *trial)] or (
+                    self.beside_a_wrong_block(before, tried))
+
+    def is_a_wrong_block(
+        self, before: _Misfit, good: Sequence[tuple[_Misfit, MapConvention]]
+    ) -> bool:
+        """Tell whether a single block, the simpler cause, explains the map as well."""
+        alone = self.with_a_wrong_block(MapConvention())
+        return self.explains(before, alone, MapConvention()) and (
+            alone.standard <= INDISTINGUISHABLE_MISFIT_RATIO * min(
+                misfit.standard for misfit, _ in good))
 
     def factor_as_good(self, after: _Misfit) -> float | None:
         """Return the factor of all readings that explains the map as well as a correction does

@@ -17,7 +17,6 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet, build_magnet
-from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.readings import unit_vectors
 from halbach_fe.measurement.instrument import (
     nonlinear_part,
@@ -83,11 +82,6 @@ class NominalFields:
     def blocks(self) -> tuple[MagnetBlock, ...]:
         """The blocks of the study's magnet."""
         return self.magnet.blocks
-
-    @cached_property
-    def intact_blocks(self) -> tuple[MagnetBlock, ...]:
-        """The blocks as they were meant, see `as_meant`."""
-        return as_meant(self.magnet).blocks
 
     @cached_property
     def unit_fields(self) -> Floats:
@@ -178,7 +172,7 @@ class NominalFields:
     @cached_property
     def gradient_fields(self) -> Floats:
         """Change of B per unit of each block's magnetization gradient, (blocks, n, 3) in T."""
-        uneven = [replace(block, gradient=1.0) if len(block.outline) == 4 else block
+        uneven = [replace(block, gradient=block.gradient + 1) if len(block.outline) == 4 else block
                   for block in self.blocks]
         return np.asarray(self.fields_of(uneven) - self.block_fields)
 

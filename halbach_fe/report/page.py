@@ -228,9 +228,12 @@ def page_of(result: object) -> Page:
 
 
 def csv_file(
-    columns: Mapping[str, Iterable[object]], attributes: Mapping[str, str]
+    columns: Mapping[str, Any], attributes: Mapping[str, str]
 ) -> Callable[[Path], None]:
-    """Return how a table is written, for `Page.files`; ``attributes`` are comments at its top."""
+    """Return how a table is written, for `Page.files`; ``attributes`` are comments at its top.
+
+    Columns are of equal length, and of any kind: lists, tuples, arrays.
+    """
     def write(path: Path) -> None:
         with atomic(path) as temporary:
             write_csv(columns, attributes, temporary)
@@ -635,7 +638,7 @@ def write_report(result: object, folder: str | Path) -> Path:
     Parameters
     ----------
     result : Solution, InferenceResult, Diagnosis, Verification, MultipoleTables, \
-HomogeneityResult, Forces, MeasurementPlan, FilledTray, Shim, SortedBlocks, Assembly, \
+HomogeneityResult, Forces, MeasurementPlan, Designed, FilledTray, Shim, SortedBlocks, Assembly, \
 Tolerance, HomogeneityTolerance, DemagnetizationMap or SimulatedCampaign
         The result of a function of `halbach_fe`.
     folder : str or Path

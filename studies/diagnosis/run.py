@@ -453,13 +453,10 @@ def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
         places = [(given.get(f"{other}ring"), given.get(f"{other}slot"))
                   for other in ("", "other_")]
         found[effect] = [names[place] for place in places if place in names]
-        if not found[effect] and effect in RINGS:
+        if "ring" in given and not given.keys() & {"slot", "slots", "other_ring"}:  # a ring alone
             found[effect] = [f"r{given['ring']:02.0f}"]
     return found
 
-
-RINGS = ("ring_twisted", "ring_shifted", "ring_shifted_along", "ring_tilted", "ring_demagnetized")
-"""Effects whose place in the catalogue is a ring."""
 
 LIKE_HIDDEN = (
     "gain", "offset", "misalignment", "mapper", "z_scale", "radius_scale", "arm_sag",

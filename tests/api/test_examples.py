@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import inspect
@@ -170,6 +171,23 @@ def test_every_result_has_a_command():
     shown = {name for name in hf.__all__ if isinstance(kind := getattr(hf, name), type)
              and issubclass(kind, ShownInNotebook)}
     assert set(PAGES) == shown - {"Magnet"}  # which has a picture instead
+    results = re.search(r"result : (.*?)\n {8}", hf.write_report.__doc__, re.S)[1]
+    assert set(re.findall(r"[A-Z]\w+", results)) == set(PAGES)
+
+
+def test_every_result_and_function_is_known_to_type_checkers():
+    """They read imports, which are not run; the control is one import less."""
+    source = inspect.getsource(hf)
+    assert checked_names(source) == set(hf.__all__)
+    less = source.replace("    from halbach_fe.api import sort as sort\n", "")
+    assert checked_names(less) == set(hf.__all__) - {"sort"}
+
+
+def checked_names(source):
+    """Names that the imports for type checkers give to a module."""
+    names = (alias.asname for part in ast.parse(source).body if isinstance(part, ast.If)
+             for line in part.body if isinstance(line, ast.ImportFrom) for alias in line.names)
+    return set(filter(None, names))
 
 
 RESULT, TABLE = object.__new__(hf.InferenceResult), object.__new__(hf.BlockTable)

@@ -18,7 +18,7 @@ import numpy as np
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
@@ -288,6 +288,39 @@ class Effect(ABC):
         return values, sd
 
 
+class MagnetizationEffect(Effect):
+    """An effect by which magnetizations are larger or smaller by fractions of what they were."""
+
+    @abstractmethod
+    def rates(self, magnet: Magnet, place: Place) -> Mapping[int, Sequence[float]]:
+        """Return the relative changes (k,) of magnetizations per unit of each of the k parameters,
+        by the blocks' numbers from 0.
+        """
+
+    def magnetization_change(
+        self, nominal: NominalFields, place: Place
+    ) -> Mapping[int, Floats] | None:
+        return None if len(self.parameters) > 1 else {
+            number: rate * nominal.magnetizations[number]
+            for number, (rate,) in self.rates(nominal.magnet, place).items()}
+
+    def signature(self, nominal: NominalFields, place: Place) -> Floats:
+        return self.derivative(nominal, place, [0.0] * len(self.parameters))
+
+    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.derivative`: per unit of the magnetizations without the effect."""
+        rates = self.rates(nominal.magnet, place)
+        weights = [np.divide(rate, one_and(np.dot(rate, values))) for rate in rates.values()]
+        return np.einsum("bk,bnc->knc", weights, nominal.block_fields[list(rates)])
+
+    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
+        magnet = build_magnet(study)
+        return with_exceptions(study, [
+            BlockException(**where, magnetization_factor=factor) for where, factor in together(
+                magnet.blocks, {number: one_and(np.dot(rate, values))
+                                for number, rate in self.rates(magnet, place).items()})])
+
+
 class InstrumentEffect(Effect):
     """An effect of the mapper, which changes the study's instrument."""
 
@@ -318,6 +351,29 @@ def added(values: Sequence[float], change: Sequence[float]) -> tuple[float, ...]
     return tuple(float(value) + float(more) for value, more in zip(values, change, strict=True))
 
 
+def one_and(fraction: float) -> float:
+    """Return 1 + fraction, or 1e-9 in place of 0: a derivative is divided by this factor."""
+    return 1 + float(fraction) or 1e-9
+
+
+def together(
+    blocks: Sequence[MagnetBlock], values: Mapping[int, float]
+) -> list[tuple[dict[str, int], float]]:
+    """Return ring and slot of block exceptions, and what each says, for values by the blocks'
+    numbers: one exception for all blocks, rings or slots if these are alike.
+    """
+    for of in ((), ("ring",), ("slot",)) if len(values) > 1 else ():
+        groups: dict[tuple[int, ...], set[float | None]] = {}
+        for number, block in enumerate(blocks):
+            key = tuple(getattr(block, name) for name in of)
+            groups.setdefault(key, set()).add(values.get(number))
+        if all(len(group) == 1 for group in groups.values()):
+            return [(dict(zip(of, key, strict=True)), value)
+                    for key, (value,) in groups.items() if value is not None]
+    return [({"ring": blocks[number].ring, "slot": blocks[number].slot}, value)
+            for number, value in values.items()]
+
+
 def with_exceptions(study: Study, exceptions: Sequence[BlockException]) -> Study:
     """Return the study with further block exceptions after those it has."""
     array = study.array.with_(exceptions=(*study.array.exceptions, *exceptions))
@@ -329,11 +385,11 @@ def with_array(study: Study, **keys: Any) -> Study:
     return study.with_(array=study.array.with_(**keys))
 
 
-def blocks_at(nominal: NominalFields, place: Place) -> list[int]:
+def blocks_at(magnet: Magnet, place: Place) -> list[int]:
     """Return the numbers of the blocks at a place, counted from 0."""
     if place.ring and place.slot:
-        return [nominal.magnet.number_of(place.ring, place.slot)]
-    return [number for number, block in enumerate(nominal.blocks)
+        return [magnet.number_of(place.ring, place.slot)]
+    return [number for number, block in enumerate(magnet.blocks)
             if place.ring in (0, block.ring) and place.slot in (0, block.slot)]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.diagnosis.effects.base import (
     Effect,
+    MagnetizationEffect,
     Parameter,
     Place,
     blocks_at,
     can_be_uneven,
-    changed,
     each_block,
     each_ring,
     place_of,
@@ -46,7 +47,7 @@ class BlockMissingEffect(Effect):
     def magnetization_change(
         self, nominal: NominalFields, place: Place
     ) -> Mapping[int, Floats] | None:
-        (block,) = blocks_at(nominal, place)
+        (block,) = blocks_at(nominal.magnet, place)
         return {block: (self.factor - 1) * nominal.magnetizations[block]}
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
@@ -62,7 +63,7 @@ class BlockFlippedEffect(BlockMissingEffect):
     factor = -1.0
 
 
-class BlockDemagnetizedEffect(Effect):
+class BlockDemagnetizedEffect(MagnetizationEffect):
     """One block has lost a fraction of its magnetization.
 
     The prior standard deviation is far larger than a block's own tolerance, which belongs to the
@@ -76,29 +77,8 @@ class BlockDemagnetizedEffect(Effect):
     def places(self, study: Study) -> Sequence[Place]:
         return each_block(study)
 
-    def magnetization_change(
-        self, nominal: NominalFields, place: Place
-    ) -> Mapping[int, Floats] | None:
-        return {number: -nominal.magnetizations[number] for number in blocks_at(nominal, place)}
-
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        return -nominal.block_fields[blocks_at(nominal, place)].sum(axis=0)[None]
-
-    def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
-        """See `Effect.derivative`: the loss is relative to the block without it, which may be
-        reversed by another effect.
-        """
-        left = 1.0 - values[0]
-        if left:
-            return self.signature(nominal, place) / left
-        return -np.sum([nominal.intact_blocks[number].remanence * (
-            nominal.unit_fields[number] @ np.array(nominal.blocks[number].easy_axis))
-            for number in blocks_at(nominal, place)], axis=0)[None]
-
-    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        return with_exceptions(study, [BlockException(
-            ring=place.ring, slot=place.slot or None,
-            magnetization_factor=1.0 - float(values[0]))])
+    def rates(self, magnet: Magnet, place: Place) -> Mapping[int, Sequence[float]]:
+        return dict.fromkeys(blocks_at(magnet, place), (-1.0,))
 
 
 class RingDemagnetizedEffect(BlockDemagnetizedEffect):
@@ -134,7 +114,7 @@ class MagnetizationGradientEffect(Effect):
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
         per_unit = nominal.gradient_fields
-        return np.asarray(per_unit[blocks_at(nominal, place)].sum(axis=0))[None]
+        return np.asarray(per_unit[blocks_at(nominal.magnet, place)].sum(axis=0))[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         return with_exceptions(study, [BlockException(
@@ -156,7 +136,8 @@ class CornersDemagnetizedEffect(Effect):
         return [Place()] if all(map(can_be_uneven, build_magnet(study).blocks)) else []
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        return changed(nominal, self.apply(nominal.study, place, [0.5]))[None] / 0.5
+        lost = [replace(block, corner_loss=block.corner_loss + 1) for block in nominal.blocks]
+        return (nominal.fields_of(lost) - nominal.block_fields).sum(axis=0)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         # the last exception that applies to all blocks sets the loss the study has already

@@ -88,11 +88,6 @@ def _plus_alike(key: str) -> Change:
         key: [entry + values[0] for entry in getattr(instrument, key)]}
 
 
-def _longer_arm(instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
-    """Lengthen the arm, by a factor of what it is already."""
-    return {"radius_scale": (1 + instrument.radius_scale) * (1 + values[0]) - 1}
-
-
 def _turned(axis: int) -> Change:
     """Return the change that turns the mapper about the magnet's centre, with its sensors."""
     def change(instrument: Instrument, values: Sequence[float]) -> Mapping[str, Any]:
@@ -139,7 +134,8 @@ EFFECTS = (
     # moves the points of a circle along its radius alone, a displaced mapper also along the angle
     _row("eccentric_circle", "eccentric circles", "x y", "m", 1e-3, _plus("eccentricity_m")),
     _row("z_scale", "scale of the mapper along z", "scale", "1", 5e-4, _plus("z_scale")),
-    _row("radius_scale", "length of the mapper's arm", "scale", "1", 5e-3, _longer_arm),
+    _row("radius_scale", "length of the mapper's arm", "scale", "1", 5e-3,
+         _plus("radius_scale")),
     # towards -y, with the square of the distance from the end at the smallest z
     _row("arm_sag", "sag of the mapper's arm", "sag", "m", 5e-4, _plus("arm_sag_m")),
     # in lines that all go one way a lag is a shift of the map

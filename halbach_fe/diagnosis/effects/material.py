@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.effects.base import (
     Effect,
+    MagnetizationEffect,
     Parameter,
     Place,
     with_array,
@@ -96,22 +97,18 @@ def coefficient(study: Study) -> float:
     return study.prior.temperature_coefficient_per_K or TYPICAL_COEFFICIENT_PER_K
 
 
-class TemperatureEffect(Effect):
+class TemperatureEffect(MagnetizationEffect):
     """The temperature of the whole magnet differs, which scales all magnetizations alike."""
 
     name = "temperature"
     title = "temperature of the magnet"
     parameters = (Parameter("difference", "K", 10.0),)
 
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        return coefficient(nominal.study) * nominal.block_fields.sum(axis=0)[None]
-
-    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        return with_exceptions(study, [BlockException(
-            magnetization_factor=1.0 + coefficient(study) * float(values[0]))])
+    def rates(self, magnet: Magnet, place: Place) -> Mapping[int, Sequence[float]]:
+        return dict.fromkeys(range(len(magnet.blocks)), (coefficient(magnet.study),))
 
 
-class TemperatureGradientEffect(Effect):
+class TemperatureGradientEffect(MagnetizationEffect):
     """The temperature varies linearly across the magnet.
 
     The parameters are the differences between the axis and the outer radius, along x and y.
@@ -121,21 +118,10 @@ class TemperatureGradientEffect(Effect):
     title = "temperature gradient across the magnet"
     parameters = (Parameter("x", "K", 3.0), Parameter("y", "K", 3.0),)
 
-    def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        centres = np.array([block.middle[:2] for block in nominal.blocks])
-        weights = coefficient(nominal.study) * centres / _outer_radius(nominal.magnet)
-        return np.einsum("bk,bnc->knc", weights, nominal.block_fields)
-
-    def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        magnet, exceptions = build_magnet(study), []
-        blocks, radius = magnet.blocks, _outer_radius(magnet)
-        uniform = study.array.is_uniform  # then one exception serves a slot of all rings
-        for block in blocks[:study.array.blocks_per_ring] if uniform else blocks:
-            middle = block.middle[:2] / radius
-            exceptions.append(BlockException(
-                ring=None if uniform else block.ring, slot=block.slot, magnetization_factor=float(
-                    1.0 + coefficient(study) * (middle @ np.asarray(values)))))
-        return with_exceptions(study, exceptions)
+    def rates(self, magnet: Magnet, place: Place) -> Mapping[int, Sequence[float]]:
+        per_m = coefficient(magnet.study) / _outer_radius(magnet)
+        return {number: (per_m * block.middle[:2]).tolist()
+                for number, block in enumerate(magnet.blocks)}
 
 
 def _outer_radius(magnet: Magnet) -> float:

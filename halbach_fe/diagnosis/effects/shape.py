@@ -23,6 +23,7 @@ from halbach_fe.diagnosis.effects.base import (
     changed,
     each_block,
     each_ring,
+    together,
     with_array,
     with_exceptions,
     with_remanence,
@@ -105,7 +106,7 @@ class MoveRow(Effect):
         return places[::max(1, len(places) // self.few)] if self.few else places
 
     def signature(self, nominal: NominalFields, place: Place) -> Floats:
-        moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal, place)
+        moving = range(len(nominal.blocks)) if self.moves_all else blocks_at(nominal.magnet, place)
         return np.sum([self.by_block(nominal, place, number) for number in moving], axis=0)
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
@@ -152,11 +153,10 @@ def _oval(angle_deg: float) -> tuple[float, float]:
 
 def _ovals_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of the blocks of oval rings, by slots if the rings are equal."""
-    alike = study.array.is_uniform
-    return [BlockException(
-        ring=None if alike else block.ring, slot=block.slot,
-        displacement_m=(float(np.dot(values, _oval(block.angle_deg))), 0.0, 0.0))
-        for block in build_magnet(study).blocks if block.ring == 1 or not alike]
+    blocks = build_magnet(study).blocks
+    return [BlockException(**where, displacement_m=(float(np.dot(values, _oval(angle))), 0.0, 0.0))
+            for where, angle in together(blocks, {
+                number: block.angle_deg for number, block in enumerate(blocks)})]
 
 
 def _own_axes(nominal: NominalFields, number: int) -> Floats:
@@ -270,14 +270,10 @@ def _half(nominal: NominalFields, place: Place, number: int) -> list[Floats]:
 
 def _halves_of(study: Study, place: Place, values: Sequence[float]) -> list[BlockException]:
     """Return the displacements of both halves, by slots if these are the same in all rings."""
-    shift = np.array(values) @ _in_plane(place.at_m[0])
-    sides: dict[int, dict[int, float]] = {}
-    for block in build_magnet(study).blocks:
-        sides.setdefault(block.slot, {})[block.ring] = _side(block.middle, place)
-    return [BlockException(ring=ring, slot=slot, shift_m=tuple((side * shift).tolist()))
-            for slot, rings in sides.items()
-            for ring, side in (rings.items() if len(set(rings.values())) > 1
-                               else [(None, next(iter(rings.values())))])]
+    shift, blocks = np.array(values) @ _in_plane(place.at_m[0]), build_magnet(study).blocks
+    sides = {number: _side(block.middle, place) for number, block in enumerate(blocks)}
+    return [BlockException(**where, shift_m=tuple((side * shift).tolist()))
+            for where, side in together(blocks, sides)]
 
 
 BLOCK_DISPLACED = MoveRow(

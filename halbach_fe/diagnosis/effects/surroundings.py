@@ -9,7 +9,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import StudyError, must_be
-from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, added
+from halbach_fe.diagnosis.effects.base import Effect, Parameter, Place, added, one_and
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.coil_field import coil_field
@@ -321,7 +321,7 @@ class CoilCurrentEffect(Effect):
     def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.derivative`: per unit of the current that the study says, not of its own."""
         return self._change(
-            nominal, place, _coil(nominal.study, place).current_A / _factor(values[0]))
+            nominal, place, _coil(nominal.study, place).current_A / one_and(values[0]))
 
     def _change(self, nominal: NominalFields, place: Place, more_A: float) -> Floats:
         """Return the change of B (1, n, 3) in T for more current, with that of what answers it."""
@@ -332,7 +332,7 @@ class CoilCurrentEffect(Effect):
         return ((more - nominal.finite_element_field) / SHARE)[None]
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
-        return _with_coil(study, place, _factor(values[0]) * _coil(study, place).current_A)
+        return _with_coil(study, place, one_and(values[0]) * _coil(study, place).current_A)
 
 
 def _coil(study: Study, place: Place) -> AnyCoil:
@@ -345,11 +345,6 @@ def _with_coil(study: Study, place: Place, current_A: float) -> Study:
     coils = list(study.external.coils)
     coils[place.slot - 1] = _coil(study, place).with_(current_A=current_A)
     return study.with_(external__coils=tuple(coils))
-
-
-def _factor(fraction: float) -> float:
-    """Return 1 + fraction, or 1e-9 in place of 0: a derivative is divided by this factor."""
-    return 1 + float(fraction) or 1e-9
 
 
 class IronPermeabilityEffect(Effect):
@@ -378,7 +373,7 @@ class IronPermeabilityEffect(Effect):
 
     def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
         """See `Effect.derivative`: per unit of the permeability that the study says."""
-        return self.signature(nominal, place) / _factor(values[0])
+        return self.signature(nominal, place) / one_and(values[0])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         key = "iron" if study.iron_ring is None else "iron_ring"
@@ -449,7 +444,7 @@ class IronDisplacedEffect(Effect):
 def _more_permeable(material: Any, fraction: float) -> Any:
     """Return iron of a permeability that is larger by a fraction, but at least 1."""
     return material.with_(relative_permeability=max(
-        1.0, _factor(fraction) * material.relative_permeability))
+        1.0, one_and(fraction) * material.relative_permeability))
 
 
 EFFECTS = (BackgroundEffect(), NeighbourMagnetEffect(), FerromagneticObjectEffect(),
