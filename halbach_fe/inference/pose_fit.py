@@ -12,7 +12,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -320,10 +320,10 @@ class PoseFit:
         start, values = pose, np.zeros(len(self.prior_sd()))
         rows = self.training.ravel()
         if self._few is not None:  # a few readings lead near the end in less time
-            near, changed = self._few._come_to_rest(start, pose, values, pace)[:2]
-            if self.is_possible(changed, near):
-                pose, values = near, changed
-        pose, values, state, columns, at_rest = self._come_to_rest(start, pose, values, pace)
+            near, _ = self._few._come_to_rest(start, pose, values, pace)
+            if self.is_possible(near.values, near.pose):
+                pose, values = near.pose, near.values
+        (pose, values, state, columns), at_rest = self._come_to_rest(start, pose, values, pace)
         scaled = self.scaled(pose, values, start)
         sd = state.step(rows, scaled)[1]
         updated, log_evidence, mean, covariance = state.updated(rows, scaled)
@@ -361,68 +361,87 @@ class PoseFit:
 
     def _come_to_rest(
         self, start: Floats, pose: Floats, values: Floats, pace: Pace | None
-    ) -> tuple[Floats, Floats, _State, _BlockColumns, bool]:
-        """Return where least squares leads from a pose (6,) and other parameters.
+    ) -> tuple[_Place, bool]:
+        """Return where least squares leads from a pose (6,) and other parameters, and whether the
+        fit is at rest there.
 
-        With both come the state and the columns there, and whether the fit is at rest. ``start``
-        (6,) is the pose about which the prior is, see `scaled`.
+        ``start`` (6,) is the pose about which the prior is, see `scaled`.
         """
-        prior_sd = self.prior_sd()
-        rows = self.training.ravel()
         self.derivatives.clear()  # those of another pose belong to other places
-        columns = self._columns(pose, values)
-        state = self._state(pose, values, columns)
+        place, at_rest = self._at(pose, values), False
         if not self.is_part:
-            self._check_effects(state)
-        for blurred in self._blur(state):
-            sigma = np.hypot(state.sigma, blurred) if self.on_a_line else None
-            at_rest, renewed = False, False
+            self._check_effects(place.state)
+        for blurred in self._blur(place.state):
+            place, at_rest = self._settled(place, start, blurred, pace)
+        return place, at_rest
 
-            def reach(state: _State, blurred: float = blurred) -> float:
-                """Return how far in m the block columns hold; on a line only the noise counts."""
-                return state.reach * (
-                    NEAR * blurred / self.smallest_sigma if self.on_a_line else 1.0)
+    def _at(self, pose: Floats, values: Floats) -> _Place:
+        """Return a pose (6,) and other parameters with the state and the columns there."""
+        columns = self._columns(pose, values)
+        return _Place(pose, values, self._state(pose, values, columns), columns)
 
-            for number in range(ITERATIONS):
-                if pace is not None:
-                    pace.advance(number, ITERATIONS)
-                # noise of positions grows with the gradient, and a fit would look for one: so it
-                # is held, on a line always, and elsewhere while a step is tried
-                held = state.sigma if sigma is None else sigma
-                state = state.with_noise(held)
-                step, sd, chi2 = state.step(rows, self.scaled(pose, values, start), self._damping)
-                if float(np.abs(step / sd).max()) < AT_REST:
+    def _settled(
+        self, place: _Place, start: Floats, blurred: float, pace: Pace | None
+    ) -> tuple[_Place, bool]:
+        """Return where steps of Gauss and Newton lead, and whether the fit is at rest there.
+
+        ``blurred`` is noise in T beside that of the readings, see `_blur`.
+        """
+        rows = self.training.ravel()
+        longest = LONGEST_SD * self.prior_sd()[PROBE:]
+        sigma = np.hypot(place.state.sigma, blurred) if self.on_a_line else None
+        at_rest, renewed = False, False  # renewed: the derivatives are those of this very place
+        for number in range(ITERATIONS):
+            if pace is not None:
+                pace.advance(number, ITERATIONS)
+            # noise of positions grows with the gradient, and a fit would look for one: so it is
+            # held, on a line always, and elsewhere while a step is tried
+            held = place.state.sigma if sigma is None else sigma
+            place = place._replace(state=place.state.with_noise(held))
+            step, sd, chi2 = place.state.step(
+                rows, self.scaled(place.pose, place.values, start), self._damping)
+            if float(np.abs(step / sd).max()) < AT_REST:
+                at_rest = True
+                break
+            step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
+            # on a line only the noise decides how far the block columns hold
+            reach = 0.0 if renewed else place.state.reach * (
+                NEAR * blurred / self.smallest_sigma if self.on_a_line else 1.0)
+            better = self._better(place, step, held, start, chi2, reach)
+            if better is not None:
+                (place, now), renewed = better, False
+                if chi2 - now < chi2 * (NO_BETTER_ON_A_LINE if self.on_a_line else NO_BETTER):
                     at_rest = True
                     break
-                longest = LONGEST_SD * prior_sd[PROBE:]
-                step[6 + PROBE:] = np.clip(step[6 + PROBE:], -longest, longest)
-                share = share_of(step)
-                for _ in range(HALVINGS):
-                    other, changed = moved_by(pose, share * step[:6]), values + share * step[6:]
-                    if self.is_possible(changed, other):
-                        moved = self._middle(other, changed) - columns.places
-                        near = columns if not renewed and np.abs(moved).max() < reach(state) else (
-                            self._columns(other, changed))  # whose own gradient may decide, too
-                        tried = self._state(other, changed, near).with_noise(held)
-                        now = tried.chi2(rows, self.scaled(other, changed, start))
-                        if now <= chi2:
-                            break
-                    share /= 2
-                else:  # the derivatives may be those of another place
-                    if renewed:  # no step is better, by derivatives of this very place
-                        at_rest = float(np.abs(step / sd).max()) < NEARLY_AT_REST
-                        break
-                    self.derivatives.clear()
-                    columns = self._columns(pose, values)
-                    state, renewed = self._state(pose, values, columns), True
-                    continue
-                pose, values, state, columns, renewed = other, changed, tried, near, False
-                if chi2 - now < chi2 * (
-                        NO_BETTER_ON_A_LINE if self.on_a_line else NO_BETTER):
-                    at_rest = True
-                    break
-            state = state.with_noise(None)
-        return pose, values, state, columns, at_rest
+            elif renewed:  # no step is better, by derivatives of this very place
+                at_rest = float(np.abs(step / sd).max()) < NEARLY_AT_REST
+                break
+            else:  # the derivatives may be those of another place
+                self.derivatives.clear()
+                place, renewed = self._at(place.pose, place.values), True
+        return place._replace(state=place.state.with_noise(None)), at_rest
+
+    def _better(
+        self, place: _Place, step: Floats, held: Floats, start: Floats, chi2: float, reach: float
+    ) -> tuple[_Place, float] | None:
+        """Return where a step, or a half of it, a quarter, ..., has no larger chi^2, and that.
+
+        None if it is larger all along it. ``held`` is the noise, and ``reach`` how far in m from
+        their places the block columns hold.
+        """
+        share = share_of(step)
+        for _ in range(HALVINGS):
+            pose, values = moved_by(place.pose, share * step[:6]), place.values + share * step[6:]
+            if self.is_possible(values, pose):
+                moved = self._middle(pose, values) - place.columns.places
+                near = place.columns if np.abs(moved).max() < reach else (
+                    self._columns(pose, values))  # whose own gradient may decide, too
+                state = self._state(pose, values, near).with_noise(held)
+                now = state.chi2(self.training.ravel(), self.scaled(pose, values, start))
+                if now <= chi2:
+                    return _Place(pose, values, state, near), now
+            share /= 2
+        return None
 
     def _doubts(self, scaled: Floats, blocks: Gaussian) -> tuple[Term, ...]:
         """Return the terms that a fit has taken far from their priors.
@@ -657,6 +676,15 @@ class _BlockColumns:
     fields: Floats
     shift: Floats
     directions: Floats
+
+
+class _Place(NamedTuple):
+    """A pose (6,) and other parameters (p,), with the readings and the block columns there."""
+
+    pose: Floats
+    values: Floats
+    state: _State
+    columns: _BlockColumns
 
 
 @dataclass(frozen=True)
