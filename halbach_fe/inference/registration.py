@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.numbers import check_number
 from halbach_fe.core.pace import QUIET_S, Pace, duration
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.pose_fit import PoseFit
@@ -95,7 +96,8 @@ def register(
         If no pose puts the map's points in air, no pose explains half of its field, or none is
         turned as it is known to be; or if the map holds what none does.
     StudyError
-        If the study is a cross-section, or an open key is no number that it gives.
+        If the study is a cross-section, an open key is no number that it gives, or ``most`` is no
+        whole number of at least 1.
 
     Examples
     --------
@@ -108,6 +110,8 @@ def register(
     >>> np.round(best.instrument.translation_m, 4) + 0.0
     array([0.   , 0.   , 0.001])
     """
+    if most is not None:
+        check_number("most", "register", most, 1, whole=True)
     data = checked_map(data, "`data`")
     refuse_unordered("data", data, magnet.study)
     prior = pose or PosePrior()
