@@ -13,7 +13,7 @@ from halbach_fe.api import shim
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Hypothesis, Place
+from halbach_fe.diagnosis.effects.base import Hypothesis, MagnetizationEffect, Place
 from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.summary import STUDY_FILE
 from halbach_fe.diagnosis.uncertain_effects import with_uncertain_effects
@@ -321,6 +321,20 @@ def test_all_laws_of_an_instrument_can_be_uncertain(session, generator):
                       session.within(name)).amplitudes
         assert abs(found.change[0] + 0.5 * sd) < 3.5 * found.sd[0]
         assert found.sd[0] < 0.5 * sd, name
+
+
+@pytest.mark.parametrize("effect", [
+    effect for effect in catalogue() if isinstance(effect, MagnetizationEffect)],
+    ids=lambda effect: effect.name)
+@pytest.mark.parametrize("magnet", MAGNETS)
+def test_a_study_at_an_amplitude_of_zero_has_the_numbers_that_change_with_it(effect, magnet):
+    """A temperature gradient of 0 was one exception of all blocks, and one per slot beside it."""
+    study = parse_study(DOCUMENT | {"array": DOCUMENT["array"] | MAGNETS[magnet]})
+    for place in effect.places(study)[:2]:
+        none = effect.apply(study, place, [0.0] * len(effect.parameters))
+        for which, parameter in enumerate(effect.parameters):
+            values = parameter.sd * np.eye(len(effect.parameters))[which]
+            assert number_changes(none, effect.apply(study, place, values.tolist()))
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [

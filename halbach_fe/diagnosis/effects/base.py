@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.study.array import BlockException
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
+
+T = TypeVar("T")
 
 STEP = 1e-3
 """Step of the differences by an instrument, in prior standard deviations of an effect: small
@@ -315,10 +317,12 @@ class MagnetizationEffect(Effect):
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         magnet = build_magnet(study)
+        # which blocks share an exception must not depend on the values: a study at an amplitude of
+        # 0 has the numbers that change with it
+        rates = {number: tuple(rate) for number, rate in self.rates(magnet, place).items()}
         return with_exceptions(study, [
-            BlockException(**where, magnetization_factor=factor) for where, factor in together(
-                magnet.blocks, {number: one_and(np.dot(rate, values))
-                                for number, rate in self.rates(magnet, place).items()})])
+            BlockException(**where, magnetization_factor=one_and(np.dot(rate, values)))
+            for where, rate in together(magnet.blocks, rates)])
 
 
 class InstrumentEffect(Effect):
@@ -357,13 +361,13 @@ def one_and(fraction: float) -> float:
 
 
 def together(
-    blocks: Sequence[MagnetBlock], values: Mapping[int, float]
-) -> list[tuple[dict[str, int], float]]:
+    blocks: Sequence[MagnetBlock], values: Mapping[int, T]
+) -> list[tuple[dict[str, int], T]]:
     """Return ring and slot of block exceptions, and what each says, for values by the blocks'
     numbers: one exception for all blocks, rings or slots if these are alike.
     """
     for of in ((), ("ring",), ("slot",)) if len(values) > 1 else ():
-        groups: dict[tuple[int, ...], set[float | None]] = {}
+        groups: dict[tuple[int, ...], set[T | None]] = {}
         for number, block in enumerate(blocks):
             key = tuple(getattr(block, name) for name in of)
             groups.setdefault(key, set()).add(values.get(number))
