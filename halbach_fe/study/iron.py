@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -509,6 +510,10 @@ def read_stl(path: Path) -> Floats:
     most_bytes = 5_000_000
     with path.open("rb") as file:
         raw = file.read(most_bytes + 1)
+    if raw.lstrip().startswith(b"ISO-10303-21"):  # damaged ones crash the libraries that read them
+        names = quote(path.name), quote(f"{path.stem}.stl")
+        raise ValueError("it is a STEP file; make an STL file in mm of it by the command "
+                         "gmsh -2 -clscale 20 -clcurv 800 {} -o {}".format(*names))
     if len(raw) > most_bytes:
         raise ValueError("it is too large; export it with fewer triangles")
     count = int.from_bytes(raw[80:84], "little")

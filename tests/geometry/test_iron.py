@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 
 import gmsh
@@ -351,6 +356,7 @@ def test_a_large_plate_of_triangles_over_small_blocks(short_dipole, generator):
     (lambda raw, text: text.replace("vertex 50.0", "vertex nan"), "it is no STL file"),
     (lambda raw, text: text.replace("vertex 50.0", "vertex 1e999"), "without finite corners"),
     (lambda raw, text: b"solid\nendsolid\n", "it has no triangles"),
+    (lambda raw, text: "ISO-10303-21;" + 5_000_000 * " ", "it is a STEP file"),
     (lambda raw, text: None, "must be a readable file")])
 def test_stl_files(tmp_path, change, sentence):
     """Binary or text, in mm; one that is open, damaged or missing is refused."""
@@ -381,6 +387,63 @@ def test_stl_files(tmp_path, change, sentence):
         return
     with pytest.raises(StudyError, match=sentence):
         read_study(study)
+
+
+CHAMFERED = [[-0.02, -0.015], [0.02, -0.015], [0.02, 0.009], [0.014, 0.015], [-0.02, 0.015]]
+
+
+def stl_of_step(folder, draw):
+    """Triangles of what is drawn in mm: the study refuses its STEP file, and takes what the command
+    of the sentence makes.
+    """
+    with gmsh_session("body"):
+        draw(gmsh.model.occ)
+        gmsh.model.occ.synchronize()
+        gmsh.write(str(folder / "a body.step"))
+    study = folder / "study.toml"
+    body = {"kind": "stl", "file": "a body.step", "centre_m": [0.0, 0.0, 0.4]}
+    study.write_text(tomlkit.dumps(changed(
+        DIPOLE, dimension=3, array__ring_length_m=0.08,
+        iron={"relative_permeability": 10.0, "bodies": [body]})))
+    with pytest.raises(StudyError, match="it is a STEP file; make an STL file in mm") as refused:
+        read_study(study)
+    command = re.search(r"gmsh (.*\.stl')", str(refused.value)).group(1)
+    subprocess.run([Path(sys.executable).with_name("gmsh"), *shlex.split(command)],
+                   cwd=folder, check=True, timeout=100)
+    study.write_text(study.read_text().replace(".step", ".stl"))
+    return read_study(study).iron.bodies[0].triangles_m
+
+
+def draw_prism(occ, cut=None):
+    """A chamfered prism of 10 mm about the origin; cut by a cylinder along it of a radius in mm."""
+    points = [occ.addPoint(1e3 * x, 1e3 * y, -5.0) for x, y in CHAMFERED]
+    lines = [occ.addLine(points[one - 1], points[one]) for one in range(len(points))]
+    found = occ.extrude([(2, occ.addPlaneSurface([occ.addCurveLoop(lines)]))], 0, 0, 10.0)
+    if cut:
+        occ.cut(found[1:2], [(3, occ.addCylinder(0, 0, -20, 0, 0, 40, cut))])
+
+
+def test_step_files(tmp_path, short_dipole):
+    """A solid is as the prism of the study, also with a round hole; others are refused."""
+    prism = {"kind": "prism", "outline_m": CHAMFERED, "length_m": 0.01}
+    (theirs,) = magnet_of(short_dipole, prism).iron
+    (ours,) = magnet_of(short_dipole, {
+        "kind": "stl", "triangles_m": stl_of_step(tmp_path, draw_prism)}).iron
+    assert ours.measures[0] == pytest.approx(theirs.measures[0], rel=1e-9)
+    assert len(ours.triangles) < 100
+    drilled = closed_surface(np.array(stl_of_step(
+        tmp_path, lambda occ: draw_prism(occ, cut=4.0))))
+    hole = np.einsum("ni,ni->", drilled[:, 0], np.cross(drilled[:, 1], drilled[:, 2])) / 6
+    # 40 chords, of which one may begin at the seam, enclose 0.4 % less than their circle
+    assert theirs.measures[0] - hole == pytest.approx(0.01 * np.pi * 0.004**2, rel=0.01)
+    for draw, wrong in (
+            (lambda occ: [occ.addBox(x, 0, 0, 9, 9, 9) for x in (0, 20)], "2 closed shells"),
+            (lambda occ: [occ.addBox(x, 0, 0, 9, 9, 9) for x in (0, 9)], "on the same side"),
+            (lambda occ: occ.addRectangle(0, 0, 0, 9, 9), "the surface must be closed"),
+            (lambda occ: occ.addLine(occ.addPoint(0, 0, 0), occ.addPoint(9, 0, 0)),
+             "it has no triangles")):
+        with pytest.raises(StudyError, match=wrong):
+            stl_of_step(tmp_path, draw)
 
 
 def test_several_bodies(short_dipole):

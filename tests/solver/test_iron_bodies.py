@@ -36,7 +36,7 @@ from halbach_fe.study.model import MeshSettings
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.ngsolve_reaction import Elements, reaction_field
-from tests.geometry.test_iron import triangles_of_box
+from tests.geometry.test_iron import CHAMFERED, draw_prism, stl_of_step, triangles_of_box
 
 SPHERE = {"kind": "sphere", "radius_m": 0.02, "centre_m": [0.0, 0.0, 0.05]}
 POINTS = np.array([[0.0, 0.0, 0.0], [0.01, 0.02, 0.02], [0.03, 0.0, 0.05], [0.0, -0.03, 0.09]])
@@ -134,6 +134,23 @@ def test_a_body_of_triangles_is_as_a_box(session):
     scale = np.abs(found[0]).max()
     assert np.abs(found[1] - found[0]).max() < 0.03 * scale
     assert np.abs(found[2] - found[0]).max() > 0.05 * scale
+
+
+def test_a_step_file_is_as_the_prism_of_the_study(session, tmp_path):
+    """In a uniform field, 3 cm off and more; without its chamfer as the control."""
+    mesh = {"block_size_m": 0.02, "growth": 1.5}
+    points = np.array([[0, 0, 0], [0, 0.05, 0.05], [0.05, 0, 0.09], [0, -0.04, 0.09]])
+    uniform = lambda points: np.broadcast_to([0.3, -0.2, 1.0], points.shape)  # noqa: E731
+    place = {"centre_m": [0.0, 0.0, 0.05], "rotation_deg": [0, 30, 0]}
+    prism = {"kind": "prism", "outline_m": CHAMFERED, "length_m": 0.01}
+    step = {"kind": "stl", "triangles_m": stl_of_step(tmp_path, draw_prism)}
+    box = {"kind": "box", "size_m": [0.04, 0.03, 0.01]}
+    found = [solve_bodies(build_magnet(study_with(body | place, mesh=mesh)), uniform,
+                          session.within(name), estimate=False).field(points)
+             for name, body in (("prism", prism), ("step", step), ("box", box))]
+    scale = np.abs(found[0]).max()
+    assert np.abs(found[1] - found[0]).max() < 2e-3 * scale  # 1.1e-3 by the meshes: bars of 9e-3
+    assert np.abs(found[2] - found[0]).max() > 4e-2 * scale
 
 
 def test_a_profile_is_as_a_tube(session):
