@@ -488,14 +488,14 @@ def _found(diagnosis: Diagnosis) -> list[str]:
         sentences += unknown_sentences(diagnosis, unknown)
     elif not diagnosis.identified and not diagnosis.suspected and _fails(diagnosis):
         disagree = "The maps disagree" if after.is_campaign else "The map disagrees"
-        start = (f"{disagree} with the study (chi² per reading {decimals(after.prior_conflict)}, "
-                 f"where {after.conflict_limit:.3g} would be rare), and no")
+        effect = ("no effect of the catalogue" if not diagnosis.is_partial else
+                  f"none of the effects that were compared ({not_compared(diagnosis)})")
+        other = " The cause may be another effect of the catalogue." * diagnosis.is_partial
         sentences.append(
-            f"{start}ne of the effects that were compared explains the difference "
-            f"({not_compared(diagnosis)}): the cause may be another of the catalogue."
-            if diagnosis.is_partial else
-            f"{start} effect of the catalogue explains the difference, nor does a smooth field or "
-            "sensor error. The readings scatter as if their noise were "
+            f"{disagree} with the study (chi² per reading "
+            f"{decimals(after.prior_conflict)}, where {after.conflict_limit:.3g} would be rare), "
+            f"and {effect} explains the difference, nor does a smooth field or sensor error."
+            f"{other} The readings scatter as if their noise were "
             f"{np.sqrt(after.prior_conflict):.2g} times as large as the study says: check that.")
     for suspicion in diagnosis.suspected:
         sentences.append(suspicion_in_words(suspicion, titles))

@@ -162,7 +162,8 @@ def solve_irreversible(
     by_node = np.einsum("nij,nqj->nqi", chi, field) + (
         strength[:, None] * at_nodes)[..., None] * easy[:, None]
     by_node += (polarization - cells.mean(by_node))[:, None]
-    return (Moments(interaction, by_node - system.remanence[:, None], system.blocks, steps),
+    return (Moments(interaction, by_node - system.remanence[:, None], system.blocks, steps,
+                    system.largest_susceptibility),
             np.asarray(strength * (1 - part)))
 
 

@@ -76,12 +76,15 @@ class Moments:
         Number of blocks, of which some may have no cells.
     steps : int
         Steps of the iteration.
+    susceptibility : float
+        The largest one of any cell, by which the error grows.
     """
 
     interaction: Interaction
     induced: Floats
     blocks: int
     steps: int
+    susceptibility: float
 
     @property
     def cells(self) -> Cells:
@@ -155,7 +158,7 @@ class System:
         mean_outer = cells.mean(outer)
         scale = float(np.abs(self.remanence).max(initial=0.0) + np.abs(mean_outer).max(initial=0.0))
         if scale == 0:
-            return Moments(interaction, outer, self.blocks, 0)
+            return Moments(interaction, outer, self.blocks, 0, self.largest_susceptibility)
         uniform, steps = self._self_consistent(self.remanence + self._respond(mean_outer), scale)
         deviation = self._respond(interaction.node_field(uniform) + outer)
         deviation -= cells.mean(deviation)[:, None]
@@ -163,7 +166,8 @@ class System:
         correction, more = self._self_consistent(
             self._respond(interaction.mean_field_of_deviations(deviation, share)), scale)
         induced = deviation + (uniform + correction - self.remanence)[:, None]
-        return Moments(interaction, induced, self.blocks, steps + more)
+        return Moments(interaction, induced, self.blocks, steps + more,
+                       self.largest_susceptibility)
 
     @property
     def largest_susceptibility(self) -> float:
@@ -254,7 +258,14 @@ def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[F
     larger = min((fine.cells, coarse.cells), key=len)
     share = np.interp(_distances(larger, points), list(ERROR_SHARE), list(ERROR_SHARE.values()))
     floor = 5e-4  # smallest error bar relative to the reaction, for the expansions of far clusters
-    return field, np.repeat((share * change + floor * size)[:, None], 3, axis=1)
+    # with larger susceptibilities cells converge more slowly. Of 60 random stacks of one to three
+    # cuboids, against 8 cells a side, 0.95 of the readings 3 mm and more away were within 1.0 bars
+    # without this for chi = 0.3, 1.7 for 0.5, 2.2 for 0.75 and 3.7 for 1; and there the change may
+    # vanish at a point, hence the floor
+    slower = 1 + fine.susceptibility**2
+    less_sure = 10 * fine.susceptibility**2
+    bar = slower * share * change + (1 + less_sure) * floor * size
+    return field, np.repeat(bar[:, None], 3, axis=1)
 
 
 def field_within(
