@@ -1147,7 +1147,7 @@ def _found_again(
             if there:
                 one = (parameter.beside or parameter.own)[0]
                 certainty[one] = max(certainty.get(one, 0.0), np.inf if (
-                    rivals or term.found and again) else abs(term.value) / term.sd)
+                    rivals or (term.found and again)) else abs(term.value) / term.sd)
         least = min(certainty, key=certainty.__getitem__, default=None)
         if least is None or certainty[least] == np.inf:
             return kept, tuple(now)
