@@ -829,7 +829,7 @@ def test_a_turn_that_is_not_even_is_found(generator, monkeypatch):
 def test_what_is_not_found_where_it_is_corrected_is_not_stated(monkeypatch, again):
     """A probe whose axes are 25 mrad off those of a nearly uniform field turns about x by 40 mrad.
     The control does not ask again: it states a drift of the zero of Bx, which is a turn about y of
-    3.5 mrad, and a bar by half as long. So it does in six of eight such maps, and in four asked
+    3.5 mrad, and a bar by half as long. So it does in five of eight such maps, and in four asked
     again.
     """
     if not again:
