@@ -133,8 +133,11 @@ def field_map(
         raise MeasurementError(must_be(
             "points_m and B_T", "field_map", f"of shapes (n, 3) and (n, {len(components)}), for "
             f"components out of {', '.join(COMPONENTS)}",
-            f"{points.shape} and {given.shape}, for {', '.join(map(str, components))}",
-            "State which components are given, as in components=['x', 'y']."))
+            f"{points.shape} and {given.shape}, for "
+            + ("'" + components + "'" if isinstance(components, str)
+               else ", ".join(map(str, components))),
+            "State which components are given, as in components=['x', 'y']; readings of |B| come "
+            "from a file with a column Babs_T."))
 
     def of_all(values: ArrayLike) -> Floats:
         """Return values of the components that are given (n, 3), NaN of the others."""
