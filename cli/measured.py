@@ -53,6 +53,7 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import parse_number
+from halbach_fe.core.result_folder import RECORD
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
@@ -591,6 +592,10 @@ def explain(arguments: argparse.Namespace) -> int:
             "`maps`", f"study {arguments.study}", "left out for explain, which takes one map",
             "a list of maps", "Of maps that a study lists, run halbach-fe check, register, infer "
             "and diagnose; they take all of them."))
+    if (arguments.output / RECORD).exists():
+        raise OutputError(
+            f"Folder {arguments.output} holds results of another command. The results of explain "
+            "are folders, one for each of its steps: name a folder for these.")
     steps = _Explanation(arguments, arguments.study, arguments.map)
     follow(steps)
     common.say("")

@@ -110,7 +110,7 @@ def _after_an_exact_field(solution: Solution) -> tuple[str, str]:
         return ("Choose where to measure it." if _smallest_noise(solution) else
                 "Add [[noise.regions]] to the study, and choose where to measure it.",
                 "halbach-fe plan STUDY -o DIR")
-    if solution.magnet.dimension == 2:
+    if solution.magnet.dimension == 2 or solution.magnet.array.multipole_order > 1:
         return ("See its multipoles, with what the tolerances of the blocks make of them.",
                 "halbach-fe multipoles STUDY -o DIR")
     return ("See how homogeneous it is, with what the tolerances of the blocks make of it.",

@@ -10,7 +10,7 @@ import tomlkit
 
 from halbach_fe.cli import main
 from halbach_fe.cli.verbs import VERBS
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.report.answer import PAGE_RECORD, Answer, PageRecord, write_record
 from tests.diagnosis.campaign import CIRCLES, NOISE_T, STUDY, drawn, field
 from tests.support.brought_maps import Brought, bring, judged
@@ -71,6 +71,16 @@ def test_a_map_that_is_not_there_is_said_once(study, tmp_path, capsys):
     printed = capsys.readouterr().err
     assert printed.count("no.csv must be a readable file") == 1
     assert "cannot be checked" not in printed
+
+
+def test_a_folder_of_another_command_is_refused_before_work(study, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["solve", str(study), "-o", str(out)]) == 0
+    before = sorted(out.iterdir())
+    assert main(["explain", str(study), str(out / "nominal_map.csv"),
+                 "-o", str(out)]) == OutputError.exit_code
+    assert "holds results of another command" in capsys.readouterr().err
+    assert sorted(out.iterdir()) == before
 
 
 CHECK = Answer("?", "Passed.", "Yes.", "")
