@@ -369,7 +369,7 @@ def test_options_of_the_format_of_listed_maps(campaign, tmp_path, capsys, option
     ({"excluded_readings": list(range(1, 17))}, "some that the study does not exclude"),
     ({"excluded_readings": [99]}, "rows of map"),
     ({"held_out": {"radii_m": [0.01]}}, "none, at radii from 0.03 to 0.03 m"),
-    ({"held_out": {"radii_m": [0.01]}}, "Or are they in mm? Then set `instrument.length_unit_m`")])
+    ({"held_out": {"radii_m": [0.01]}}, "are they in mm? Then set `instrument.length_unit_m`")])
 def test_sentences_about_readings(campaign, tmp_path, capsys, inference, said):
     study, measured, _ = campaign
     study.write_text(tomlkit.dumps(changed(BASE, inference=inference)))
