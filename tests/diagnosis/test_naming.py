@@ -163,7 +163,7 @@ def test_an_effect_that_predicts_worse_than_none_is_no_answer(
     assert told.sound == there
     assert names_of(found) == ["gain_x"] * there  # the negative control
     assert (found.answer == found.rounds) == there
-    assert ("Nothing in the catalogue explains the map" in told.said) != there
+    assert ("Nothing that was compared explains the map" in told.said) != there
 
 
 def test_bars_contain_that_a_part_may_not_be_zero():
