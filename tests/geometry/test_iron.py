@@ -408,7 +408,8 @@ def stl_of_step(folder, draw):
     with pytest.raises(StudyError, match="it is a STEP file; make an STL file in mm") as refused:
         read_study(study)
     command = re.search(r"gmsh (.*\.stl')", str(refused.value)).group(1)
-    subprocess.run([Path(sys.executable).with_name("gmsh"), *shlex.split(command)],
+    # the script begins with "env python", which need not be the environment of the tests
+    subprocess.run([sys.executable, Path(sys.executable).with_name("gmsh"), *shlex.split(command)],
                    cwd=folder, check=True, timeout=100)
     study.write_text(study.read_text().replace(".step", ".stl"))
     return read_study(study).iron.bodies[0].triangles_m
