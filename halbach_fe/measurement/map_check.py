@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import permutations, product
+from itertools import chain, permutations, product
 from typing import Any
 
 import numpy as np
@@ -959,21 +959,19 @@ class Parameter:
 class EvidenceByPart:
     """What a map tells of the instrument, and what each of pairs of halves of it does.
 
-    ``flat`` is what the half in which the field is flat tells; None if the map has no such half.
+    ``flat`` is the number of the pair of which the first half is where the field is flat; None if
+    the map has no such half.
     """
 
     whole: Evidence
     halves: tuple[tuple[Evidence, Evidence], ...]
-    flat: Evidence | None = None
+    flat: int | None = None
 
     @classmethod
     def of(cls, told: Sequence[Evidence], flat: int | None = None) -> EvidenceByPart:
-        """Return what `Evidence.of` yields; ``flat`` is the number of the pair of halves of which
-        the first one is where the field is flat.
-        """
+        """Return what `Evidence.of` yields, with the halves in pairs."""
         whole, *parts = told
-        pairs = tuple(zip(parts[::2], parts[1::2], strict=True))
-        return cls(whole, pairs, None if flat is None else pairs[flat][0])
+        return cls(whole, tuple(zip(parts[::2], parts[1::2], strict=True)), flat)
 
 
 def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
@@ -1263,23 +1261,19 @@ def _shown(
         return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True)
     used = np.flatnonzero(kept | np.isin(np.arange(len(kept)), parameter.own))
     row = parameter.row[used]
-    def of(part: Evidence) -> tuple[float, float]:
-        mean, covariance = part.estimate(used)
-        return float(row @ mean), float(np.sqrt(row @ covariance @ row))
-
-    value, sd = of(told.whole)
-    values, sds = np.array([[of(half) for half in pair] for pair in told.halves]).reshape(
-        -1, 2, 2).transpose(2, 0, 1)
+    parts = [each.estimate(used) for each in (told.whole, *chain(*told.halves))]
+    value, *by_half = (float(row @ mean) for mean, _ in parts)
+    sd, *sd_by_half = (float(np.sqrt(row @ covariance @ row)) for _, covariance in parts)
+    values, sds = (np.reshape(each, (-1, 2)) for each in (by_half, sd_by_half))  # a pair a row
     alone = np.sqrt(np.maximum(sds**2 - sd**2, 0.1 * sds**2))
     beyond = max(1.0, float(np.sqrt(np.mean(((values - value) / alone)**2)))) if sds.size else 1.0
     sees = SEEN * beyond * sds < abs(value)
     share = values / value if value else np.zeros(values.shape)
     off = (np.abs(values - value) > SEEN * sds) & ((share < alike[0]) | (share > alike[1]))
     supported = bool(sees.all(axis=1).any() and not (sees & off).any() and (
-        told.flat is None or SEEN * of(told.flat)[1] < abs(value)))
+        told.flat is None or SEEN * sds[told.flat, 0] < abs(value)))
     prior = float(np.linalg.norm(row))
-    own = told.whole.estimate(used)[0][np.isin(used, parameter.own)]
-    away = float(np.abs(own).max())
+    away = float(np.abs(parts[0][0][np.isin(used, parameter.own)]).max())
     return InstrumentTerm(
         parameter.name, parameter.unit, value, beyond * sd, beyond * sd < determined * prior,
         away <= doubted_from(len(kept)),
