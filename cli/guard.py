@@ -190,25 +190,26 @@ def _at_the_limit() -> bool:
 def claim_buffers() -> None:
     """If the memory of this process is limited, have OpenBLAS allocate its buffers now.
 
-    OpenBLAS keeps its buffers. If it cannot allocate them, it retries forever; so the memory for
-    them is asked for here first.
+    OpenBLAS keeps its buffers. If it cannot allocate them, it retries forever or ends the process;
+    so the memory for them, and for the libraries themselves, is asked for here first.
 
     Raises
     ------
     MemoryError
         If there is not enough for the buffers.
     """
-    # What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use: 32 MiB by
-    # thread and library, on two threads.
+    # What two OpenBLAS libraries, numpy's and scipy's, allocate at their first use, 32 MiB by
+    # thread and library on two threads; and what loading numpy 2.3 and scipy 1.16 maps, 178 MiB.
     blas_buffer_bytes = 128 * 2**20
+    library_bytes = 0 if "scipy.linalg" in sys.modules else 180 * 2**20
     if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        try:
+            mmap.mmap(-1, blas_buffer_bytes + library_bytes).close()
+        except OSError:
+            raise MemoryError("the limit leaves too little for the linear algebra") from None
         import numpy as np
         import scipy.linalg as linalg
 
-        try:
-            mmap.mmap(-1, blas_buffer_bytes).close()
-        except OSError:
-            raise MemoryError("the limit leaves too little for the linear algebra") from None
         matrix = np.eye(200)
         linalg.cholesky(matrix @ matrix)  # numpy and scipy each have their own OpenBLAS
 

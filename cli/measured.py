@@ -53,7 +53,6 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import parse_number
-from halbach_fe.core.result_folder import RECORD
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
@@ -585,6 +584,7 @@ def explain(arguments: argparse.Namespace) -> int:
     run again by itself. Writes the folders check, inferred, registered, updated, diagnosed and
     explained, as far as there are such, and explanation.html, which joins their pages.
     """
+    from halbach_fe.core.result_folder import RECORD
     from halbach_fe.explanation import follow
 
     if hf.read_study(arguments.study).maps:

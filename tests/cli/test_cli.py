@@ -495,7 +495,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
-@pytest.mark.parametrize("extra_MiB", [100, 200, 300, 400])
+@pytest.mark.parametrize("extra_MiB", [100, 350, 500, 800])
 def test_memory_limit(study, measured, tmp_path, extra_MiB):
     """Beyond what the program takes itself: whoever meets it says so, and nothing is broken."""
     out = tmp_path / "out"
