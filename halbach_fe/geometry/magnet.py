@@ -488,8 +488,8 @@ def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
             if len(in_winding(coil, windings[other])) or len(
                     in_winding(coils[other], windings[number])):
                 raise StudyError(must_be(
-                    f"`external.coils[{number}]`", "study", "clear of other coils",
-                    f"a winding in that of `external.coils[{other}]`",
+                    f"`external.coils[{number + 1}]`", "study", "clear of other coils",
+                    f"a winding in that of `external.coils[{other + 1}]`",
                     "Move one of them, or join both in one coil of more turns."))
 
 
@@ -538,7 +538,7 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
     if found:
         coil, number = found[0]
         raise StudyError(must_be(
-            f"`external.coils[{coil}]`", "study", "clear of blocks and iron",
+            f"`external.coils[{coil + 1}]`", "study", "clear of blocks and iron",
             f"a winding in {bodies[number][0]}", "Move the coil, or what is in its winding."))
 
 

@@ -142,7 +142,7 @@ def check_apart(external: External, points: Floats, study: str) -> None:
     """
     # Smallest distance of a reading from a point dipole: nearer than any probe can be.
     closest_m = 1e-6
-    for number, dipole in enumerate(external.dipoles):
+    for number, dipole in enumerate(external.dipoles, start=1):
         distance = np.linalg.norm(points - np.array(dipole.position_m), axis=1)
         if len(points) and distance.min() < closest_m:
             x, y, z = points[np.argmin(distance)]

@@ -124,7 +124,7 @@ def _doubted_units(study: Study) -> list[str]:
     thick = study.array.outer_radius_m - study.array.inner_radius_m
     if study.array.rings and thick > large_block_m:
         found.append(f"its blocks are {thick:.3g} m thick. Were other units than metres meant?")
-    for number, body in enumerate(study.iron.bodies if study.iron else ()):
+    for number, body in enumerate(study.iron.bodies if study.iron else (), start=1):
         if body.kind == "stl" and body.triangles_m:
             largest = np.ptp(np.array(body.triangles_m).reshape(-1, 3), axis=0).max()
             if largest < small_iron_m:
@@ -167,7 +167,7 @@ def _with_table(study: Study, folder: Path, where: str) -> Study:
         found = found.with_(bodies=tuple(
             _with_triangles(body, f"{key}.bodies[{number}]", folder, where).with_(
                 curve=_read_curve(body.curve, f"{key}.bodies[{number}]", folder, where))
-            for number, body in enumerate(found.bodies)))
+            for number, body in enumerate(found.bodies, start=1)))
     return study if found == iron else study.with_(**{key: found})
 
 

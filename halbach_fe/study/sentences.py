@@ -258,7 +258,7 @@ def _locate(
     that may stand there.
 
     pydantic puts the tag of a discriminated union into the location. It is left out here, because
-    it is no key of the file.
+    it is no key of the file. Elements of lists count from 1, as in all that a study says.
     """
     models: list[type[BaseModel]] = [root]
     owner: type[BaseModel] | None = root
@@ -267,7 +267,7 @@ def _locate(
         if part == KEY:
             continue
         if isinstance(part, int):
-            parts[-1] += f"[{part}]"
+            parts[-1] += f"[{part + 1}]"
             continue
         tagged = [m for m in models if len(models) > 1 and part in _tags(m)]
         if tagged:

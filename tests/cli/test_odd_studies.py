@@ -73,7 +73,7 @@ def test_a_reading_at_a_dipole(tmp_path, capsys, command):
     given = ["--measurements", measured] if command == "infer" else []
     code, sentence = refused([command, study, "-o", tmp_path / "out", *given], capsys)
     assert code == 3
-    assert "`external.dipoles[1].position_m`" in sentence
+    assert "`external.dipoles[2].position_m`" in sentence
     assert "the place of the reading at (0.03, 0, 0) m" in sentence
 
 

@@ -243,7 +243,7 @@ def test_turned_copies_have_turned_holes(short_dipole):
     ({"holes": [{"x_m": 0.25, "y_m": 0.2, "radius_m": 0.02}]}, "must lie within outline_m"),
     ({"holes": [{"x_m": 0.05, "y_m": 0.2, "radius_m": 0.02}] * 2}, "nor touch|neither touch"),
     ({"holes": [{"x_m": 0.05, "y_m": 0.2, "radius_m": 0.02},
-                {"x_m": 0.05, "y_m": 0.2, "radius_m": 0.01}]}, r"holes\[1\], about"),
+                {"x_m": 0.05, "y_m": 0.2, "radius_m": 0.01}]}, r"holes\[2\], about"),
     ({"holes": [{"x_m": 0.05, "y_m": 0.2}]}, "either radius_m"),
     ({"holes": [{"outline_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}]}, "do not cross")])
 def test_holes_that_are_refused(short_dipole, change, said):

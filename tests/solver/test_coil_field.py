@@ -201,7 +201,7 @@ def test_blocks_and_iron_in_windings_are_refused():
              "block r01s")):
         study = parse_study(plain | {"external": {"coils": [one]}})
         refused = nullcontext() if where is None else pytest.raises(
-            StudyError, match=rf"coils\[0\].* clear of blocks and iron; .* in {where}")
+            StudyError, match=rf"coils\[1\].* clear of blocks and iron; .* in {where}")
         with refused:
             build_magnet(study)
         with refused:
@@ -223,7 +223,7 @@ def test_windings_in_a_cross_section_are_refused_at_any_height(one, where):
         "inner_radius_m": 0.1875, "outer_radius_m": 0.2, "relative_permeability": 9.0},
         external={"coils": [one | {"current_A": 1.0}]}))
     with nullcontext() if where is None else pytest.raises(
-            StudyError, match=rf"coils\[0\].* clear of blocks and iron; .* in {where}"):
+            StudyError, match=rf"coils\[1\].* clear of blocks and iron; .* in {where}"):
         build_magnet(study)
 
 
@@ -235,7 +235,7 @@ def test_windings_in_one_another_are_refused():
             ({}, True), ({"radius_m": 0.07}, False), ({"radius_m": 0.068}, True),
             ({"section_m": [0.0, 0.0]}, True), ({"centre_m": [0.5, 0.0, 0.0]}, False)):
         study = parse_study(changed(DIPOLE, external={"coils": [one, one | other]}))
-        with pytest.raises(StudyError, match=r"coils\[1\].* clear of other coils") if refused else (
+        with pytest.raises(StudyError, match=r"coils\[2\].* clear of other coils") if refused else (
                 nullcontext()):
             build_magnet(study)
 
@@ -252,7 +252,7 @@ def test_layers_of_windings_may_touch_on_arcs(inner, outer):
     for other, refused in ((outer, False), (nearer, True)):
         study = parse_study(changed(DIPOLE, external={"coils": [
             own | inner, own | inner | other]}))
-        with pytest.raises(StudyError, match=r"coils\[1\].* clear of other coils") if refused else (
+        with pytest.raises(StudyError, match=r"coils\[2\].* clear of other coils") if refused else (
                 nullcontext()):
             build_magnet(study)
     if inner["kind"] == "round":

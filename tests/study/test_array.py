@@ -98,7 +98,7 @@ def test_rings_give_what_the_array_does_not():
 
 
 @pytest.mark.parametrize(("rings", "common", "said"), [
-    ([{}, {"remanence": 1.0}], {}, r"array\.ring\[1\].*Did you mean `remanence_T`"),
+    ([{}, {"remanence": 1.0}], {}, r"array\.ring\[2\].*Did you mean `remanence_T`"),
     ([{}, {"outer_radius_m": 0.05}], {}, r"ring 2: outer_radius_m \(0.05\) must be larger"),
     ([{}, {"inner_radius_m": 50}], {}, "Was it meant in millimetres"),
     ([{"remanence_T": 1.1}, {"block_moment_A_m2": 9, "remanence_T": 1.0}], {},

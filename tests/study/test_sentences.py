@@ -79,7 +79,7 @@ def test_every_kind_of_error_has_a_sentence():
     ({"array__block": {}}, "Add the key, as one of 'sector', 'trapezoid', 'cuboid'."),
     ({"array__block__shape": "hexagon"}, "`array.block.shape` of study must be one of"),
     ({"iron": {"relative_permeability": 9, "bodies": [{"kind": "tub"}]}},
-     "`iron.bodies[0].kind` of study must be one of 'tube', 'prism', 'box', 'sphere', "
+     "`iron.bodies[1].kind` of study must be one of 'tube', 'prism', 'box', 'sphere', "
      "'revolved', 'stl'; instead received 'tub'. "
      "Did you mean 'tube'?"),
     ({"array": {"free_blocks": "blocks.csv"}}, "free_blocks = { file ="),
@@ -93,7 +93,7 @@ def test_every_kind_of_error_has_a_sentence():
     ({"observation__components": ["w"]}, "must be 'x', 'y' or 'z'; instead received 'w'."),
     ({"observation__components": []}, "a list with 1 or more elements"),
     ({"instrument": {"crosstalk": {"xx": 0.1}}}, "`instrument.crosstalk.xx` of study must be 'xy'"),
-    ({"instrument": {"translation_m": [1.0, 2.0]}}, "`instrument.translation_m[2]` of study must "
+    ({"instrument": {"translation_m": [1.0, 2.0]}}, "`instrument.translation_m[3]` of study must "
      "be given"),
     ({"instrument": {"translation_m": [1.0, 2.0, 3.0, 4.0]}}, "a list with at most 3 elements"),
     ({"array__exceptions": [{"slot": 17, "magnetization_factor": 0}]},
@@ -111,7 +111,7 @@ def test_every_kind_of_error_has_a_sentence():
     ({"instrument": {"gain": 1.02}}, "a list; instead received 1.02. Write it in brackets, an "
      "element for each axis or part. It is the deviation from 1: if 1.02 is the whole factor, "
      "write 0.02;"),
-    ({"maps": [{"name": "a", "file": ""}]}, "`maps[0].file` of study must be a text of 1 or more"),
+    ({"maps": [{"name": "a", "file": ""}]}, "`maps[1].file` of study must be a text of 1 or more"),
     ({"demagnetization": {"irreversible": "maybe"}}, "`demagnetization"),
 ])
 def test_sentences_are_ours(changes, said):

@@ -686,3 +686,10 @@ def test_an_effect_of_one_block_is_hidden_once(texts):
         simulate_campaign(parse_study(RINGS), 1, hide=[first, second])
     if len(second[1]) > 1:
         simulate_campaign(parse_study(RINGS), 1, hide=[first, (second[0], (1.0, 4.0))])
+
+
+def test_axes_are_numbers_or_letters():
+    """A letter is an axis only where the value is one: a ring is not called x."""
+    assert parse_hidden_effect("swapped_axes=x,z") == parse_hidden_effect("swapped_axes=1,3")
+    with pytest.raises(ValueError, match="needs numbers"):
+        parse_hidden_effect("blocks_swapped=x,1,1,2")

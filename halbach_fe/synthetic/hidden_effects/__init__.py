@@ -32,7 +32,7 @@ def signature(effect: HiddenEffect) -> str:
 
 
 def parse_hidden_effect(text: str) -> RequestedEffect:
-    """Parse an effect of the form ``NAME`` or ``NAME=value,value``.
+    """Parse an effect of the form ``NAME`` or ``NAME=value,value``, axes as numbers or letters.
 
     Raises
     ------
@@ -48,8 +48,10 @@ def parse_hidden_effect(text: str) -> RequestedEffect:
     if not equals:
         return effect, None
     parameters = signature(effect)
+    axes = {"x": 1, "y": 2, "z": 3} if name in ("swapped_axes", "sign_flipped_axis") else {}
     try:
-        values = tuple(float(value) for value in rest.split(",")) if rest else ()
+        values = tuple(float(axes.get(value.strip(), value))
+                       for value in rest.split(",")) if rest else ()
     except ValueError:
         raise ValueError(f"{name} needs numbers ({parameters}), not '{rest}'") from None
     if len(values) != len(effect.parameters) or not np.isfinite(values).all():
