@@ -122,11 +122,19 @@ class Answer:
 
     @property
     def headline(self) -> str:
-        """The gist, or the first sentence, as far as the words of large type suffice."""
+        """The gist, or the first sentence, as far as the words of large type suffice.
+
+        What is cut ends in a word, not within a number and its error bar.
+        """
         first = self.gist or _first_sentence(self.said)
         words = first.split(" ")
         most = MOST_WORDS - sum(len(f"{name} {size}".split(" ")) for name, size in self.numbers)
-        return first if len(words) <= most else f"{' '.join(words[:most - 1]).rstrip(',;:(')} …"
+        if len(words) <= most:
+            return first
+        kept = words[:most - 1]
+        while len(kept) > 1 and not kept[-1].strip(",;:()").isalpha():
+            kept.pop()
+        return f"{' '.join(kept).rstrip(',;:(')} …"
 
     @property
     def short_trust(self) -> str:

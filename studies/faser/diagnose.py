@@ -305,8 +305,8 @@ def answer_page(answers: list[Answer], found: list[str], published: PublishedErr
         sound=sound,
         gist=f"It is the profile of a line {radius:.0f} ± {radius_sd:.0f} mm beside the axis, "
         f"in a magnet {array.rings * array.ring_length_m:.3g} m long.",
-        numbers=(("median error of held-out readings in the fringe, by the paper's magnet and by "
-                  f"this one (by the best one on the axis: {100 * axis:.2g} %)",
+        numbers=((f"median error in the fringe, of the paper and here (on the axis: "
+                  f"{100 * axis:.2g} %)",
                   f"{100 * paper:.0f} % → {100 * here:.1g} %"),))
 
 

@@ -447,7 +447,8 @@ def test_decimals_have_no_exponent(value, digits, said):
 @pytest.mark.parametrize(("said", "headline"), [
     ("The middle lies at 1.5 mm. Its odds are 1 : 1.", "The middle lies at 1.5 mm."),
     ("Passed. The map obeys. More.", "Passed. The map obeys."), ("Yes", "Yes"),
-    ("word, " * 100, ("word, " * 35).rstrip(", ") + " …")])
+    ("word, " * 100, ("word, " * 35).rstrip(", ") + " …"),
+    ("word " * 32 + "78 ± 3 mm from " + "word " * 9, "word " * 32 + "…")])
 def test_large_type_has_forty_words(said, headline):
     """Those of the numbers are among them: `before` and `3 mT`, with a space of two words."""
     answer = Answer("?", said, "Yes.", "", numbers=(("off before", "3 mT"),))
