@@ -100,7 +100,7 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
     StudyError
         If bodies overlap.
     MeshError
-        If Gmsh fails.
+        If Gmsh fails, or curved sides turn an element inside out.
     """
     with gmsh_session(name):
         pieces, shell = _draw(name, bodies)
@@ -119,7 +119,10 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         _set_sizes(bodies, pieces[:-2], sizes, shell)
         gmsh.model.mesh.generate(3)
         gmsh.model.mesh.setOrder(2)
+        gmsh.option.setNumber("General.AbortOnError", 0)  # it throws where nobody can catch it
+        gmsh.option.setNumber("General.AbortOnError", 0)  # it throws where nothing can catch
         gmsh.model.mesh.optimize("HighOrder")
+        _check_elements(name)
         write_mesh(mesh_path)
     return Regions(
         study=name, dimension=3, air=tags.AIR_TAG, iron=None, shell=tags.SHELL_TAG,
@@ -127,6 +130,24 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         blocks=tuple(BlockRegion(name=f"iron{number + 1}", ring=number + 1, slot=0,
                                  tag=tags.FIRST_BLOCK_TAG + number)
                      for number in range(len(bodies)))), shell
+
+
+def _check_elements(name: str) -> None:
+    """Refuse a mesh in which curved sides turn an element inside out, after Gmsh's optimizer.
+
+    Raises
+    ------
+    MeshError
+    """
+    mesh = gmsh.model.mesh
+    elements = mesh.getElementsByType(mesh.getElementType("tetrahedron", 2))[0]
+    quality = mesh.getElementQualities(elements, "minSJ")
+    if quality.min() <= 0:
+        x, y, z = mesh.getNode(mesh.getElement(elements[np.argmin(quality)])[1][0])[0]
+        raise MeshError(
+            f"Gmsh could not mesh the iron of study '{name}' near ({x:.5g}, {y:.5g}, {z:.5g}) m: "
+            "its curved sides turn an element inside out. Were other units meant there? Otherwise "
+            "give a smaller mesh.block_size_m, or a shape without thin slivers.")
 
 
 def check_apart(name: str, bodies: Sequence[IronSolid]) -> None:

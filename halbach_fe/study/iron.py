@@ -330,9 +330,9 @@ def _check_holes(outline: Floats, holes: list[Floats]) -> None:
                 hole[:1], outline)[0] or any(_within(hole[:1], other)[0] or _within(
                     other[:1], hole)[0] for other in holes[:number]):
             x, y = hole.mean(axis=0).round(6) + 0.0
-            raise ValueError(f"holes[{number + 1}], about ({x:g}, {y:g}) m, must lie within outline_m, "
-                             "and neither touch its edges nor another hole; what opens to a side "
-                             "belongs into outline_m")
+            raise ValueError(f"holes[{number + 1}], about ({x:g}, {y:g}) m, must lie within "
+                             "outline_m, and neither touch its edges nor another hole; what "
+                             "opens to a side belongs into outline_m")
 
 
 def _within(points: Floats, polygon: Floats) -> Floats:

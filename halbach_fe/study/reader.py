@@ -130,7 +130,24 @@ def _doubted_units(study: Study) -> list[str]:
             if largest < small_iron_m:
                 found.append(f"`iron.bodies[{number}]` is only {1e3 * largest:.3g} mm large. Were "
                              "metres meant? Then set its unit_m = 1.")
+    found += _doubted_curves(study)
     return found
+
+
+def _doubted_curves(study: Study) -> Iterator[str]:
+    """Yield sentences about tables of steel whose H is rather in another unit."""
+    high_permeability = 2e4  # relative; of steels that are not grain-oriented at most some 15 000
+    of_all = "iron_ring" if study.iron_ring else "iron"
+    irons = [(of_all, iron_of(study)), *(
+        (f"iron.bodies[{number}]", body)
+        for number, body in enumerate(study.iron.bodies if study.iron else (), start=1))]
+    for key, iron in irons:
+        if iron and isinstance(iron.curve, TableCurve):
+            found = np.max(np.divide(iron.curve.B_T[1:], iron.curve.H_A_per_m[1:])) / materials.MU_0
+            if found > high_permeability:
+                yield (f"`{key}.curve` has a relative permeability of up to {found:.2g}, as only "
+                       "nickel-iron and grain-oriented sheet have. Was its H in Oe or A/cm? Then "
+                       "multiply H by 79.58 or 100.")
 
 
 def parse_study(document: dict[str, Any], where: str = "study") -> Study:

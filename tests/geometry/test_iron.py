@@ -6,8 +6,10 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from time import perf_counter
 
@@ -453,6 +455,22 @@ def test_several_bodies(short_dipole):
     assert (magnet.iron_half_length, magnet.radius) == pytest.approx((0.21, 0.25))
     points = np.array([[0.22, 0, 0], [0.1, 0, 0.2], [0.01, 0, 0.2], [0.22, 0, 0.1]])
     assert magnet.contains(points).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("H_per", "doubted"), [(1.0, False), (1e3 / (4 * np.pi), True),
+                                                (100.0, True)])
+def test_a_curve_in_another_unit_is_doubted(tmp_path, H_per, doubted):
+    """Steel up to 1.9 T with H in Oe or A/cm could be oriented sheet: it is said, not refused."""
+    H, B = np.loadtxt(files("halbach_fe.study") / "steels" / "aisi_1010.csv", delimiter=",",
+                      comments=("#", "H")).T
+    use = B < 1.9
+    study = tmp_path / "study.toml"
+    study.write_text(tomlkit.dumps(changed(DIPOLE, iron_ring={
+        "inner_radius_m": 0.3, "outer_radius_m": 0.35, "curve": {
+            "kind": "table", "H_A_per_m": (H[use] / H_per).tolist(), "B_T": B[use].tolist()}})))
+    with pytest.warns(HalbachWarning, match="`iron_ring.curve` .* H in Oe") if doubted else (
+            warnings.catch_warnings(action="error")):
+        read_study(study)
 
 
 @pytest.mark.parametrize(("body", "volume"), [

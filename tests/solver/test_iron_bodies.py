@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import meshio
 import numpy as np
 import pytest
 
-from halbach_fe.core.errors import GetDPError, StudyError
+from halbach_fe.core.errors import GetDPError, MeshError, StudyError
 from halbach_fe.geo.iron_bodies import Sizes, check_apart, mesh_iron
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
@@ -251,6 +252,15 @@ def test_edges_at_narrow_gaps_have_small_elements():
     assert narrow > 1.3 * wide
     assert touching < 1.1 * wide
     assert narrow < glued < 10 * wide
+
+
+@pytest.mark.parametrize(("size_m", "refused"), [(4e-5, True), (1e-4, False)])
+def test_a_mesh_that_gmsh_cannot_curve(size_m, refused):
+    """A plate of 40 mm whose file is in m, read as mm: Gmsh's optimizer would end the process."""
+    plate = {"kind": "stl", "centre_m": [0.0, 0.0, 0.012],
+             "triangles_m": triangles_of_box([size_m, size_m, size_m / 4]).tolist()}
+    with pytest.raises(MeshError, match="other units") if refused else nullcontext():
+        nodes_of(plate)
 
 
 def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
