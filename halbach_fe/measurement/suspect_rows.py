@@ -111,8 +111,9 @@ def rough_rows(
     # of a map that ends 6 mm from the edges of magnets a quadratic function is off by 0.1 of it.
     # Smaller spikes are left to the fit of a field without sources. A row at the map's border has
     # neighbours on one side only: there it is 1, as quadratic functions were off by up to 0.65 in
-    # clean maps that end 12 mm from magnets.
-    of_range = 0.2
+    # clean maps that end 12 mm from magnets. A row at a tip, as of a grid cut to a sphere, has them
+    # a whole spacing away: off by 1.02 in a clean map of |B| 20 mm apart in a ring of cubes.
+    of_range, at_tip = 0.2, 3.0
     found = np.zeros(len(points), bool)
     for _ in range(rough_rounds):
         rows = np.flatnonzero(usable & ~found)
@@ -123,6 +124,7 @@ def rough_rows(
         worst = spikes(points, residual, usable & ~found, 1.0)
         around = np.linalg.norm(np.ptp(field[rows[near]], axis=1), axis=1)
         limit = np.where(at_border(points[rows], near), 1.0, of_range)
+        limit[at_border(points[rows], near, -0.5)] = at_tip
         worst[rows] &= (size > ROUGH * size[near].max(axis=1)) & (size > limit * around)
         if not worst.any():
             break
@@ -130,11 +132,15 @@ def rough_rows(
     return found
 
 
-def at_border(points: Floats, near: Ints) -> NDArray[np.bool_]:
-    """Tell which points (n, 3) have all their neighbours (n, k) on one side, along any axis."""
+def at_border(points: Floats, near: Ints, beside: float = 0.5) -> NDArray[np.bool_]:
+    """Tell which points (n, 3) have all their neighbours (n, k) on one side, along any axis.
+
+    Those that lie at most ``beside`` spacings on the other side count to it: by default rows in the
+    same plane; with −0.5 only a row without any in its plane is at the border.
+    """
     away = (points[near] - points[:, None]) / point_spacing(points)
     low, high = away.min(axis=1), away.max(axis=1)
-    return np.asarray((((low > -0.5) | (high < 0.5)) & (high - low > 0.5)).any(axis=1))
+    return np.asarray((((low > -beside) | (high < beside)) & (high - low > 0.5)).any(axis=1))
 
 
 def quadratic_residual(

@@ -200,7 +200,7 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
                 "follows. This map therefore does not tell its noise. For sigma_T, read the probe "
                 "repeatedly at one place.")
     noise = ("The noise of a reading is "
-             f"{'at most ' if check.position_noise_at_most or not check.is_whole else ''}"
+             f"{'at most ' if check.noise_is_limit else ''}"
              f"{flux_density(check.noise_T, 2)}")
     where = "put that into the study as sigma_T, unless you know better"
     if check.is_displaced:
