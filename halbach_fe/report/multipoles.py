@@ -148,28 +148,28 @@ def middle_circle(tables: Sequence[MultipoleTable]) -> MultipoleTable:
 
 
 def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
-    """Say how strong the best known magnet's main multipole is in the middle; empty without tables.
+    """Say how strong the best known magnet's main multipole is; empty without tables.
 
-    Of a dipole that is its field, of a quadrupole its gradient, of others the field at a radius.
+    Of a dipole that is its field, of a quadrupole its gradient, of others the field at a radius. In
+    2D they are those in the middle. In 3D they are those of the circle nearest to it: in a short
+    magnet the harmonic of a circle changes with its radius otherwise than a multipole.
     """
     if not tables:
         return ""
     model, magnets = middle_circle(tables)
     known = list(magnets.values())[-1]
-    # distance in m from the middle of a magnet below which a circle is there, but for rounding
-    middle_m = 1e-9
-    where = "In the middle" if abs(model.z or 0.0) < middle_m else (
-        f"At z = {1e3 * (model.z or 0.0):.4g}\u00a0mm")
     circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
+    local = model.z is not None
+    where = (f"On the circle {circle} at z = {1e3 * model.z:.4g}\u00a0mm" if model.z is not None
+             else "In the middle")
     name, scale, unit = {
-        1: ("dipole field", 1e3, "mT"), 2: ("gradient", 1 / model.radius, "T/m")}.get(
-            model.main, (f"main multipole, of order {model.main},", 1e3, f"mT at {circle}"))
+        1: ("dipole harmonic" if local else "dipole field", 1e3, "mT"),
+        2: ("gradient, by the quadrupole harmonic," if local else "gradient", 1 / model.radius,
+            "T/m")}.get(model.main, (f"main multipole, of order {model.main},", 1e3,
+                                     "mT" if local else f"mT at {circle}"))
     size = (with_error(scale * known.main, scale * known.main_sd) if known.main_sd > 0
             else decimals(scale * known.main, 4))
-    # in 3D the harmonic of a circle is not the field on the axis
-    by = f" (harmonic of order {model.main} at {circle})" if model.z is not None and (
-        model.main in (1, 2)) else ""
-    return f"{where} the {name} is {size}\u00a0{unit}{by}."
+    return f"{where} the {name} is {size}\u00a0{unit}."
 
 
 def sections_of_circles(

@@ -107,9 +107,13 @@ def of_solve(given):
 
 
 def test_the_field_in_the_middle_is_said_first(given):
-    """A dipole by its field, a quadrupole by its gradient; without circles nothing is known."""
-    for order, name, scale, unit in ((1, "dipole field", 1e-3, "mT"), (2, "gradient", 0.03, "T/m"),
-                                     (3, "main multipole, of order 3,", 1e-3, "mT")):
+    """A dipole by its field, a quadrupole by its gradient; without circles nothing is known. In 3D
+    they are those of the circle, which the field in the middle of a short magnet is not.
+    """
+    for order, name, scale, unit in (
+            (1, "dipole harmonic", 1e-3, "mT"),
+            (2, "gradient, by the quadrupole harmonic,", 0.03, "T/m"),
+            (3, "main multipole, of order 3,", 1e-3, "mT")):
         magnet = build_magnet(given.study.with_(array__multipole_order=order))
         found = hf.solve(magnet, given.session)
         on_circle = np.isclose(found.points[:, 2], 0)  # B_r at 8 angles
@@ -118,10 +122,11 @@ def test_the_field_in_the_middle_is_said_first(given):
             [np.cos(angle), np.sin(angle)])).sum(axis=1)
         size = 2 * abs(np.mean(radial * np.exp(-1j * order * angle)))
         said = solution.page(found).answer.said
-        assert re.match(f"In the middle the {name} is ([0-9.]+)\u00a0{unit}", said)
+        assert re.match("On the circle r = 30\u00a0mm at z = 0\u00a0mm the "
+                        f"{name} is ([0-9.]+)\u00a0{unit}", said)
         value = float(re.search("is ([0-9.]+)", said)[1])
         assert value == pytest.approx(size / scale, rel=ALIASES)
-    assert "In the middle" not in solution.answer(found).said
+    assert "On the circle" not in solution.answer(found).said
 
 
 def test_blocks_that_are_not_as_designed_are_named(given):
