@@ -344,7 +344,9 @@ def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
     def named(found: re.Match[str]) -> str:
         if found[1] not in chapter.record.files:
             return found[0]
-        return shlex.quote(_from_here(chapter.folder / found[1]) or f"{chapter.label}/{found[1]}")
+        place = chapter.folder / found[1]  # as it was given; of the root the page says nothing
+        return shlex.quote(_from_here(place) or printable(
+            f"{chapter.label}/{found[1]}" if place.is_absolute() else str(place), MAX_QUOTED))
 
     return replace(answer, command=re.sub(r"DIR/(\S+)", named, answer.command))
 
