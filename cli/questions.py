@@ -313,8 +313,10 @@ def demagnetization(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     material. Writes demagnetization.html and its figures, demagnetization.json, demagnetization.csv
     (a row per block) and demagnetization.vtu (cells, for ParaView).
     """
-    with common.session(arguments, magnet.study) as session:
-        return hf.demagnetization(magnet, session, *filter(None, [arguments.across]))
+    with common.session(arguments, magnet.study) as session, common.progress_bar(
+            "cells", told=True) as show:
+        return hf.demagnetization(magnet, session, show=show, **(
+            {"across": arguments.across} if arguments.across else {}))
 
 
 @verb(SOLVED, REGION, SEED)

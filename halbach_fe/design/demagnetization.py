@@ -113,8 +113,15 @@ class DemagnetizationMap(ShownInNotebook):
 
     @property
     def share_error(self) -> float:
-        """By how much `share_beyond_now` depends on the size of the cells."""
-        return abs(self.share_beyond_now - self.coarse_share)
+        """By how much `share_beyond_now` depends on the size of the cells.
+
+        Two sizes may agree by chance: it is at least the share of a cell of twice the length, if
+        anything is past the knee.
+        """
+        volumes = self.cells.volumes
+        cells = 2 ** self.magnet.dimension  # of which one of twice the length consists
+        least = cells * float(volumes.max() / volumes.sum()) if self.share_beyond_now else 0.0
+        return max(abs(self.share_beyond_now - self.coarse_share), least)
 
     @property
     def margin(self) -> Floats:
@@ -217,8 +224,10 @@ def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
                       * np.maximum(0.0, factor))
 
 
-def demagnetization_map(magnet: Magnet, session: Session,
-                        across: int = ACROSS) -> DemagnetizationMap:
+def demagnetization_map(
+    magnet: Magnet, session: Session, across: int = ACROSS,
+    show: Callable[[int, int], object] = lambda done, total: None,
+) -> DemagnetizationMap:
     """Compute H in all blocks of the nominal magnet, at the temperature that the study states.
 
     Parameters
@@ -228,6 +237,8 @@ def demagnetization_map(magnet: Magnet, session: Session,
     across : int
         Number of cells across the radial thickness of a block. In the other directions the cells
         have about the same length, but are no fewer: through a thin block H varies most.
+    show : callable, optional
+        Is told how many cells are done, and how many there are.
 
     Raises
     ------
@@ -251,7 +262,7 @@ def demagnetization_map(magnet: Magnet, session: Session,
     cells, coarse = cut(blocks, magnetized, across), cut(blocks, magnetized, max(1, across // 2))
     number = np.append(cells.block, coarse.block)
     field = _field_strength(
-        warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session)
+        warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session, show)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
     along, rest = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
     by_coarse = DemagnetizationMap(magnet, material, blocks, coarse, rest, np.nan)
@@ -377,10 +388,15 @@ def _count(length: float, size: float) -> int:
 
 
 def _field_strength(
-    magnet: Magnet, blocks: Sequence[MagnetBlock], points: Floats, number: Ints, session: Session
+    magnet: Magnet, blocks: Sequence[MagnetBlock], points: Floats, number: Ints, session: Session,
+    show: Callable[[int, int], object],
 ) -> Floats:
     """Return H (n, 3) in A/m at points (n, 3) in m inside the blocks of some numbers (n,)."""
-    field = field_of(blocks, points)  # mu_0 H in vacuum
+    field = np.empty_like(points)  # mu_0 H in vacuum
+    # of all blocks at some points, which take seconds
+    for some in np.array_split(np.arange(len(points)), 1 + len(points) * len(blocks) // 10**7):
+        field[some] = field_of(blocks, points[some])
+        show(int(some[-1]) + 1, len(points))
     reacting = magnet.with_(solver__method="reaction")
     if not magnet.is_vacuum and _by_moments(reacting):
         field += solve_separate(reacting, session, estimate=False).field(points)

@@ -179,6 +179,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def taking_arrays(function: Function) -> Function:
     """Decorate a function of a magnet and a map, which then takes arrays for the map too: positions
     (n, 3) in m, readings (n, 3) in T, ``sigma_T`` and ``components``, as `field_map` does.
+
+    Of arrays no page says that a result is not to be used, so that a HalbachWarning does; error
+    bars that are too wide mislead nobody.
     """
     @wraps(function)
     def of_map_or_arrays(*arguments: Any, **options: Any) -> Any:
@@ -188,7 +191,11 @@ def taking_arrays(function: Function) -> Function:
                 data = field_map(points_m, B_T, options.pop("sigma_T", None),
                                  components=options.pop("components", COMPONENTS))
                 _refuse_exchanged(magnet, data)
-                return function(magnet, data, *others, **options)
+                result = function(magnet, data, *others, **options)
+                said = getattr(result, "disagreement", "")
+                if said and said != result.too_near:
+                    warnings.warn(said, HalbachWarning, stacklevel=2)
+                return result
         return function(*arguments, **options)
 
     return cast(Function, of_map_or_arrays)

@@ -256,6 +256,8 @@ def test_positions_and_readings_that_are_exchanged(generator):
     with pytest.raises(hf.HalbachError, match="given in this order"):
         hf.infer(ring, field, points, sigma_T=5e-5)
     assert hf.infer(ring, points, field, sigma_T=5e-5).disagreement == ""
+    with pytest.warns(hf.HalbachWarning, match="cannot all be right"):  # no page says so
+        assert hf.infer(ring, points, -field, sigma_T=5e-5).disagreement
 
 
 def test_a_magnet_is_inferred_from_arrays_alone(tmp_path, monkeypatch, generator):

@@ -241,6 +241,9 @@ def test_a_mean_or_temperature_that_cannot_be_is_told(vacuum_dipole, generator, 
     moments = np.linalg.norm(table_of(study, slots, truth, rings).moment, axis=1)
     with pytest.warns(HalbachWarning, match=r"known to \d+ % only, where the study alone states "):
         assert "Not yet" in answer(prior(truth, sigma=moments / 2)).trust
+    with pytest.warns(HalbachWarning, match="ppm, better than any coil measures"):
+        assert "Not yet" in answer(prior(truth, sigma=1e-6 * moments)).trust
+    assert prior(truth, sigma=1e-4 * moments).doubts == ()
     assert prior(1.3 * truth, vacuum_dipole(prior__common_mode_sd=0.2)).doubts == ()
 
 
