@@ -441,7 +441,9 @@ def is_promised(result: dict[str, Any]) -> bool:
 
 def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
               ) -> dict[str, list[str]]:
-    """Return the blocks, or the ring, of hidden effects, as places of the catalogue name them."""
+    """Return the blocks, the ring, or that below a seam, of hidden effects, as places of the
+    catalogue name them.
+    """
     names = {(block.ring, block.slot): block.name for block in build_magnet(study).blocks}
     found = {}
     for effect, values in faults:
@@ -450,8 +452,9 @@ def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
         places = [(given.get(f"{other}ring"), given.get(f"{other}slot"))
                   for other in ("", "other_")]
         found[effect] = [names[place] for place in places if place in names]
-        if "ring" in given and not given.keys() & {"slot", "slots", "other_ring"}:  # a ring alone
-            found[effect] = [f"r{given['ring']:02.0f}"]
+        ring = given.get("seam", given.get("ring"))
+        if ring is not None and not given.keys() & {"slot", "slots", "other_ring"}:  # a ring alone
+            found[effect] = [f"r{ring:02.0f}"]
     return found
 
 

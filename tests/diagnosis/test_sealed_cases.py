@@ -166,6 +166,23 @@ def test_magnets_and_maps_are_drawn(study):
     assert one.faults[1][1] == (2e-4,)
 
 
+def test_a_gap_is_compared_with_that_at_its_seam(study):
+    """A gap that stands for a displaced ring is not wrong by the difference of the two."""
+    magnet = study.drawn_study("mandhala", np.random.default_rng(2))
+    faults = [("ring_gap", (1.0, 2e-4)), ("ring_shifted_along", (3.0, 5e-4))]
+    labels = study.labels_of(magnet, faults)
+    assert labels == {"ring_gap": ["r01"], "ring_shifted_along": ["r03"]}
+    one = result([name for name, _ in faults], [["ring_gap", "ring_shifted_along"], ["ring_gap"]])
+    one |= {"labels": labels, "truth": [{"name": "ring_gap", "parameters": [
+        {"name": "seam", "value": 1.0}, {"name": "distance", "value": 2e-4}]}], "identified": [
+            identified("ring_gap", "r02", [5.2e-4], [1e-4], [("ring_shifted_along", "r03")]),
+            identified("ring_gap", "r01", [2.2e-4], [2e-5])]}
+    assert study.amplitude_errors(one) == pytest.approx([1.0])
+    assert study.wrong(one) == 0
+    # the control: where the gap is at another seam, so is its name
+    assert study.wrong(one | {"labels": labels | {"ring_gap": ["r03"]}}) == 1
+
+
 @pytest.mark.parametrize("name", ["clipped", "quantized", "warming", "lead_screw", "cable"])
 def test_causes_outside_the_catalogue_are_what_they_are_called(study, ring, name):
     case = study.Case(3, ring, (), name)
