@@ -35,8 +35,10 @@ from halbach_fe.core.files import is_told, make_folder, telling
 
 RECORD = "run.json"
 
-KEPT = ("*.msh", "*regions.json", "response.h5", "response-*.npy", "chains.nc")
-"""Files that a later run may read instead of writing them again; each is verified when it is."""
+KEPT = ("*.msh", "*regions.json", "response.h5", "response-*.npy", "chains.nc",
+        "[0-9][0-9][0-9][0-9]-*.json")
+"""Files that a later run may read instead of writing them again; each is verified when it is, but
+for sealed cases, the last."""
 
 _OF_RUNS = ("mesh.msh", "meridian.msh", "iron.msh", "regions.json", "meridian-regions.json",
             "iron-regions.json", "response.h5", "response-*.npy", "chains.nc", "getdp-*")

@@ -9,7 +9,7 @@ how large it is.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -204,9 +204,6 @@ def describe_unknown(
     factors = {kind: max(term.fitted.log_bayes_factor for term in first
                          if (term.family.acts_on == "field") == (kind == "field"))
                for kind in ("field", "instrument")}
-    is_field = shown.terms[0].family.acts_on == "field"
-    kind: Literal["field", "instrument"] = "field" if is_field else "instrument"
-    other = factors["instrument" if kind == "field" else "field"]
     points = search.nominal.points
     parts, total = [], np.zeros(points.shape)
     for number, term in enumerate(shown.terms):
@@ -218,7 +215,7 @@ def describe_unknown(
         parts.append(_part(term, field, rivals))
     size = np.linalg.norm(total, axis=1)
     source = None
-    if kind == "field":
+    if shown.terms[0].family.acts_on == "field":
         given = with_candidates(search.evidence, [search.candidates[k] for k in shown.effects])
         odds = log_bayes_factors(given, search.candidates)
         dipoles = [number for number, hypothesis in enumerate(search.hypotheses)
@@ -226,9 +223,24 @@ def describe_unknown(
         if dipoles:
             source = search.hypotheses[max(dipoles, key=lambda k: odds[k])].place.at_m
     return UnknownCause(
-        "either" if factors[kind] - other < INDISTINGUISHABLE_LOG_EVIDENCE else kind, factor,
+        kind_of([term.family.acts_on == "field" for term in shown.terms], factors), factor,
         not identified, ambiguous, float(size.max()),
         tuple(points[int(np.argmax(size))].tolist()), source, tuple(parts))
+
+
+def kind_of(
+    are_fields: Sequence[bool], factors: Mapping[str, float]
+) -> Literal["field", "instrument", "either"]:
+    """Return what a cause of any shape is, from whether its terms are fields, the largest first.
+
+    ``factors`` are the largest log Bayes factors of a ``field`` and of an ``instrument`` as its
+    first term. A displaced probe reads a field that Maxwell's equations allow, too, as long as it
+    is displaced alike on all lines: most of what a stage does looks like a field, and not all.
+    """
+    kind: Literal["field", "instrument"] = "field" if are_fields[0] else "instrument"
+    other = factors["instrument" if kind == "field" else "field"]
+    mixed = are_fields[0] and not all(are_fields)
+    return "either" if mixed or factors[kind] - other < INDISTINGUISHABLE_LOG_EVIDENCE else kind
 
 
 def _over_larger_noise(

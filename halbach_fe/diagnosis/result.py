@@ -276,7 +276,7 @@ class UnknownCause:
     kind : str
         ``field``: the discrepancy solves Maxwell's equations in the bore, so that a source outside
         the bore is missing; ``instrument``: it does not, so that the sensors are in error;
-        ``either``: the readings do not distinguish the two.
+        ``either``: the readings do not distinguish the two, or not all of it solves them.
     log_bayes_factor : float
         Log Bayes factor of the discrepancy over no effect at all if ``alone`` or ``ambiguous``, and
         over the identified effects otherwise.

@@ -310,7 +310,9 @@ def other_findings(diagnosis: Diagnosis) -> list[OtherFinding]:
             "outliers", "single readings that are outliers", "readings",
             f"{count} of {count + len(diagnosis.before.parts)}",
             f"{count} {'readings are outliers' if count > 1 else 'reading is an outlier'} and "
-            f"excluded ({text}).", place=text.removesuffix(" of the map")))
+            f"excluded ({text})"
+            f"{', unless what is unknown is largest there' if diagnosis.unknown else ''}.",
+            place=text.removesuffix(" of the map")))
     if diagnosis.solver_error:
         cause = diagnosis.solver_error
         found.append(OtherFinding(

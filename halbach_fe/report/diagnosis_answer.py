@@ -496,7 +496,8 @@ def _found(diagnosis: Diagnosis) -> list[str]:
             f"{decimals(after.prior_conflict)}, where {after.conflict_limit:.3g} would be rare), "
             f"and {effect} explains the difference, nor does a smooth field or sensor error."
             f"{other} The readings scatter as if their noise were "
-            f"{np.sqrt(after.prior_conflict):.2g} times as large as the study says: check that.")
+            f"{np.sqrt(after.prior_conflict):.2g} times as large as the study says: check that, "
+            "and what may change them from one to the next (mains, backlash, steps of a display).")
     for suspicion in diagnosis.suspected:
         sentences.append(suspicion_in_words(suspicion, titles))
     return sentences

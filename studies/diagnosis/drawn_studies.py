@@ -6,12 +6,16 @@ A magnet has 12 to 144 blocks and a map some 200 points, so that a diagnosis tak
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.measurement.positions import points_from
+from halbach_fe.measurement.scan_lines import goes_both_ways, motion
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
@@ -254,3 +258,191 @@ def _turns(body: Body) -> list[Floats]:
     easy = np.array(body.easy_axis)
     return [turn for turn in found
             if Rotation.from_rotvec(turn).apply(easy) @ easy < least_turn]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A map without the cause outside the catalogue that acts on it.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), in m
+        In the order of the scan.
+    outer : float, in m
+        Outer radius of the magnet.
+    axes : tuple of int
+        Components that are read.
+    field, readings : ndarray, shape (n, 3), in T
+        The true field there, and the readings with noise; 0 of components that are not read.
+    field_at : callable
+        The true field (n, 3) in T at points (n, 3) in m.
+    """
+
+    points: Floats
+    outer: float
+    axes: tuple[int, ...]
+    field: Floats
+    readings: Floats
+    field_at: Callable[[Floats], Floats]
+
+    @property
+    def time(self) -> Floats:
+        """Of every reading (n,), from 0 to 1."""
+        return np.linspace(0.0, 1.0, len(self.points))
+
+    def moved(self, way: Floats) -> Floats:
+        """Change (n, 3) of the field, in an arbitrary unit, where the probe is off by ``way`` (n,
+        3), in one as well; it is much less than a millimetre.
+        """
+        step_m = 1e-5
+        step = step_m * way / max(float(np.abs(way).max()), np.finfo(float).tiny)
+        return self.field_at(self.points + step) - self.field_at(self.points - step)
+
+
+def _coil(scan: Scan, generator: Generator) -> Floats:
+    """Return the field of a loop of current around the magnet."""
+    magpylib = import_extra("magpylib")
+    size = float(np.linalg.norm(scan.points, axis=1).max())
+    loop = magpylib.current.Circle(
+        current=1.0, diameter=size * generator.uniform(3, 5),
+        position=(0, 0, size * generator.uniform(-1, 1)))
+    return np.asarray(loop.getB(scan.points))
+
+
+def _ripple(scan: Scan, generator: Generator) -> Floats:
+    """Return an error of one sensor, periodic along z or, in a plane, along x."""
+    error, along = np.zeros_like(scan.points), scan.points[:, _longest(scan.points)]
+    error[:, generator.integers(2)] = np.sin(
+        2 * np.pi * along / (np.ptp(along) * generator.uniform(0.15, 0.4))
+        + generator.uniform(0, 6))
+    return error
+
+
+def _longest(points: Floats) -> int:
+    """Return the axis z of points (n, 3), or x if they are in a plane."""
+    return 2 if np.ptp(points[:, 2]) else 0
+
+
+def _long_quadrupole(scan: Scan, generator: Generator) -> Floats:
+    """Return the field of a long quadrupole."""
+    return np.asarray(scan.points * [1, -1, 0])
+
+
+def _lead_screw(scan: Scan, generator: Generator) -> Floats:
+    """Return what a screw does whose thread is off periodically, by some ten turns in the map."""
+    axis, way = _longest(scan.points), np.zeros_like(scan.points)
+    along = scan.points[:, axis]
+    way[:, axis] = np.sin(
+        2 * np.pi * along / (np.ptp(along) * generator.uniform(0.06, 0.12))
+        + generator.uniform(0, 6))
+    return scan.moved(way)
+
+
+def _warming(scan: Scan, generator: Generator) -> Floats:
+    """Return a drift of the zeros with a thermal time constant."""
+    return np.asarray((1 - np.exp(-scan.time / generator.uniform(0.03, 0.2)))[:, None]
+                      * generator.standard_normal(3))
+
+
+def _mains(scan: Scan, generator: Generator) -> Floats:
+    """Return a pickup of the mains, slow as it is sampled once a row."""
+    rows = np.arange(len(scan.points))
+    phase = 2 * np.pi * rows * generator.uniform(0.02, 0.45) + generator.uniform(0, 6)
+    return np.asarray(np.sin(phase)[:, None] * generator.standard_normal(3))
+
+
+def _play(values: Floats, width: float) -> Floats:
+    """Return what follows values (n,) with play, which is ``width`` to either side."""
+    shown = values[:1].tolist()
+    for value in values[1:].tolist():
+        shown.append(min(max(shown[-1], value - width), value + width))
+    return np.array(shown)
+
+
+def _hysteresis(scan: Scan, generator: Generator) -> Floats:
+    """Return the error of sensors that follow the field with play."""
+    return np.column_stack([
+        _play(values, 1e-3 * float(np.ptp(scan.field))) - values for values in scan.field.T])
+
+
+def _backlash(scan: Scan, generator: Generator) -> Floats:
+    """Return what a stage does that has play along one axis."""
+    way, axis = np.zeros_like(scan.points), int(generator.integers(3))
+    play_m = 1e-5
+    way[:, axis] = _play(scan.points[:, axis], play_m) - scan.points[:, axis]
+    return scan.moved(way)
+
+
+def _lag_one_way(scan: Scan, generator: Generator) -> Floats:
+    """Return what a stage does that is behind on its way down only."""
+    way = motion(scan.points)
+    return scan.moved(way * (way[:, 2:] < 0))
+
+
+def _bolt(scan: Scan, generator: Generator) -> Floats:
+    """Return the field of a long bolt of iron beside the magnet, magnetized along itself."""
+    magpylib = import_extra("magpylib")
+    angle, size = generator.uniform(0, 2 * np.pi), scan.outer
+    bolt = magpylib.magnet.Cylinder(
+        polarization=(0, 0, 1), dimension=(0.1 * size, size * generator.uniform(1, 2)),
+        position=1.25 * size * np.array([np.cos(angle), np.sin(angle), generator.uniform(-1, 1)]))
+    bolt.rotate_from_rotvec(generator.uniform(-1, 1) * np.array(  # its lower end stays outside
+        [-np.sin(angle), np.cos(angle), 0]) * 0.3, degrees=False)
+    return np.asarray(bolt.getB(scan.points))
+
+
+def _cubic_of_magnitude(scan: Scan, generator: Generator) -> Floats:
+    """Return the error of a probe whose sensitivity falls with the square of |B|."""
+    return np.asarray(scan.field * np.sum(scan.field**2, axis=1)[:, None])
+
+
+def _planar_hall_of_another(scan: Scan, generator: Generator) -> Floats:
+    """Return the error of a sensor by the product of its own component and another."""
+    error, axis = np.zeros_like(scan.field), int(generator.choice(scan.axes))
+    other = (axis + int(generator.integers(1, 3))) % 3
+    error[:, axis] = scan.field[:, axis] * scan.field[:, other]
+    return error
+
+
+def _cable(scan: Scan, generator: Generator) -> Floats:
+    """Return what a cable does that pulls the probe aside near one end of the map."""
+    along, angle = scan.points[:, _longest(scan.points)], generator.uniform(0, 2 * np.pi)
+    pull = np.exp((along - along.max()) / (np.ptp(along) * generator.uniform(0.08, 0.2)))
+    return scan.moved(pull[:, None] * [np.cos(angle), np.sin(angle), 0])
+
+
+def _clipped(scan: Scan, generator: Generator) -> Floats:
+    """Return what readings lack beyond the range of the probe, which some of them exceed."""
+    limit = float(np.quantile(np.abs(scan.readings[:, scan.axes]), generator.uniform(0.94, 0.98)))
+    return np.clip(scan.readings, -limit, limit) - scan.readings
+
+
+def _quantized(scan: Scan, generator: Generator) -> Floats:
+    """Return what readings lack of which some hundred steps are shown."""
+    step = float(np.ptp(scan.readings)) / generator.uniform(150, 500)
+    return step * np.round(scan.readings / step) - scan.readings
+
+
+Outside = Callable[[Scan, Generator], Floats]
+"""Function of a map that returns what a cause changes (n, 3), in an arbitrary unit."""
+
+OUTSIDE: Mapping[str, Outside] = {"coil": _coil, "ripple": _ripple, "quadrupole": _long_quadrupole}
+"""Causes outside the catalogue."""
+
+NEWER_OUTSIDE: Mapping[str, Outside] = {
+    "lead_screw": _lead_screw, "warming": _warming, "mains": _mains, "hysteresis": _hysteresis,
+    "bolt": _bolt, "cubic_of_magnitude": _cubic_of_magnitude,
+    "planar_hall_of_another": _planar_hall_of_another, "backlash": _backlash, "cable": _cable,
+    "clipped": _clipped, "quantized": _quantized, "lag_one_way": _lag_one_way}
+"""Those of cases that come after all others, whose seeds thus stay as they were."""
+
+OF_OWN_SIZE = ("clipped", "quantized")
+"""Those whose size is that of the readings."""
+
+TO_AND_FRO = ("backlash", "lag_one_way")
+"""Those of a stage that comes back."""
+
+
+def can_have(study: Study, outside: str) -> bool:
+    """Tell whether the map of a study can show a cause outside the catalogue."""
+    return outside not in TO_AND_FRO or goes_both_ways(points_from(study.observation.positions))

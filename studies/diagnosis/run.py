@@ -15,23 +15,32 @@ import os
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from drawn_studies import MAGNETS, drawn_fault, drawn_magnet, drawn_study
+from drawn_studies import (
+    MAGNETS,
+    NEWER_OUTSIDE,
+    OF_OWN_SIZE,
+    OUTSIDE,
+    Scan,
+    can_have,
+    drawn_fault,
+    drawn_magnet,
+    drawn_study,
+)
 from sealed_cases_page import page
 
 from halbach_fe.cli import common
 from halbach_fe.core.errors import CheckFailedError, HalbachError
 from halbach_fe.core.files import write_text
-from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.material import TYPICAL_COEFFICIENT_PER_K
@@ -60,6 +69,7 @@ from halbach_fe.study.model import Study
 from halbach_fe.study.reader import read_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.hidden_effects import EFFECTS as CAN_BE_HIDDEN
+from halbach_fe.synthetic.hidden_effects.effect_types import site_of
 from halbach_fe.synthetic.simulate import SimulatedCampaign, simulate_campaign, true_field
 from halbach_fe.synthetic.true_magnet import TrueMagnet
 
@@ -131,23 +141,29 @@ class Case:
         return f"{self.seed:04d}-{self.study.name}-{hidden}"
 
 
-def drawn_case(seed: int, hidden: Sequence[str], outside: str = "") -> Case:
-    """Draw magnets until one, with its map, can have the effects."""
+def drawn_case(
+    seed: int, hidden: Sequence[str], outside: str = "", magnets: Collection[str] = tuple(MAGNETS)
+) -> Case:
+    """Draw magnets until one of some kinds, with its map, can have the effects."""
     generator = np.random.default_rng([seed, 45])
     while True:
         study = drawn_study(drawn_magnet(generator), generator)
         faults = [(name, values) for name in hidden
                   if (values := drawn_fault(name, study, generator)) is not None]
         with_blocks = bool(generator.integers(2))
-        if len(faults) == len(hidden) and (with_blocks or "rings_swapped" not in hidden):
+        if len(faults) == len(hidden) and (with_blocks or "rings_swapped" not in hidden) and (
+                study.name in magnets and can_have(study, outside)):
             return Case(seed, study, tuple(faults), outside, with_blocks)
 
 
-def cases(singles: int, clean: int, pairs: int, outside: int, first: int = 0) -> list[Case]:
+def cases(
+    singles: int, clean: int, pairs: int, outside: int, newer_outside: int = 0, first: int = 0,
+    magnets: Collection[str] = tuple(MAGNETS)
+) -> list[Case]:
     """Effects that the campaign can hide, alone and in pairs of small ones; none; others.
 
-    They are mixed, so that the first ones are of all kinds; those that take long are the last.
-    ``first`` is the smallest seed, which no other set of cases may have.
+    They are mixed, so that the first ones are of all kinds; those that take long are the last, but
+    for newer ones. ``first`` is the smallest seed, which no other set of cases may have.
     """
     names = [name for name in CAN_BE_HIDDEN if name not in NEWER]
     small = [name for name in names if CAN_BE_HIDDEN[name].group != "gross" and name not in SLOW]
@@ -160,50 +176,31 @@ def cases(singles: int, clean: int, pairs: int, outside: int, first: int = 0) ->
     mixed = [drawn[number] for number in generator.permutation(len(drawn))]
     mixed.sort(key=lambda one: bool(set(one[0]) & set(SLOW)))
     mixed += [((name,), "") for _ in range(singles) for name in NEWER]
-    return [drawn_case(first + number, *each) for number, each in enumerate(mixed)]
+    mixed += [((), name) for _ in range(newer_outside) for name in NEWER_OUTSIDE]
+    return [drawn_case(first + number, *each, magnets) for number, each in enumerate(mixed)]
 
 
-def coil(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Field (n, 3) of a loop of current around the magnet, in an arbitrary unit."""
-    magpylib = import_extra("magpylib")
-    size = float(np.linalg.norm(points, axis=1).max())
-    loop = magpylib.current.Circle(
-        current=1.0, diameter=size * generator.uniform(3, 5),
-        position=(0, 0, size * generator.uniform(-1, 1)))
-    return np.asarray(loop.getB(points))
-
-
-def ripple(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Error (n, 3) of one sensor, periodic along z or, in a plane, along x."""
-    error, along = np.zeros_like(points), points[:, 2 if np.ptp(points[:, 2]) else 0]
-    error[:, generator.integers(2)] = np.sin(
-        2 * np.pi * along / (np.ptp(along) * generator.uniform(0.15, 0.4))
-        + generator.uniform(0, 6))
-    return error
-
-
-def quadrupole(points: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Field (n, 3) of a long quadrupole."""
-    return np.asarray(points * [1, -1, 0])
-
-
-OUTSIDE = {"coil": coil, "ripple": ripple, "quadrupole": quadrupole}
 OUTSIDE_NAME = "outside"
 """Name of their log Bayes factor among those of hidden effects."""
 
 OUTSIDE_SIZES = (5.0, 20.0)
-"""Their rms over all readings, in units of the noise."""
+"""Rms over all readings of causes outside the catalogue, in units of the noise."""
 
 
-def with_outside(case: Case, readings: xr.Dataset) -> xr.Dataset:
-    """Return a map with the cause outside the catalogue of a case."""
+def with_outside(case: Case, campaign: SimulatedCampaign) -> xr.Dataset:
+    """Return the map of a campaign with the cause outside the catalogue of a case."""
     assert case.study.noise is not None
-    generator = np.random.default_rng(case.seed)
-    added = OUTSIDE[case.outside](points_of(readings), generator)
-    there = np.isfinite(readings["B_T"].values)
+    readings, generator = campaign.readings, np.random.default_rng(case.seed)
+    points, there = points_of(readings), np.isfinite(readings["B_T"].values)
+    at = partial(true_field, campaign.magnet)
+    scan = Scan(points, site_of(case.study, campaign.magnet).outer,
+                tuple(np.flatnonzero(there.any(axis=0)).tolist()), at(points),
+                np.nan_to_num(readings["B_T"].values), at)
+    added = (OUTSIDE | NEWER_OUTSIDE)[case.outside](scan, generator)
     size = (generator.choice([-1, 1]) * generator.uniform(*OUTSIDE_SIZES)
             * case.study.noise.regions[0].sigma_T / np.sqrt(np.mean(added[there]**2)))
-    return readings.assign(B_T=readings["B_T"] + size * added)
+    return readings.assign(B_T=readings["B_T"] + (
+        added if case.outside in OF_OWN_SIZE else size * added))
 
 
 def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, Any]:
@@ -211,7 +208,7 @@ def run_case(case: Case, session: Session, solver: NominalSolver) -> dict[str, A
     study = case.study
     campaign = simulate_campaign(study, case.seed, hide=[
         (CAN_BE_HIDDEN[name], values) for name, values in case.faults])
-    readings = with_outside(case, campaign.readings) if case.outside else campaign.readings
+    readings = with_outside(case, campaign) if case.outside else campaign.readings
     blocks = campaign.blocks if case.with_blocks else None
     found = diagnose(study, readings, session, blocks, solver=solver)
     best = own_factors(found, case.hidden)
@@ -444,7 +441,9 @@ def is_promised(result: dict[str, Any]) -> bool:
 
 def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
               ) -> dict[str, list[str]]:
-    """Return the blocks, or the ring, of hidden effects, as places of the catalogue name them."""
+    """Return the blocks, the ring, or that below a seam, of hidden effects, as places of the
+    catalogue name them.
+    """
     names = {(block.ring, block.slot): block.name for block in build_magnet(study).blocks}
     found = {}
     for effect, values in faults:
@@ -453,8 +452,9 @@ def labels_of(study: Study, faults: Sequence[tuple[str, tuple[float, ...]]]
         places = [(given.get(f"{other}ring"), given.get(f"{other}slot"))
                   for other in ("", "other_")]
         found[effect] = [names[place] for place in places if place in names]
-        if "ring" in given and not given.keys() & {"slot", "slots", "other_ring"}:  # a ring alone
-            found[effect] = [f"r{given['ring']:02.0f}"]
+        ring = given.get("seam", given.get("ring"))
+        if ring is not None and not given.keys() & {"slot", "slots", "other_ring"}:  # a ring alone
+            found[effect] = [f"r{ring:02.0f}"]
     return found
 
 
@@ -628,7 +628,7 @@ def run_one(
 def run(arguments: argparse.Namespace) -> int:
     """Run all cases and print the rates."""
     chosen = cases(arguments.singles, arguments.clean, arguments.pairs, arguments.outside,
-                   arguments.first)
+                   arguments.newer_outside, arguments.first, arguments.magnets)
     if arguments.only:
         chosen = [one for one in chosen if one.seed in arguments.only]
     paths = [arguments.output / "cases" / f"{case.name}.json" for case in chosen]
@@ -690,11 +690,15 @@ def report(study: Study, results: list[dict[str, Any]], folder: Path) -> dict[st
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add this study's own options."""
-    for name, count in (("singles", 1), ("clean", 10), ("pairs", 20), ("outside", 9)):
+    for name, count in (("singles", 1), ("clean", 10), ("pairs", 20), ("outside", 9),
+                        ("newer-outside", 1)):
         parser.add_argument(f"--{name}", type=int, default=count, metavar="N",
-                            help="cases (of each effect, for singles; default: %(default)s)")
+                            help="cases (of each effect or cause, for singles and newer-outside; "
+                                 "default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, metavar="N",
                         help="seed of the first case, for others than the usual ones")
+    parser.add_argument("--magnets", nargs="+", choices=tuple(MAGNETS), default=tuple(MAGNETS),
+                        help="kinds of magnets (default: all)")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="seeds of cases")
 
 

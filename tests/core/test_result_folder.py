@@ -54,6 +54,17 @@ def test_what_is_stale_is_removed(tmp_path):
     assert listed(folder) == {RECORD, "other.html", "notes.txt", "edited.toml", "response.h5"}
 
 
+def test_cases_of_an_interrupted_run_stay(tmp_path):
+    """A run of sealed cases that went on removed those that it had not run itself, hours of them,
+    once all its checks passed.
+    """
+    run(tmp_path, "cases/0003-dipole-lag.json", "cases/other.json", command="study diagnosis")
+    run(tmp_path, "cases/0004-rods-none.json", command="study diagnosis")
+    assert listed(tmp_path) == {  # the control: another name is stale
+        RECORD, "cases/0003-dipole-lag.json", "cases/0004-rods-none.json"}
+    run(tmp_path, "cases/0004-rods-none.json", command="study diagnosis")  # may be written again
+
+
 @pytest.mark.parametrize("owner", [{"command": "infer"}, {"study": "b"}])
 def test_a_mixture_is_refused(tmp_path, owner):
     run(tmp_path, "report.html")

@@ -14,6 +14,7 @@ from halbach_fe.diagnosis.discriminating_measurements import separations
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Hypothesis, Parameter, Place
 from halbach_fe.diagnosis.model_selection import MAX_EFFECTS, Candidate
+from halbach_fe.diagnosis.outliers import Outlier
 from halbach_fe.diagnosis.result import (
     IdentifiedEffect,
     Imitation,
@@ -123,6 +124,12 @@ def test_verdicts(flat, tmp_path):
     unknown = UnknownCause("either", 40.0, False, False, 2e-4, (0.05, 0.0, 0.0), None)
     assert "nothing" not in verdict(found)
     assert "outside the catalogue remains" in verdict(replace(found, unknown=unknown))
+    odd = Outlier(7, "z", (0.05, 0.0, 0.0), 1e-3, 1e-5)
+    for what in (None, unknown):  # a rough cause may leave single readings that look like outliers
+        said = answer(replace(found, outliers=(odd,), unknown=what)).said
+        assert ("is an outlier and excluded (row 7 of the map), unless what is unknown is largest"
+                in said) == bool(what)
+        assert "is an outlier and excluded (row 7 of the map)" in said
     tie = replace(unknown, ambiguous=True)
     assert "A single cause outside the catalogue could equally well" in verdict(
         replace(found, unknown=tie))

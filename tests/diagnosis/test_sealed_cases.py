@@ -166,6 +166,47 @@ def test_magnets_and_maps_are_drawn(study):
     assert one.faults[1][1] == (2e-4,)
 
 
+def test_a_gap_is_compared_with_that_at_its_seam(study):
+    """A gap that stands for a displaced ring is not wrong by the difference of the two."""
+    magnet = study.drawn_study("mandhala", np.random.default_rng(2))
+    faults = [("ring_gap", (1.0, 2e-4)), ("ring_shifted_along", (3.0, 5e-4))]
+    labels = study.labels_of(magnet, faults)
+    assert labels == {"ring_gap": ["r01"], "ring_shifted_along": ["r03"]}
+    one = result([name for name, _ in faults], [["ring_gap", "ring_shifted_along"], ["ring_gap"]])
+    one |= {"labels": labels, "truth": [{"name": "ring_gap", "parameters": [
+        {"name": "seam", "value": 1.0}, {"name": "distance", "value": 2e-4}]}], "identified": [
+            identified("ring_gap", "r02", [5.2e-4], [1e-4], [("ring_shifted_along", "r03")]),
+            identified("ring_gap", "r01", [2.2e-4], [2e-5])]}
+    assert study.amplitude_errors(one) == pytest.approx([1.0])
+    assert study.wrong(one) == 0
+    # the control: where the gap is at another seam, so is its name
+    assert study.wrong(one | {"labels": labels | {"ring_gap": ["r03"]}}) == 1
+
+
+@pytest.mark.parametrize("name", ["clipped", "quantized", "warming", "lead_screw", "cable"])
+def test_causes_outside_the_catalogue_are_what_they_are_called(study, ring, name):
+    case = study.Case(3, ring, (), name)
+    campaign = study.simulate_campaign(ring, 3)
+    shown = study.with_outside(case, campaign)["B_T"].values
+    before = campaign.readings["B_T"].values
+    change = shown - before
+    if name == "clipped":
+        assert np.abs(shown).max() < np.abs(before).max()
+        assert (change[np.abs(shown) < np.abs(shown).max()] == 0).all()
+    elif name == "quantized":
+        steps = np.diff(np.unique(shown.round(9)))
+        steps /= steps.min()
+        assert steps == pytest.approx(steps.round(), abs=1e-3)
+    elif name == "warming":  # towards a limit, from 0
+        assert (change[0] == 0).all()
+        assert (np.abs(change[-1] - change[-20]) < 0.3 * np.abs(change[20])).all()
+    else:  # a displaced probe: the difference of fields that have no sources there
+        assert 5 <= np.sqrt(np.mean(change**2)) / ring.noise.regions[0].sigma_T <= 20
+    # the control: without the cause nothing is changed
+    assert name in study.NEWER_OUTSIDE
+    assert (change != 0).any()
+
+
 def made_up_cases(generator, sharpened):
     """300 cases that state a probability of gain_z and give the rest to offset_z.
 
@@ -210,9 +251,11 @@ def test_naming_error_leaves_out_what_it_cannot_judge(study, tmp_path):
 
 
 def test_every_effect_that_can_be_hidden_is_in_a_case(study):
-    cases = study.cases(1, 1, 1, 1)
+    cases = study.cases(1, 1, 1, 1, 1)
     assert {name for one in cases for name in one.hidden} == set(study.CAN_BE_HIDDEN)
-    assert len(cases) == len(study.CAN_BE_HIDDEN) + 3
+    newer = list(study.NEWER_OUTSIDE)  # the last, so that published seeds stay
+    assert [one.outside for one in cases[-len(newer):]] == newer
+    assert len(cases) == len(study.CAN_BE_HIDDEN) + 3 + len(newer)
     assert len({one.seed for one in cases}) == len(cases)
     assert {one.study.name for one in cases} == set(study.MAGNETS)
     assert np.isnan(study.rate([]))
