@@ -379,18 +379,6 @@ def _lag_one_way(scan: Scan, generator: Generator) -> Floats:
     return scan.moved(way * (way[:, 2:] < 0))
 
 
-def _bolt(scan: Scan, generator: Generator) -> Floats:
-    """Return the field of a long bolt of iron beside the magnet, magnetized along itself."""
-    magpylib = import_extra("magpylib")
-    angle, size = generator.uniform(0, 2 * np.pi), scan.outer
-    bolt = magpylib.magnet.Cylinder(
-        polarization=(0, 0, 1), dimension=(0.1 * size, size * generator.uniform(1, 2)),
-        position=1.25 * size * np.array([np.cos(angle), np.sin(angle), generator.uniform(-1, 1)]))
-    bolt.rotate_from_rotvec(generator.uniform(-1, 1) * np.array(  # its lower end stays outside
-        [-np.sin(angle), np.cos(angle), 0]) * 0.3, degrees=False)
-    return np.asarray(bolt.getB(scan.points))
-
-
 def _cubic_of_magnitude(scan: Scan, generator: Generator) -> Floats:
     """Return the error of a probe whose sensitivity falls with the square of |B|."""
     return np.asarray(scan.field * np.sum(scan.field**2, axis=1)[:, None])
@@ -431,9 +419,9 @@ OUTSIDE: Mapping[str, Outside] = {"coil": _coil, "ripple": _ripple, "quadrupole"
 
 NEWER_OUTSIDE: Mapping[str, Outside] = {
     "lead_screw": _lead_screw, "warming": _warming, "mains": _mains, "hysteresis": _hysteresis,
-    "bolt": _bolt, "cubic_of_magnitude": _cubic_of_magnitude,
-    "planar_hall_of_another": _planar_hall_of_another, "backlash": _backlash, "cable": _cable,
-    "clipped": _clipped, "quantized": _quantized, "lag_one_way": _lag_one_way}
+    "cubic_of_magnitude": _cubic_of_magnitude, "planar_hall_of_another": _planar_hall_of_another,
+    "backlash": _backlash, "cable": _cable, "clipped": _clipped, "quantized": _quantized,
+    "lag_one_way": _lag_one_way}
 """Those of cases that come after all others, whose seeds thus stay as they were."""
 
 OF_OWN_SIZE = ("clipped", "quantized")
