@@ -987,10 +987,10 @@ class EvidenceByPart:
 
 
 def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
-    """Return all parameters of the instrument.
+    """Return all parameters of the instrument, the same ones in the same order for every map.
 
     ``shares`` (3, 3) is how much each element of the matrix of gains and crosstalk changes |B|, see
-    `ProbeModel.shares`.
+    `ProbeModel.shares`. What no map of such shares can tell has a ``row`` of 0.
     """
     # Share of a component in the mean square of the field from which its gain is that of |B|.
     all_of_it = 0.99
@@ -1012,8 +1012,8 @@ def all_parameters(prior_sd: Floats, shares: Floats) -> list[Parameter]:
         add(f"B{COMPONENTS[first]} and B{COMPONENTS[second]} not perpendicular", "mrad", 1e3,
             {MIXING.start + 3 + axis: 1.0})
     of_size = np.einsum("mij,ij->m", MATRICES, shares)
-    for own in np.flatnonzero(np.diag(shares) < all_of_it).tolist():
-        weights = MATRICES[:, own, own] - of_size
+    for own in range(3):
+        weights = (MATRICES[:, own, own] - of_size) * (shares[own, own] < all_of_it)
         add(f"gain of B{COMPONENTS[own]} relative to that of |B|", "%", 100.0,
             dict(enumerate(weights.tolist(), MIXING.start)), (MIXING.start + 6 + own,))
     for (when, by_wave), own in product(CHANGES.items(), range(3)):
@@ -1269,7 +1269,7 @@ def _shown(
     """
     # A parameter is determined if its standard deviation is below this part of its prior one.
     determined = 0.5
-    if not parameter.row.any():  # it is not asked, see `ProbeModel`
+    if not parameter.row.any():  # it is not asked, see `all_parameters`
         return InstrumentTerm(parameter.name, parameter.unit, 0.0, 0.0, False, True)
     used = np.flatnonzero(kept | np.isin(np.arange(len(kept)), parameter.own))
     row = parameter.row[used]

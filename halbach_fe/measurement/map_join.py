@@ -1220,7 +1220,7 @@ def _own_terms(
         open_terms[gain] = True
         first = model.own(number).start
         for parameter in all_parameters(model.any_sd[model.own(number)], shares):
-            if set(parameter.own) <= set(range(TERMS)[MIXING]):
+            if parameter.row.any() and set(parameter.own) <= set(range(TERMS)[MIXING]):
                 row = np.zeros(len(open_terms))
                 row[model.own(number)] = parameter.row
                 own = tuple(first + each for each in parameter.own)
@@ -1234,7 +1234,8 @@ def _common_terms(model: JoinedModel, shares: Floats) -> list[Parameter]:
     """Return the terms that all maps have in common, as parameters."""
     found = []
     for parameter in all_parameters(model.any_sd[:TERMS], shares):
-        if COMMON[list(parameter.own)].all() and (model.prior_sd[list(parameter.own)] > 0).all():
+        own = list(parameter.own)
+        if parameter.row.any() and COMMON[own].all() and (model.prior_sd[own] > 0).all():
             row = np.zeros(len(model.any_sd))
             row[:TERMS] = parameter.row
             found.append(Parameter(f"{parameter.name}, in all maps", parameter.unit, row,

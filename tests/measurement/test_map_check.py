@@ -403,6 +403,18 @@ def test_a_turn_is_found_where_the_field_is_not_rough(monkeypatch, shares, found
     assert abs(term.value - value) < 2 * term.sd
 
 
+def test_one_component_may_be_nearly_all_of_the_field(generator, monkeypatch):
+    """Its gain is that of |B| in some regions of a map, and hardly another one elsewhere."""
+    counted = iter(range(100))
+    monkeypatch.setattr(ProbeModel, "shares", lambda *_: np.diag(
+        [[0.006, 0.005, 0.989], [0.005, 0.004, 0.991]][next(counted) % 2]))
+    check = check_map(field_map(GRID, read_by(generator, turn_rad=(0.0, 0.0, 0.02))))
+    assert next(counted) > 2
+    assert abs(named(check, "probe turned about z").value) == pytest.approx(20.0, abs=2.0)
+    assert [term.name for term in check.terms if term.name.startswith("gain of B")] == [
+        f"gain of B{axis} relative to that of |B|" for axis in "xyz"]
+
+
 def test_what_charges_cannot_follow_is_no_error_of_the_probe(generator):
     """Readings exact to 1 uT of the field of a far dipole."""
     steps = 0.01 * np.arange(-3, 4)
