@@ -70,7 +70,7 @@ LONGEST = [
     "inference/test_mcmc.py", "synthetic/test_reaction.py", "inference/test_registration.py",
     "inference/test_campaign.py", "response/test_resource_estimate.py",
     "response/test_mesh_convergence.py", "solver/test_getdp_cache.py", "api/test_examples.py",
-    "inference/test_block_prior.py",
+    "inference/test_block_prior.py", "diagnosis/test_iron_faults.py",
 ]
 """Files that take half a minute or more of processor time, the longest first."""
 

@@ -192,13 +192,21 @@ class Linearization:
     def of_identified(self, present: IdentifiedEffect) -> tuple[Floats, Floats]:
         """Return the whitened signature (rows, k) of an effect in the model, and its amounts (k,).
 
-        That of an effect which is applied in full is the difference that it makes.
+        That of an effect which is applied in full is the difference that it makes. The product of
+        both is what the effect contributes to the model.
         """
         hypothesis = present.hypothesis
         effect, scale = hypothesis.effect, amplitude_scale(hypothesis.effect)
         amounts = np.pad(present.values, (0, len(scale) - len(present.values)))
         if not effect.applied_in_full:
-            return self.training.shown(self.scene.derivative(hypothesis, amounts)), amounts
+            signature = self.training.shown(self.scene.derivative(hypothesis, amounts))
+            size = len(effect.parameters)
+            if amounts[size:].any() and amounts[:size].any():
+                # without its parameters it is absent, wherever its refinements have put it
+                moved = signature[:, size:] @ amounts[size:]
+                signature[:, :size] -= np.outer(
+                    moved, amounts[:size] / (amounts[:size] @ amounts[:size]))
+            return signature, amounts
         amounts[0] = 1.0
         without = self._scene_of(self.campaign.with_terms(apply_effects(self.corrected, [
             one for one in self.identified if one is not present]), self.update.terms),

@@ -217,6 +217,8 @@ def with_rough_mesh(study: Study) -> Study:
     radii = (radii for _, radii in build_magnet(study).ring_sections)
     rough_meridian_elements = 3  # across the blocks, where a tenth of the accuracy suffices
     rough = min(outer - inner for inner, outer in radii) / rough_meridian_elements
+    if not rough:  # a block on the axis, whose ring is a point
+        return study
     return study.with_(mesh__meridian_size_m=max(rough, study.mesh.meridian_size_m or 0.0))
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import magpylib
 import numpy as np
 import pytest
 
 from halbach_fe.diagnosis.diagnose import diagnose
 from halbach_fe.diagnosis.effects import catalogue
-from halbach_fe.diagnosis.effects.base import Place
+from halbach_fe.diagnosis.effects.base import Hypothesis, Place
 from halbach_fe.diagnosis.effects.surroundings import FerromagneticObjectEffect
+from halbach_fe.diagnosis.linearization import Linearization
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.diagnosis.summary import diagnosis_summary
 from halbach_fe.measurement.field_map import field_map, points_of
@@ -90,3 +93,43 @@ def test_derivatives_by_the_position():
         change = (shown(values + moved) - shown(values - moved)) / (2 * step)
         assert np.abs(found[number] - change).max() < 1e-3 * np.abs(change).max()
         assert np.abs(found[number] + change).max() > np.abs(change).max()
+
+
+def test_what_an_object_contributes_is_its_field():
+    """Also where the refinements have moved it far: without moments it is absent."""
+    effect, points = FerromagneticObjectEffect(), CIRCLES[:20]
+    nominal = NominalFields(STUDY, points, np.zeros(20), lambda _: np.zeros((20, 3)))
+    place, values = Place(at_m=(0.2, 0.0, 0.1)), np.array([1.0, 0.5, -2.0, 0.05, -0.04, 0.03])
+    slopes = effect.derivative(nominal, place, values.tolist())
+    point = SimpleNamespace(
+        training=SimpleNamespace(shown=lambda fields: fields.reshape(6, -1).T.copy()),
+        scene=SimpleNamespace(derivative=lambda *_: slopes))
+    present = SimpleNamespace(hypothesis=Hypothesis(effect, place), values=values)
+    signature, amounts = Linearization.of_identified(point, present)
+    own = dipole_field(values[3:] + place.at_m, values[:3], points).ravel()
+    np.testing.assert_allclose(signature @ amounts, own, rtol=1e-9, atol=1e-12)
+    unchanged = slopes.reshape(6, -1).T
+    assert np.abs(unchanged @ amounts - own).max() > 0.2 * np.abs(own).max()  # the control
+    assert np.array_equal(signature[:, 3:], unchanged[:, 3:])
+
+
+@pytest.mark.parametrize("at_m", [(0.25, 0.0, 0.1), (0.0, 0.0, 0.3495)])
+def test_iron_answers_to_an_object_in_the_model(at_m):
+    """By a stand-in for the solver with which it doubles its field; the second one has the iron
+    within a step, and moves to the other side.
+    """
+    effect, points, values = FerromagneticObjectEffect(), CIRCLES[:20], [1.0, 0.5, -2.0]
+    beside = STUDY.with_(external={}, iron={"relative_permeability": 30.0, "bodies": [
+        {"kind": "box", "size_m": [0.1] * 3, "centre_m": [0.0, 0.0, 0.4 + 1e-5]}]})
+    place, zero = Place(at_m=at_m), [0.0] * 3
+
+    def solve(study):
+        return 2 * sum(dipole_field(np.array(one.position_m), np.array(one.moment_A_m2), points)
+                       for one in study.external.dipoles)
+
+    alone = effect.derivative(NominalFields(beside, points, np.zeros(20), solve), place,
+                              values + zero)
+    there = NominalFields(effect.apply(beside, place, values), points, np.zeros(20), solve)
+    found = effect.derivative(there, place, values + zero)
+    for each, twice in zip(found, 2 * alone, strict=True):  # one-sided differences of 0.5 mm
+        assert np.abs(each - twice).max() < 0.02 * np.abs(twice).max()

@@ -182,3 +182,17 @@ def test_places_resemble_their_representatives(name, tmp_path):
         # twice what is noticed at the least, also if chance takes three standard deviations
         assert most > 2 * np.sqrt(NOTICEABLE_CHI2) + 3, place
         assert most > 0.5 * seen[number, number], place
+
+
+def test_a_block_on_the_axis_has_no_rough_meridian():
+    """It is no ring; the control is the block beside the axis."""
+    def study_at(x_m):
+        return parse_study({"name": "cube", "mesh": {"block_size_m": 0.01}, "dimension": 3,
+            "observation": {"quantity": "flux_density", "positions": {
+                "kind": "points", "points_m": [[0.1, 0, 0]]}},
+            "array": {"free_blocks": {
+                "name": ["cube"], "shape": ["cuboid"], "x_m": [x_m], "y_m": [0.0], "z_m": [0.0],
+                "size_x_m": [0.02], "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.3]}}})
+
+    assert with_rough_mesh(study_at(0.0)) == study_at(0.0)
+    assert with_rough_mesh(study_at(0.03)).mesh.meridian_size_m > 1e-3

@@ -136,12 +136,37 @@ class FerromagneticObjectEffect(Effect):
         return np.array([_field(position, moment, nominal.points) for moment in np.eye(3)])
 
     def derivative(self, nominal: NominalFields, place: Place, values: Sequence[float]) -> Floats:
+        """See `Effect.derivative`: of an object in the model with what iron answers to it.
+
+        Without that answer the search leaves an object between plates, and finds it again.
+        """
         position, moment = _at(place, values), np.array(values[:3])
+        if nominal.study.external.dipoles and external_acts(nominal.magnet):
+            return self._derivative_beside_iron(nominal, place, values)
         slopes = [(_field(position + step, moment, nominal.points)
                    - _field(position - step, moment, nominal.points)) / (2 * STEP_M)
                   for step in STEP_M * np.eye(3)]
         fields = [_field(position, unit, nominal.points) for unit in np.eye(3)]
         return np.array([*fields, *slopes])
+
+    def _derivative_beside_iron(
+        self, nominal: NominalFields, place: Place, values: Sequence[float]
+    ) -> Floats:
+        """Return the derivative (6, n, 3) by solving for a moment and for a displacement more."""
+        moment, away = np.array(values[:3]), np.resize([*values[3:], 0.0, 0.0, 0.0], 3)
+        size = float(np.linalg.norm(moment)) or 1.0  # as large as it is, far above rounding
+
+        def change(*objects: tuple[Floats, Floats]) -> Floats:
+            study = nominal.study
+            for strength, position in objects:
+                study = self.apply(study, place, [*strength, *position])
+            return nominal.solve(study) - nominal.finite_element_field
+
+        steps = [-step if nominal.magnet.contains((_at(place, values) + step)[None]).any() else step
+                 for step in STEP_M * np.eye(3)]
+        return np.array([
+            *(change((size * unit, away)) / size for unit in np.eye(3)),
+            *(change((moment, away + step), (-moment, away)) / step.sum() for step in steps)])
 
     def apply(self, study: Study, place: Place, values: Sequence[float]) -> Study:
         """See `Effect.apply`.
