@@ -131,20 +131,35 @@ def test_the_field_in_the_middle_is_said_first(given):
 
 def test_blocks_that_are_not_as_designed_are_named(given):
     """Below the title of every page, so that no number of theirs is read as the design's."""
-    def said(*exceptions):
-        return faults_in_words(given.study.with_(array__exceptions=exceptions))
+    def said(*exceptions, study=given.study):
+        return faults_in_words(study.with_(array__exceptions=exceptions))
 
     assert said() == ""
     assert said({"ring": 1, "slot": 3, "displacement_m": (1e-4, 0, 0)}) == ""
     assert said({"ring": 1, "slot": 3, "magnetization_factor": -0.98},
                 {"ring": 1, "slot": 5, "magnetization_factor": 0}) == (
         "reversed: ring 1, slot 3; missing: ring 1, slot 5")
-    assert said({"ring": 1, "slot": 1, "mounted_from": (1, 2)},
-                {"ring": 1, "slot": 2, "mounted_from": (1, 1)}) == (
+    exchanged = ({"ring": 1, "slot": 1, "mounted_from": (1, 2)},
+                 {"ring": 1, "slot": 2, "mounted_from": (1, 1)})
+    along_radius = parse_study(changed(MAGNET, array__block={"shape": "sector"}))
+    assert said(*exchanged, study=along_radius) == (
         "made for another place: ring 1, slot 1; ring 1, slot 2")
+    assert said(*exchanged) == ""  # equal cubes, each along its magnetization, as `shim` swaps them
     assert said({"ring": 1, "slot": 3, "rotation_deg": (0, 5.0, 0)},  # a slot allows that
                 {"ring": 1, "slot": 4, "rotation_deg": (-180.0, 0, 0)}) == (
         "put in the wrong way: ring 1, slot 4")
+    # Turned about its magnetization: a cube is as designed, a bar that fits the slot is not.
+    turned = {"ring": 1, "slot": 1, "rotation_deg": (90.0, 0, 0)}
+    assert said(turned) == ""
+    bars = given.study.with_(array__ring_length_m=0.028)
+    assert said(turned, study=bars) == "put in the wrong way: ring 1, slot 1"
+    half = turned | {"rotation_deg": (0, 0, 180.0)}
+    assert said(half | {"magnetization_factor": -1}) == ""
+    assert said(half) == "put in the wrong way: ring 1, slot 1"
+    flat = parse_study(changed(DIPOLE, array__first_block_angle_deg=0,
+                               array__first_magnetization_angle_deg=0))
+    assert said({"ring": 1, "slot": 2, "rotation_deg": (180.0, 0, 0)}, study=flat)
+    assert not said({"ring": 1, "slot": 1, "rotation_deg": (180.0, 0, 0)}, study=flat)
     assert "6 blocks" in said(*(
         {"ring": 1, "slot": slot, "magnetization_factor": -1} for slot in range(1, 7)))
 
