@@ -18,6 +18,7 @@ from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
+    at_z,
     lacks_main,
     main_in_words,
     multipole_figure,
@@ -280,7 +281,8 @@ def answer(shim: Shim) -> Answer:
         question, said,
         f"{shim.result.reservation or 'Yes. Model and map agree.'} {ended}{mounted}", *(
             (make,
-             "halbach-fe shim STUDY --measurements MAP -o DIR" if shim.unsaid else
+             f"halbach-fe shim STUDY --measurements MAP{at_z(shim.model)} -o DIR"
+             if shim.unsaid else
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {aim.verb} of the magnet as it is.",

@@ -18,6 +18,7 @@ import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.cli.common import _paths_of
 from halbach_fe.cli.verbs import parser
+from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.diagnosis.effects.base import Parameter
@@ -55,7 +56,7 @@ from halbach_fe.report.words import (
     with_error,
 )
 from halbach_fe.response.homogeneity import Region
-from halbach_fe.response.multipoles import Multipoles
+from halbach_fe.response.multipoles import MultipoleReference, Multipoles
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -239,6 +240,30 @@ def of_multipoles(given):
         *(f"{size} units" for size in largest),
         *(with_error(1e3 * one.main, 1e3 * one.main_sd) for one in known), "within 50 units",
         "as ordered"]
+
+
+@pytest.mark.filterwarnings("ignore:The field integrated along z has no multipole")
+def test_what_was_asked_on_a_circle_is_advised_there(given, tmp_path):
+    """Of rings of opposite fields, along which the main multipole cancels, without the circle the
+    advised command is refused. The control is a magnet whose multipoles are integrated along z.
+    """
+    document = changed(MAGNET, array__ring=[{}, {"first_magnetization_angle_deg": 180.0}])
+    del document["array"]["rings"]
+    study, there = parse_study(document), MultipoleReference(0.02, (2, 3), 0.015)
+    magnet, campaign = build_magnet(study), simulate_campaign(study, 3)
+    updated = hf.infer(magnet, campaign.readings, given.session)
+    option = " --at-z-m 0.015 "
+    said = [multipoles.page(hf.multipoles(magnet, given.session, there, updated)).answer,
+            tolerance.answer(hf.tolerance(magnet, given.session, None, there, draws=100)),
+            sorting.answer(replace(hf.sort(magnet, campaign.blocks, given.session, there),
+                                   doubts=("Is it?",)))]
+    assert [option in one.command for one in said] == [True, True, True]
+    with pytest.raises(StudyError, match="--at-z-m Z"):
+        hf.shim(updated, given.session)
+    assert hf.shim(updated, given.session, there, swaps=1, turns=0).tried
+    plain = [multipoles.page(hf.multipoles(given.magnet, given.session, None, given.updated)),
+             tolerance.page(hf.tolerance(given.magnet, given.session, draws=100))]
+    assert not any("--at-z-m" in one.answer.command for one in plain)
 
 
 def of_homogeneity(given):
