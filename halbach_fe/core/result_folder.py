@@ -62,7 +62,7 @@ WRITES = {
     "plan": ("plan.*", "plan_*.png"),
     "prior": ("prior.*", "prior_*.png"),
     "shim": ("shim.*", "shim_*.png", "study.shimmed.toml"),
-    "shim-tray": ("shim_tray.*", "before.png", "after.png"),
+    "shim-tray": ("shim_tray.*", "before.png", "after.png", "study.filled.toml"),
     "sort": ("sort.*", "sort_*.png", "blocks.sorted.csv"),
     "tolerance": ("tolerance.*", "tolerance_*.png"),
     "demagnetization": ("demagnetization.*", "demagnetization_*.png"),
