@@ -98,6 +98,8 @@ class FilledTray(ShownInNotebook):
     disagreement : str or None
         Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
         if that is not known.
+    filled_study : Study or None
+        The study with the magnets of the tray as free blocks; None if the tray stays empty.
     """
 
     magnet: Magnet

@@ -225,7 +225,7 @@ def answer(shim: Shim) -> Answer:
     likely = 0.5  # probability below which the answer says that moves do not reach the limit
     question = "Which blocks should be exchanged, turned or replaced?"
     aim = aim_of(shim.model)
-    before, after = map(aim.size, _sizes(shim))
+    before, after = (aim.size(rms) for rms in _sizes(shim))
     what, unit = aim.what, aim.rms_unit
     within = ("All unwanted multipoles are within {} units" if shim.fields is None else
               "The deviation is within {} ppm rms")

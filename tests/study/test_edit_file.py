@@ -143,8 +143,7 @@ def test_exceptions_that_are_gone(layout):
         assert parse_study(tomllib.loads(edited_text(text, [(fewer, "gone")]))) == fewer
 
 
-@pytest.mark.parametrize("layout", ["cubes", "iron", *(
-    name for name, text in LAYOUTS.items() if text.startswith(BARE[:20]))])
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_free_blocks_that_are_added(layout, tmp_path):
     """Those of a filled tray: in a table beside the study, and more of them in a further step."""
     study = parse_study(tomllib.loads(LAYOUTS[layout]))
