@@ -231,9 +231,9 @@ def answer(shim: Shim) -> Answer:
               "The deviation is within {} ppm rms")
     if shim.steps:
         moves = counted(len(shim.steps), "move")
-        likely = "" if shim.fields is None else " (95 %: {} to {})".format(
+        ranged = "" if shim.fields is None else " (95 %: {} to {})".format(
             *map(ppm, shim.fields[1].rms_range_ppm[::2]))
-        said = (f"{what} expected to fall from {before} to {after} {unit}{likely}, including the "
+        said = (f"{what} expected to fall from {before} to {after} {unit}{ranged}, including the "
                 "uncertainty.")
         if shim.result.disagreement:
             said = ("No block yet: model and map disagree. If the model were right, with "
