@@ -471,7 +471,8 @@ def shim_tray(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
 
     The tray and its inventory are [shim_tray] of the study; the magnet is the measured one, whose
     posterior halbach-fe infer wrote. Writes shim_tray.csv, the table to fill the tray from,
-    shim_tray.json, shim_tray.html and its figures.
+    shim_tray.json, shim_tray.html and its figures, and study.filled.toml, the study with the
+    magnets of the tray as free blocks.
     """
     from halbach_fe.inference.storage import read_posterior
 

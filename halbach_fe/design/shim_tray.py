@@ -15,6 +15,7 @@ are refused.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -43,7 +44,10 @@ from halbach_fe.solver.exact_block_field import unit_field
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.design import ShimMagnet, ShimTray
+from halbach_fe.study.free_blocks import COLUMNS
 from halbach_fe.study.grades import grade
+from halbach_fe.study.model import Study
+from halbach_fe.study.types import COMPONENTS
 
 EMPTY = -1
 
@@ -94,6 +98,8 @@ class FilledTray(ShownInNotebook):
     disagreement : str or None
         Sentences if the update of the posterior disagrees with its map, empty if it agrees; None
         if that is not known.
+    filled_study : Study or None
+        The study with the magnets of the tray as free blocks; None if the tray stays empty.
     """
 
     magnet: Magnet
@@ -107,6 +113,11 @@ class FilledTray(ShownInNotebook):
     places_m: Floats
     left: dict[str, int]
     disagreement: str | None = None
+
+    @property
+    def filled_study(self) -> Study | None:
+        """The study with the magnets of the tray as free blocks; None if the tray stays empty."""
+        return _with_free_blocks(self.magnet.study, self.filled) if self.filled else None
 
 
 @alone
@@ -182,6 +193,48 @@ def shim_tray(
         left[one.magnet.name] -= 1
     return FilledTray(magnet, model, shimmed, posterior, known, before, shimmed.of(known),
                       tuple(filled), choices.places, left)
+
+
+def _with_free_blocks(study: Study, filled: Sequence[Filled]) -> Study:
+    """Return the study with the magnets of a tray as free blocks.
+
+    They are a ring of their own, whose slots follow all others, so that neither exceptions nor
+    types of the study's blocks hold for them.
+    """
+    array, there = study.array, study.array.free_blocks
+    count, slot = len(there or ()), max(array.blocks_by_ring)
+    azimuth = np.radians([one.direction_deg - one.from_radius_deg for one in filled])
+    direction = np.radians([one.direction_deg for one in filled])
+    strength = np.array([_remanence(one.magnet) for one in filled])
+    slots = range(slot + 1, slot + 1 + len(filled))
+    decimals = 12  # of components in T, so that those of shims along an axis are 0 across it
+    shims: dict[str, Sequence[object]] = {
+        "name": [f"shim{count + number}" for number in range(1, len(filled) + 1)],
+        "shape": ["cuboid"] * len(filled), "slot": slots,
+        "ring": [len(array.blocks_by_ring) - array.rings + 1] * len(filled),
+        **_columns("{}_m", np.array([one.position_m for one in filled])),
+        "rotation_z_deg": np.degrees(azimuth).tolist(),
+        **_columns("size_{}_m", np.array([one.magnet.size_m for one in filled])),
+        **_columns("remanence_{}_T", (strength[:, None] * np.column_stack(
+            [np.cos(direction), np.sin(direction), 0 * direction])).round(decimals) + 0.0),
+        "recoil_permeability": [1.0] * len(filled)}
+    own: dict[str, Sequence[object]] = {}
+    if there is not None:
+        ring, place = zip(*there.places, strict=True)
+        own = there.model_dump() | {"ring": ring, "slot": place}
+    columns = {name: [*(own.get(name) or [None] * count),
+                      *(shims.get(name) or [None] * len(filled))] for name in COLUMNS}
+    exceptions = [one.with_(ring=ring) for one in array.exceptions for ring in (
+        [one.ring] if one.ring or one.slot else range(1, len(array.blocks_by_ring) + 1))]
+    types = study.prior.types and study.prior.types | {"shims": tuple(slots)}
+    return study.with_(array__free_blocks=columns, array__exceptions=exceptions,
+                       prior__types=types)
+
+
+def _columns(name: str, values: Floats) -> dict[str, Sequence[object]]:
+    """Return columns of components; {} in ``name`` stands for the axis."""
+    return {name.format(axis): column for axis, column in zip(
+        COMPONENTS, values.T.tolist(), strict=True)}
 
 
 @dataclass(frozen=True)
@@ -275,13 +328,18 @@ class _Choices:
 def _block(magnet: ShimMagnet, place: Floats, azimuth: float, number: int) -> MagnetBlock:
     """Return a magnet of the inventory in a place of the tray."""
     x, y, z = np.array(magnet.size_m) / 2
-    remanence = magnet.remanence_T or grade(str(magnet.material)).nominal_remanence
     return MagnetBlock(
         ring=0, slot=number, outline=closed_outline(np.array(
             [(-x, -y), (x, -y), (x, y), (-x, y)])), z_min=-float(z), z_max=float(z),
-        easy_axis=(float(np.cos(azimuth)), float(np.sin(azimuth)), 0.0), remanence=remanence,
+        easy_axis=(float(np.cos(azimuth)), float(np.sin(azimuth)), 0.0),
+        remanence=_remanence(magnet),
         recoil_permeability=1.0, recoil_permeability_across=1.0, origin_m=vector(place),
         orientation_rad=(0.0, 0.0, azimuth), label=f"place {number}")
+
+
+def _remanence(magnet: ShimMagnet) -> float:
+    """Return the remanence in T of a magnet of the inventory."""
+    return magnet.remanence_T or grade(str(magnet.material)).nominal_remanence
 
 
 def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:

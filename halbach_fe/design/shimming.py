@@ -135,7 +135,8 @@ class Shim(ShownInNotebook):
     after : Multipoles or Deviations
         The same as ``before``, after all moves.
     shimmed_study : Study or None
-        The study with the moves of blocks as exceptions; None if a study cannot express them.
+        The study with the moves of blocks as exceptions; None if a study cannot express them, or
+        need not.
     """
 
     result: InferenceResult
@@ -169,13 +170,26 @@ class Shim(ShownInNotebook):
     def shimmed_study(self) -> Study | None:
         """The study with the moves of blocks as exceptions, or None if it cannot express them.
 
-        Replacements are left out, because a study does not identify individual blocks.
+        A replaced block is one as designed, because a study does not identify individual blocks;
+        None also if the study says that already.
         """
+        changed = self._changed
+        return None if changed is None or changed.study == self.study else changed.study
+
+    @property
+    def unsaid(self) -> bool:
+        """Whether the exceptions of a study cannot express the moves."""
+        return self._changed is None
+
+    @cached_property
+    def _changed(self) -> Magnet | None:
+        """The magnet after the moves, see `remounted`."""
         slots = len(self.mounts.places)
-        moved = [(placement.to, placement.block, self.matrix(placement)) for step in self.steps
-                 for placement in step.move.placements if placement.block < slots]
-        changed = remounted(self.magnet, moved) if moved else None
-        return None if changed is None else changed.study
+        every = [placement for step in self.steps for placement in step.move.placements]
+        return remounted(
+            self.magnet, [(placement.to, placement.block, self.matrix(placement))
+                          for placement in every if placement.block < slots],
+            [placement.to for placement in every if placement.block >= slots])
 
     def matrix(self, placement: Placement) -> Floats:
         """Return the rotation (3, 3) of a block's magnetization from its old to its new slot."""

@@ -262,6 +262,22 @@ def as_meant(magnet: Magnet) -> Magnet:
         exception.with_(**meant) for exception in magnet.array.exceptions))
 
 
+def is_as_meant(block: MagnetBlock, meant: MagnetBlock, angle: float) -> bool:
+    """Tell whether a block has the magnetization and the shape that are meant for its slot, however
+    it came there.
+
+    They may differ by what a turn by ``angle`` in rad makes; ``meant`` is the block of `as_meant`.
+    """
+    turned = np.linalg.norm(np.cross(block.magnetization, meant.magnetization))
+    if np.arctan2(turned, np.dot(block.magnetization, meant.magnetization)) > angle:
+        return False
+    size = 2 if np.isinf(block.z_max) else 3  # a block of a cross-section has no ends
+    corners, others = (each[:, :size] - each[:, :size].mean(axis=0)
+                       for each in (_corners(block), _corners(meant)))
+    chord = 2 * np.sin(angle / 2) * np.linalg.norm(others, axis=1).max()
+    return _apart(corners, others) <= chord
+
+
 Turn = tuple[tuple[float, float, float], ...]
 """A rotation matrix, row by row."""
 

@@ -354,7 +354,7 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
     table = with_types(magnet, table)
     _check_types(magnet, table)
     _check_alike(magnet, lambda block: block.shape_axes, "Name them as types of their own.",
-                 OF_OTHER_RINGS)
+                 OF_OTHER_RINGS if magnet.array.rings else OF_FREE_BLOCKS)
     index = _block_of_rows(magnet, table)
     conversion = _conversions(magnet, table, blocks, index)
     measured = np.einsum("nij,nj->ni", conversion, _at_reference_temperature(magnet, table))
@@ -657,6 +657,11 @@ OF_OTHER_RINGS = (
     "`array.free_blocks` (halbach-fe export STUDY --format blocks), add a column `type` to that "
     "table, and leave the types out of the table of measured blocks.")
 """What to do about blocks of one slot that are not alike."""
+
+OF_FREE_BLOCKS = (
+    "Add a column `type` to the table of `array.free_blocks`, equal for blocks that may change "
+    "places, and leave the types out of the table of measured blocks.")
+"""What to do about free blocks whose types are not stated and that are not alike."""
 
 
 def _check_alike(

@@ -212,11 +212,12 @@ def _probability_within(known: Multipoles, limit: float) -> float:
 
 def answer(
     tables: Sequence[MultipoleTable], limit: float | None, disagreement: str | None = None,
-    faults: str = "",
+    study: Study | None = None,
 ) -> Answer:
     """Say how large the unwanted multipoles of the best known magnet are, and what to do next.
 
-    ``faults`` names the blocks that are not as designed, see `faults_in_words`.
+    ``study`` tells which blocks are not as designed, see `faults_in_words`, and for what blocks
+    would be moved.
     """
     measured = "posterior" in tables[0][1]
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
@@ -237,12 +238,24 @@ def answer(
             "halbach-fe infer STUDY --measurements MAP -o DIR")
     if disagreement:
         return of_a_conflict(question, said, disagreement)
+    faults = "" if study is None else faults_in_words(study)
+    main = tables[lacking.index(False)][0]  # the others are refused where blocks are moved
+    options = at_z(main) if study is None or study.homogeneity is None else ""
     return Answer(
         question, said, f"{agreement(disagreement)} ± is what map, prior and solver leave open.",
         "If these multipoles are too large, "
         + (f"first put right in the magnet what is not as designed ({faults}), or "
            if faults else "") + "look for blocks to swap or to turn.",
-        "halbach-fe shim STUDY --measurements MAP -o DIR")
+        f"halbach-fe shim STUDY --measurements MAP{options} -o DIR")
+
+
+def at_z(model: object) -> str:
+    """Return the option by which another command asks for multipoles on the circle of a model;
+    empty if they are integrated along z, of a cross-section, or if the model is of none.
+    """
+    if not isinstance(model, MultipoleModel) or model.z is None:
+        return ""
+    return f" --at-z-m {round(model.z, 9) + 0.0:g}"
 
 
 def multipole_rows(magnets: Mapping[str, Multipoles]) -> Rows:
@@ -381,7 +394,7 @@ def page(found: MultipoleTables) -> Page:
             "Unwanted multipoles, normal (left) and skew (right); bars are two standard deviations")
     return Page(
         "multipoles", "multipoles", study,
-        answer(found.tables, found.limit, found.disagreement, faults_in_words(study)),
+        answer(found.tables, found.limit, found.disagreement, study),
         _summary(study, found.tables, found.limit),
         [*sections, Section([*found.left_out, *linearized(study)])], tables, figures=figures,
         shown=tuple(figures),

@@ -29,6 +29,9 @@ from halbach_fe.report.page import (
 from halbach_fe.report.words import ppm
 from halbach_fe.response.homogeneity import Homogeneity
 
+STUDY_FILE = "study.filled.toml"
+"""Name of the study that has the magnets of the tray."""
+
 LISTED = 12
 """Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""
 
@@ -76,8 +79,9 @@ def _told(found: FilledTray) -> Answer:
             f"{ppm(before)}.")
     if all(not count for count in found.left.values()):
         text += " The whole inventory is used: more magnets may do better."
-    step, trust = "Fill the tray from shim_tray.csv, then measure again and update.", ""
-    command = "halbach-fe infer STUDY --measurements NEW_MAP -o DIR"
+    step, trust = (f"Fill the tray from shim_tray.csv, then measure again and update {STUDY_FILE}, "
+                   "which has the tray's magnets as free blocks."), ""
+    command = f"halbach-fe infer DIR/{STUDY_FILE} --measurements NEW_MAP -o DIR"
     if before < FEW * after:
         text = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
         step, command = (
@@ -89,8 +93,9 @@ def _told(found: FilledTray) -> Answer:
     elif after > 2 * found.after.rms_ppm:
         trust = ("What remains is mostly what the measurement and the strength of the shims leave "
                  "open. ")
-        step = ("Fill the tray from shim_tray.csv, measure again with it, update, and fill a "
-                "second one.")
+        step = (f"Fill the tray from shim_tray.csv, measure again with it, update {STUDY_FILE}, "
+                "which has its magnets as free blocks, and fill a second one in places that are "
+                "still free.")
     return Answer(question, text, f"{trust}{_ranges(found)}", step, command)
 
 
@@ -180,7 +185,7 @@ def _tray_figure(found: FilledTray) -> Figure:
 
 def page(found: FilledTray) -> Page:
     """Return the page of a tray, with the table to fill it from."""
-    tray = found.magnet.study.shim_tray
+    tray, filled = found.magnet.study.shim_tray, found.filled_study
     assert tray is not None
     before, after = (model.slices(known.mean) for model, known in (
         (found.model, found.before_known), (found.shimmed, found.after_known)))
@@ -210,4 +215,6 @@ def page(found: FilledTray) -> Page:
             "what permeable blocks answer. The rms is the median of the magnets that are possible; "
             "that of the mean field is smaller."], "What to put where")],
         {f"The field in {found.model.region.text}": fields, listed: rows[:LISTED]}, rows, figures,
-        files={"shim_tray.csv": csv_file(_columns(found), {"study": found.magnet.name})})
+        files={"shim_tray.csv": csv_file(_columns(found), {"study": found.magnet.name})},
+        new_study=None if filled is None else (
+            STUDY_FILE, lambda: [(filled, f"{len(rows)} magnets of the shim tray")]))

@@ -18,6 +18,7 @@ from halbach_fe.design.shimming import STOPS, Placement, Shim, Step
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, homogeneity_rows, plain_homogeneity
 from halbach_fe.report.multipoles import (
+    at_z,
     lacks_main,
     main_in_words,
     multipole_figure,
@@ -138,7 +139,19 @@ def _reason_against(shim: Shim) -> str:
 
 def _gained(shim: Shim) -> float:
     """Return by which part of itself the moves lower the rms."""
-    return 1 - shim.after.rms / shim.before.rms
+    before, after = _sizes(shim)
+    return 1 - after / before
+
+
+def _sizes(shim: Shim) -> tuple[float, float]:
+    """Return the rms before and after the moves, including the uncertainty.
+
+    That of a field is not the linearized one by which the moves were chosen.
+    """
+    if shim.fields is None:
+        return shim.before.rms, shim.after.rms
+    before, after = (known.rms_range_ppm[1] for known in shim.fields)
+    return before, after
 
 
 def _step_summary(shim: Shim, step: Step) -> Plain:
@@ -165,9 +178,14 @@ def _move_table(shim: Shim) -> Rows:
     return [{"move": f"{number}: {step.move.kind}",
              "blocks": "; ".join(_placement_text(shim, placement)
                                  for placement in step.move.placements),
-             f"rms after in {aim.unit}": aim.size(step.after.rms),
+             f"rms after in {aim.unit}{_how(shim)}": aim.size(step.after.rms),
              "gain in its sd": f"{step.gain / step.gain_sd:.1f}" if step.gain_sd else "exact"}
             for number, step in enumerate(shim.steps, start=1)]
+
+
+def _how(shim: Shim) -> str:
+    """Return how the rms after each move was computed, if otherwise than in the answer."""
+    return "" if shim.fields is None else ", linearized"
 
 
 def _compared(shim: Shim, before: T, after: T) -> dict[str, T]:
@@ -207,13 +225,15 @@ def answer(shim: Shim) -> Answer:
     likely = 0.5  # probability below which the answer says that moves do not reach the limit
     question = "Which blocks should be exchanged, turned or replaced?"
     aim = aim_of(shim.model)
-    before, after = (aim.size(known.rms) for known in (shim.before, shim.after))
+    before, after = (aim.size(rms) for rms in _sizes(shim))
     what, unit = aim.what, aim.rms_unit
     within = ("All unwanted multipoles are within {} units" if shim.fields is None else
               "The deviation is within {} ppm rms")
     if shim.steps:
         moves = counted(len(shim.steps), "move")
-        said = (f"{what} expected to fall from {before} to {after} {unit}, including the "
+        ranged = "" if shim.fields is None else " (95 %: {} to {})".format(
+            *map(ppm, shim.fields[1].rms_range_ppm[::2]))
+        said = (f"{what} expected to fall from {before} to {after} {unit}{ranged}, including the "
                 "uncertainty.")
         if shim.result.disagreement:
             said = ("No block yet: model and map disagree. If the model were right, with "
@@ -246,6 +266,10 @@ def answer(shim: Shim) -> Answer:
                           shim.before)
     make = ("Make the moves in their order, measure again, and update study.shimmed.toml."
             if shim.shimmed_study else "Make the moves in their order, and measure again.")
+    if shim.unsaid:
+        make = (f"No {STUDY_FILE} is written: magnetization_factor of the study's exceptions of "
+                "whole rings or slots is too small, or 0, for the blocks that come there. State it "
+                "block by block (ring and slot), and shim again before any block is moved.")
     if shim.result.reservation and shim.steps:
         make = "Find out what it is, and update again, before any block is moved."
     elif _reason_against(shim):
@@ -257,6 +281,8 @@ def answer(shim: Shim) -> Answer:
         question, said,
         f"{shim.result.reservation or 'Yes. Model and map agree.'} {ended}{mounted}", *(
             (make,
+             f"halbach-fe shim STUDY --measurements MAP{at_z(shim.model)} -o DIR"
+             if shim.unsaid else
              f"halbach-fe infer {'DIR/study.shimmed.toml' if shim.shimmed_study else 'STUDY'} "
              "--measurements NEW_MAP -o DIR") if shim.steps else
             (f"See the {aim.verb} of the magnet as it is.",
@@ -364,7 +390,9 @@ def _of_the_moves(shim: Shim) -> str:
         "The moves are listed in the order in which they were chosen; the gain is the expected "
         f"decrease of {squares}, in units "
         "of its own standard deviation (sd). The list ends before moves of less than 1; of those "
-        "with 1, one in six turns out to gain nothing, of those with 2, one in forty. A block is "
+        "with 1, one in six turns out to gain nothing, of those with 2, one in forty. " + (
+            "The rms after each is linearized about the field as it is; that of the table of the "
+            "field is not. " if shim.fields is not None else "") + "A block is "
         "first moved to its new slot in the orientation of that slot, then turned about its own "
         "axes. " + (
             f"Mounting a block again turns it by a random angle with an sd of {mounting:.3g}° "

@@ -17,6 +17,7 @@ from halbach_fe.measurement.block_table import write_blocks
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES
 from halbach_fe.report.multipoles import (
+    at_z,
     lacks_main,
     main_in_words,
     multipole_figure,
@@ -122,7 +123,8 @@ def answer(found: SortedBlocks) -> Answer:
     said = _answer(found)
     return said if not found.doubts else replace(
         said, trust=f"Not yet. {' '.join(found.doubts)}", sound=False,
-        step="Answer this first, and sort again.", command="halbach-fe sort STUDY BLOCKS -o DIR")
+        step="Answer this first, and sort again.",
+        command=f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
 
 
 def _answer(found: SortedBlocks) -> Answer:
@@ -146,7 +148,7 @@ def _answer(found: SortedBlocks) -> Answer:
             f"allowed.{left}", f"Yes: {len(found.random)} random orders are alike. Only blocks "
             "that are at the same angle may change places, in rings whose fields add up along z.",
             f"To have a choice, {_more(found)}. Then sort again.",
-            "halbach-fe sort STUDY BLOCKS -o DIR")
+            f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
     if not _chose(found):
         return Answer(
             question, f"Each into the only slot that it fits: there is no choice, and {what} "
@@ -155,7 +157,7 @@ def _answer(found: SortedBlocks) -> Answer:
             "down.)", "If blocks of some slots are alike, say so in the study "
             f"by prior.types{types_in_words(found.alike)}; or measure spare blocks. Then sort "
             "again.",
-            "halbach-fe sort STUDY BLOCKS -o DIR")
+            f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
     prior = found.study.prior  # and what the uncertainty of the blocks makes
     spread = float(np.sqrt(max(found.best.rms**2 - found.best.rms_of_mean**2, 0.0)))
     known = ["the measured moments", *(words for words, there in (

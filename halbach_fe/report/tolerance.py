@@ -15,6 +15,7 @@ from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance, Toleran
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, solver_error_text
 from halbach_fe.report.multipoles import (
+    at_z,
     lacks_main,
     main_in_words,
     of_no_main,
@@ -133,10 +134,10 @@ def _sorting(found: Tolerance | HomogeneityTolerance) -> tuple[str, str]:
     """Return the next step, and its command, if the blocks make a part of the errors."""
     if found.table_doubts:
         return ("Answer what is asked of the table of blocks, correct it or the study, and ask "
-                "again.", "halbach-fe tolerance STUDY --blocks BLOCKS -o DIR")
+                "again.", f"halbach-fe tolerance STUDY --blocks BLOCKS{at_z(found.model)} -o DIR")
     measure = "Measure the blocks before assembly, and see" if found.table_doubts is None else "See"
     return (f"{measure} what sorting them into the slots that they fit gains.",
-            "halbach-fe sort STUDY BLOCKS -o DIR")
+            f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
 
 
 def _trust(found: Tolerance | HomogeneityTolerance) -> str:

@@ -14,7 +14,8 @@ from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.geometry.symmetry import as_meant, is_as_meant
 from halbach_fe.study.model import Study, iron_of
 from halbach_fe.study.types import COMPONENTS
 
@@ -145,25 +146,34 @@ def is_fourier(study: Study) -> bool:
 def faults_in_words(study: Study) -> str:
     """Say which blocks the study has reversed, turned, missing or in places of others; empty if
     none.
+
+    A block that was moved or turned so that magnetization and shape are those of its slot is as
+    designed, as those are that `halbach_fe.shim` moves.
     """
     # Largest angle of a block that is mounted as ordered, in degrees: a slot lets it turn by a few
     # degrees, and a wrong orientation is a quarter or half turn, or the step to the next slot.
     as_ordered_deg = 10.0
+    places = {study.array.block_of(one) for one in study.array.exceptions
+              if one.magnetization_factor <= 0 or one.mounted_from is not None
+              or math.hypot(*one.rotation_deg) > as_ordered_deg} - {None}
+    if not places:
+        return ""
+    magnet = build_magnet(study)
     found: dict[str, list[str]] = {}
-    for one in study.array.exceptions:
-        if one.ring is None or one.slot is None:
+    for block, meant in zip(magnet.blocks, as_meant(magnet).blocks, strict=True):
+        if (block.ring, block.slot) not in places or (
+                block.remanence and is_as_meant(block, meant, math.radians(as_ordered_deg))):
             continue
-        kind = ("missing" if not one.magnetization_factor else "reversed"
-                if one.magnetization_factor < 0 else "made for another place"
-                if one.mounted_from not in (None, (one.ring, one.slot)) else
-                "put in the wrong way" if math.hypot(*one.rotation_deg) > as_ordered_deg else None)
-        if kind:
-            found.setdefault(kind, []).append(block_in_words(one.ring, one.slot))
+        kind = ("missing" if not block.remanence else "reversed" if block.remanence < 0 else
+                "made for another place"
+                if block.mounted_from not in (None, (block.ring, block.slot)) else
+                "put in the wrong way")
+        found.setdefault(kind, []).append(block_in_words(block.ring, block.slot))
     # largest number of blocks that a line names
     most_places = 4
     return "; ".join(
-        f"{kind}: " + ("; ".join(places) if len(places) <= most_places else f"{len(places)} blocks")
-        for kind, places in found.items())
+        f"{kind}: " + ("; ".join(names) if len(names) <= most_places else f"{len(names)} blocks")
+        for kind, names in found.items())
 
 
 def place_of(block: MagnetBlock) -> str:

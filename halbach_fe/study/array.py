@@ -66,6 +66,9 @@ MultipoleOrder = Annotated[int, Field(ge=1, le=20)]
 BlocksPerRing = Annotated[int, Field(ge=4, le=512)]
 MAX_RINGS = 1000
 
+MAX_FACTOR = 2.0
+"""Largest size of a `BlockException.magnetization_factor`."""
+
 BlockMoment = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
@@ -143,7 +146,7 @@ class BlockException(StudyModel):
     remanence_T: Remanence | None = None
     magnetization_angle_deg: Angle | None = None
     mounted_from: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
-    magnetization_factor: Annotated[float, Field(ge=-2.0, le=2.0)] = 1.0
+    magnetization_factor: Annotated[float, Field(ge=-MAX_FACTOR, le=MAX_FACTOR)] = 1.0
     magnetization_gradient: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
     inner_corner_loss: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     displacement_m: Displacement = (0.0, 0.0, 0.0)
@@ -339,6 +342,11 @@ class Array(StudyModel):
         own = tuple(ring.blocks_per_ring or self.blocks_per_ring for ring in self.ring)
         regular = own or (self.blocks_per_ring,) * self.rings
         return regular + (self.free_blocks.blocks_by_ring if self.free_blocks else ())
+
+    def block_of(self, exception: BlockException) -> tuple[int, int] | None:
+        """Return ring and slot of the block that an exception holds for; None if for several."""
+        ring = exception.ring or (1 if len(self.blocks_by_ring) == 1 else None)
+        return (ring, exception.slot) if ring and exception.slot else None
 
     def of_ring(self, ring: int) -> Array:
         """Return an array of one ring with the values that hold for a ring (from 1)."""

@@ -124,7 +124,8 @@ def _with_copy(text: str) -> str:
     document = tomlkit.parse(text)
     if not _refers_to_blocks(document):
         return text
-    _set(document["array"]["free_blocks"], "file", FREE_BLOCKS_FILE, COPIED_NOTE)
+    free = document["array"]["free_blocks"]
+    _set(free, "file", FREE_BLOCKS_FILE, _inside(free, COPIED_NOTE))
     return tomlkit.dumps(document)
 
 
@@ -137,6 +138,8 @@ def _change(table: Keys, before: BaseModel, after: BaseModel, note: str) -> None
             continue
         if new is None:
             _comment_out(table, name)
+        elif isinstance(new, FreeBlocks):
+            _set(table, name, {"file": FREE_BLOCKS_FILE}, note)
         elif isinstance(new, BaseModel) and type(old) is type(new):
             if name not in table:
                 table[name] = tomlkit.inline_table() if _in_line(table) else tomlkit.table()
@@ -157,9 +160,10 @@ def _change_list(
 ) -> None:
     """Set the keys that differ between two lists of tables, and append the new tables.
 
-    ``after`` is at least as long as ``before``.
+    Where some are gone, all are written anew.
     """
-    if name not in table:
+    if name not in table or len(after) < len(before):
+        before = ()
         # excluded readings are many and short: one inline list reads better than many tables
         in_rows = _in_line(table) or isinstance(after[0], ExcludedReading)
         table[name] = [] if in_rows else tomlkit.aot()

@@ -147,7 +147,7 @@ def coil_table(
               for body in bodies]
     return BlockTable(
         serial=tuple(f"B{number + 1:04d}" for number in there.values()),
-        type=tuple(label.get(slot) or body.type or str(slot)
+        type=tuple(label.get(slot) or body.type or ("" if body.name else str(slot))
                    for (_, slot), body in zip(there, bodies, strict=True)),
         ring=np.array([ring for ring, _ in there]), slot=np.array([slot for _, slot in there]),
         moment=measured.round(digits), sigma=sigma.round(digits),

@@ -545,6 +545,29 @@ def test_sorting_into_rings_that_differ(tmp_path, capsys):
     loose_blocks(build_magnet(read_study(study)), read_blocks(blocks))
 
 
+def test_sorting_free_blocks_of_a_simulated_measurement(tmp_path, capsys):
+    """Two rings of bars of another length, listed as free blocks: what is advised of those without
+    types makes the same simulated table one that can be sorted.
+    """
+    study, table = tmp_path / "free.toml", tmp_path / "free.csv"
+    bar = {"shape": "cuboid", "width_m": 0.01, "orientation": "magnetization"}
+    document = changed(BASE, array__block=bar, array__ring=[
+        {"ring_length_m": 0.03}, {"ring_length_m": 0.04}])
+    del document["array"]["rings"]
+    study.write_text(tomlkit.dumps(document))
+    assert main(["export", str(study), "--format", "blocks", "-o", str(table)]) == 0
+    study.write_text(tomlkit.dumps(document | {"array": {"free_blocks": {"file": "free.csv"}}}))
+    assert main(["simulate-measurement", str(study), "-o", str(tmp_path / "made")]) == 0
+    capsys.readouterr()
+    sort = ["sort", str(study), str(tmp_path / "made" / "blocks.csv"), "-o", str(tmp_path / "out")]
+    code, sentence = refused(sort, capsys)
+    assert code == 3
+    assert "Add a column `type` to the table of `array.free_blocks`" in sentence
+    header, *rows = table.read_text().splitlines()
+    table.write_text("\n".join([f"{header},type", *(f"{row},{row[:3]}" for row in rows)]))
+    assert main(sort) == 0
+
+
 def test_a_study_in_place_of_a_map(campaign, tmp_path, capsys):
     study, measured, _ = campaign
     for command in (["export", study, "--format", "csv", "-o", tmp_path / "out.csv"],

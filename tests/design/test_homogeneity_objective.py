@@ -22,7 +22,7 @@ from halbach_fe.design.sorting import Assignment, Slots
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.block_prior import as_mounted, prior_from_blocks, types_of
 from halbach_fe.inference.infer import infer
-from halbach_fe.report import sorting
+from halbach_fe.report import shimming, sorting
 from halbach_fe.report.page import html_of, write_report
 from halbach_fe.report.tolerance import OF_THE_DESIGN
 from halbach_fe.report.tolerance import answer as answer_of_tolerance
@@ -317,6 +317,12 @@ def test_shimmed_magnets_are_as_homogeneous_as_foretold(study, session, unit_fie
     assert "multipoles" not in text
     summary = json.loads((tmp_path / "shimmed" / "shim.json").read_text())
     assert summary["moves"][-1]["rms_after_ppm"] == found.after.rms
+    # the answer has the field, not the linearized one, by which the moves were chosen
+    known = replace(found.fields[1], rms_range_ppm=(123.0, 234.0, 345.0))
+    said = shimming.answer(replace(found, fields=(found.fields[0], known), limit=99.0,
+                                   within=(0.1, 0.2))).said
+    assert "These moves do not reach that limit" in said
+    assert "to 234 ppm rms (95 %: 123 to 345)" in said
 
 
 def test_a_plan_leaves_as_much_unknown_as_foretold(study, session, unit_fields, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import tomllib
+from dataclasses import replace
 from itertools import product
 
 import magpylib
@@ -26,7 +27,7 @@ from halbach_fe.response.homogeneity import PPM, Region, extremes
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.materials import MU_0
-from halbach_fe.study.reader import parse_study
+from halbach_fe.study.reader import parse_study, read_study
 
 NOISE_T, STRENGTH_SD = 2e-6, 0.02
 REGION = Region.sphere(0.03)
@@ -129,6 +130,43 @@ def test_the_field_becomes_homogeneous_as_foretold(measured, tmp_path):
         assert left == counts[name] - sum(one.magnet.name == name for one in found.filled)
     # control: the same magnets a quarter of a turn off
     assert rms_ppm(bare + shims(found.filled, turned_deg=90).getB(points)) > 0.9 * rms_ppm(bare)
+
+
+def test_the_filled_study_is_the_filled_magnet(measured, tmp_path):
+    """The map of magpylib's magnet with its shims agrees with the study that is written; the
+    control is the study without them, which the advice before had updated.
+    """
+    study, truth, _, posterior = measured
+    found = shim_tray(build_magnet(study), Session.open(tmp_path), posterior, REGION)
+    write_report(found, tmp_path / "report")
+    points, generator = points_from(study.observation.positions), np.random.default_rng(6)
+    field = truth.getB(points) + shims(found.filled).getB(points)
+    data = field_map(points, field + NOISE_T * generator.standard_normal(points.shape))
+    filled = build_magnet(read_study(tmp_path / "report" / "study.filled.toml"))
+    assert len(filled.blocks) == len(build_magnet(study).blocks) + len(found.filled)
+    new, old = (infer(each, data, Session.open(tmp_path / str(number)))
+                for number, each in enumerate((filled, build_magnet(study))))
+    assert new.prior_conflict < new.conflict_limit
+    assert old.prior_conflict > 10 * old.conflict_limit
+
+
+def test_what_the_study_says_of_its_blocks_is_not_of_the_shims(measured, tmp_path):
+    """Exceptions for all blocks, or for a slot of all rings, types, and free blocks of its own."""
+    study, _, _, posterior = measured
+    found = shim_tray(build_magnet(study), Session.open(tmp_path), posterior, REGION)
+    shim = {"name": ["own"], "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.3],
+            "size_x_m": [0.01], "size_y_m": [0.01], "size_z_m": [0.01], "remanence_T": [1.0]}
+    other = build_magnet(study.with_(
+        array__exceptions=[{"magnetization_factor": 0.9}, {"slot": 1, "magnetization_factor": 0.5}],
+        array__free_blocks=shim, prior__types={"a": tuple(range(1, 9))}))
+    plain, changed = (build_magnet(replace(found, magnet=each).filled_study).blocks
+                      for each in (build_magnet(study), other))
+    assert changed[:len(other.blocks)] == other.blocks
+    count = len(found.filled)
+    np.testing.assert_allclose(*([each.magnetization for each in blocks[-count:]]
+                                 for blocks in (changed, plain)), atol=1.0)  # of 1e6 A/m
+    np.testing.assert_allclose([each.middle for each in changed[-count:]],
+                               [one.position_m for one in found.filled])
 
 
 def test_shims_next_to_the_region(tmp_path):

@@ -18,6 +18,8 @@ from halbach_fe.geometry.symmetry import mountings
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.positions import points_from
+from halbach_fe.report.shimming import answer
+from halbach_fe.report.words import faults_in_words
 from halbach_fe.response.multipoles import MultipoleReference, Multipoles, multipole_model
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
@@ -340,6 +342,7 @@ def test_moved_cubes_lie_in_their_places_as_before(one_magnet, generator):
     _, update, model, _ = one_magnet
     shimmed = shim(update, model, generator, BUDGET).shimmed_study
     assert shimmed is not None
+    assert not faults_in_words(shimmed)  # it is what was advised
     moved_blocks = [block for block in build_magnet(shimmed).blocks if block.mounted_from]
     assert len(moved_blocks) >= 2
     off = []
@@ -409,15 +412,61 @@ def test_what_fits_where():
     assert rotation_deg(np.diag([1.0, -1.0, -1.0])) == (180.0, 0.0, 0.0)
 
 
-def test_moves_that_a_study_cannot_say():
-    """A block that is weak takes its weakness along, which exceptions of slots do not."""
-    study = study_of(**SQUARES)
-    mounts = mounts_of(build_magnet(study))
+@pytest.mark.parametrize(("block", "position"), [
+    ({"magnetization_factor": 0.9}, {}),
+    ({"magnetization_factor": -1.0}, {}),
+    ({"remanence_T": 1.1, "recoil_permeability": 1.1, "magnetization_gradient": 0.1}, {}),
+    ({"rotation_deg": (0.0, 0.0, 90.0)}, {}),
+    ({"rotation_deg": (0.0, 0.0, 3.0), "inner_corner_loss": 0.2}, {"displacement_m": (0, 1e-4, 0)}),
+    ({}, {"twist_deg": 2.0})])
+def test_a_moved_block_takes_its_exceptions_along(block, position):
+    """What the study says of the block goes with it, how it was put in is replaced by how it is
+    put in now, and what it says of the slot stays. Of several exceptions for all blocks too.
+    """
+    every = {"magnetization_factor": 0.98, "rotation_deg": (0.0, 0.0, 1.0)}
+    study = study_of(**SQUARES, array__exceptions=[
+        every, {"ring": 1, "slot": 3, **block, **position}, {"slot": 7, "twist_deg": -1.0}])
+    magnet = build_magnet(study)
+    mounts = mounts_of(magnet)
     moves = [(to, source, mounts.frames[to] @ mounts.frames[source].T)
              for to, source in ((2, 4), (4, 2))]
-    assert remounted(build_magnet(study), moves) is not None
-    weak = study_of(**SQUARES, array__exceptions=[{"slot": 3, "magnetization_factor": 0.9}])
-    assert remounted(build_magnet(weak), moves) is None
+    moved = remounted(magnet, moves)
+    for to, source, turn in moves:
+        assert moved.blocks[to].displacement_m == magnet.blocks[to].displacement_m
+        for name in ("recoil_permeability", "gradient", "corner_loss"):
+            assert getattr(moved.blocks[to], name) == getattr(magnet.blocks[source], name)
+        np.testing.assert_allclose(moved.blocks[to].magnetization,
+                                   turn @ magnet.blocks[source].magnetization, rtol=1e-9, atol=1e-3)
+    others = [number for number in range(12) if number not in (2, 4)]
+    assert [moved.blocks[n] for n in others] == [magnet.blocks[n] for n in others]
+    new = remounted(magnet, [], [2]).blocks[2]  # a new block in the third slot
+    plain = build_magnet(study.with_(array__exceptions=[every, {"slot": 3, **position}])).blocks[2]
+    assert new == plain
+
+
+def test_moves_that_a_study_cannot_say():
+    """A block comes to a ring of which the study says that it has a third of the strength, so that
+    the block would have thrice that; the control is a half.
+    """
+    def after(factor):
+        study = study_of(**SQUARES, dimension=3, array__rings=2, array__ring_length_m=0.02,
+                         array__exceptions=[{"ring": 2, "magnetization_factor": factor}])
+        mounts = mounts_of(magnet := build_magnet(study))
+        return remounted(magnet, [(to, source, mounts.frames[to] @ mounts.frames[source].T)
+                                  for to, source in ((2, 14), (14, 2))])
+
+    assert after(0.5) is not None
+    assert after(0.3) is None
+
+
+def test_it_is_said_that_there_is_no_study(one_magnet, generator, monkeypatch):
+    """Where the study cannot say the moves, it is not advised to update it after them."""
+    _, update, model, _ = one_magnet
+    assert "study.shimmed.toml" in answer(shim(update, model, generator, BUDGET)).command
+    monkeypatch.setattr("halbach_fe.design.shimming.remounted", lambda *_: None)
+    said = answer(shim(update, model, generator, BUDGET))
+    assert said.step.startswith("No study.shimmed.toml is written")
+    assert said.command.startswith("halbach-fe shim STUDY")
 
 
 @pytest.mark.parametrize(("reference", "said"), [
@@ -526,6 +575,8 @@ def test_what_a_diagnosis_found_is_put_right(session, generator):
     assert np.abs(result.before.mean).max() > 1000
     assert np.abs(result.after.mean).max() < 10  # of thousands; the prior draws a little
     shimmed = result.shimmed_study
+    assert "made for another place" in faults_in_words(result.study)
+    assert not faults_in_words(shimmed)
     assert [source for source, _ in mountings(build_magnet(shimmed))] == list(range(12))
     # negative control: what is nominal as it stands is left alone
     assert not found(nominal.bodies, [], swap=4, turn=4, replace=4).steps

@@ -18,6 +18,7 @@ import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.cli.common import _paths_of
 from halbach_fe.cli.verbs import parser
+from halbach_fe.core.errors import StudyError
 from halbach_fe.core.files import write_text
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.diagnosis.effects.base import Parameter
@@ -55,7 +56,7 @@ from halbach_fe.report.words import (
     with_error,
 )
 from halbach_fe.response.homogeneity import Region
-from halbach_fe.response.multipoles import Multipoles
+from halbach_fe.response.multipoles import MultipoleReference, Multipoles
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -131,20 +132,35 @@ def test_the_field_in_the_middle_is_said_first(given):
 
 def test_blocks_that_are_not_as_designed_are_named(given):
     """Below the title of every page, so that no number of theirs is read as the design's."""
-    def said(*exceptions):
-        return faults_in_words(given.study.with_(array__exceptions=exceptions))
+    def said(*exceptions, study=given.study):
+        return faults_in_words(study.with_(array__exceptions=exceptions))
 
     assert said() == ""
     assert said({"ring": 1, "slot": 3, "displacement_m": (1e-4, 0, 0)}) == ""
     assert said({"ring": 1, "slot": 3, "magnetization_factor": -0.98},
                 {"ring": 1, "slot": 5, "magnetization_factor": 0}) == (
         "reversed: ring 1, slot 3; missing: ring 1, slot 5")
-    assert said({"ring": 1, "slot": 1, "mounted_from": (1, 2)},
-                {"ring": 1, "slot": 2, "mounted_from": (1, 1)}) == (
+    exchanged = ({"ring": 1, "slot": 1, "mounted_from": (1, 2)},
+                 {"ring": 1, "slot": 2, "mounted_from": (1, 1)})
+    along_radius = parse_study(changed(MAGNET, array__block={"shape": "sector"}))
+    assert said(*exchanged, study=along_radius) == (
         "made for another place: ring 1, slot 1; ring 1, slot 2")
+    assert said(*exchanged) == ""  # equal cubes, each along its magnetization, as `shim` swaps them
     assert said({"ring": 1, "slot": 3, "rotation_deg": (0, 5.0, 0)},  # a slot allows that
                 {"ring": 1, "slot": 4, "rotation_deg": (-180.0, 0, 0)}) == (
         "put in the wrong way: ring 1, slot 4")
+    # Turned about its magnetization: a cube is as designed, a bar that fits the slot is not.
+    turned = {"ring": 1, "slot": 1, "rotation_deg": (90.0, 0, 0)}
+    assert said(turned) == ""
+    bars = given.study.with_(array__ring_length_m=0.028)
+    assert said(turned, study=bars) == "put in the wrong way: ring 1, slot 1"
+    half = turned | {"rotation_deg": (0, 0, 180.0)}
+    assert said(half | {"magnetization_factor": -1}) == ""
+    assert said(half) == "put in the wrong way: ring 1, slot 1"
+    flat = parse_study(changed(DIPOLE, array__first_block_angle_deg=0,
+                               array__first_magnetization_angle_deg=0))
+    assert said({"ring": 1, "slot": 2, "rotation_deg": (180.0, 0, 0)}, study=flat)
+    assert not said({"ring": 1, "slot": 1, "rotation_deg": (180.0, 0, 0)}, study=flat)
     assert "6 blocks" in said(*(
         {"ring": 1, "slot": slot, "magnetization_factor": -1} for slot in range(1, 7)))
 
@@ -224,6 +240,30 @@ def of_multipoles(given):
         *(f"{size} units" for size in largest),
         *(with_error(1e3 * one.main, 1e3 * one.main_sd) for one in known), "within 50 units",
         "as ordered"]
+
+
+@pytest.mark.filterwarnings("ignore:The field integrated along z has no multipole")
+def test_what_was_asked_on_a_circle_is_advised_there(given, tmp_path):
+    """Of rings of opposite fields, along which the main multipole cancels, without the circle the
+    advised command is refused. The control is a magnet whose multipoles are integrated along z.
+    """
+    document = changed(MAGNET, array__ring=[{}, {"first_magnetization_angle_deg": 180.0}])
+    del document["array"]["rings"]
+    study, there = parse_study(document), MultipoleReference(0.02, (2, 3), 0.015)
+    magnet, campaign = build_magnet(study), simulate_campaign(study, 3)
+    updated = hf.infer(magnet, campaign.readings, given.session)
+    option = " --at-z-m 0.015 "
+    said = [multipoles.page(hf.multipoles(magnet, given.session, there, updated)).answer,
+            tolerance.answer(hf.tolerance(magnet, given.session, None, there, draws=100)),
+            sorting.answer(replace(hf.sort(magnet, campaign.blocks, given.session, there),
+                                   doubts=("Is it?",)))]
+    assert [option in one.command for one in said] == [True, True, True]
+    with pytest.raises(StudyError, match="--at-z-m Z"):
+        hf.shim(updated, given.session)
+    assert hf.shim(updated, given.session, there, swaps=1, turns=0).tried
+    plain = [multipoles.page(hf.multipoles(given.magnet, given.session, None, given.updated)),
+             tolerance.page(hf.tolerance(given.magnet, given.session, draws=100))]
+    assert not any("--at-z-m" in one.answer.command for one in plain)
 
 
 def of_homogeneity(given):

@@ -130,6 +130,35 @@ inner_radius_m = 0.1
         assert "# equal rings" in edited
 
 
+@pytest.mark.parametrize("layout", ["faser", "exceptions", "in line", "dotted", "in pieces"])
+def test_exceptions_that_are_gone(layout):
+    """As after a block that was put in wrongly is replaced."""
+    study = parse_study(tomllib.loads(LAYOUTS[layout]))
+    there = study.array.exceptions
+    more = study.with_(array__exceptions=(*there, {"ring": 1, "slot": 1, "twist_deg": 1.0},
+                                          {"ring": 1, "slot": 2, "twist_deg": 2.0}))
+    text = edited_text(LAYOUTS[layout], [(more, "more")])
+    for left in (more.array.exceptions[-1:], ()):
+        fewer = study.with_(array__exceptions=left)
+        assert parse_study(tomllib.loads(edited_text(text, [(fewer, "gone")]))) == fewer
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_free_blocks_that_are_added(layout, tmp_path):
+    """Those of a filled tray: in a table beside the study, and more of them in a further step."""
+    study = parse_study(tomllib.loads(LAYOUTS[layout]))
+    columns = {"name": ["a", "b"], "shape": ["cuboid"] * 2, "x_m": [0.01, -0.01], "y_m": [0, 0],
+               "z_m": [0, 0], "size_x_m": [1e-3] * 2, "size_y_m": [1e-3] * 2,
+               "size_z_m": [1e-3] * 2, "remanence_T": [1.2, 1.3]}
+    one, two = (study.with_(array__free_blocks={key: values[:count] for key, values in
+                                                columns.items()}) for count in (1, 2))
+    path = tmp_path / "study.toml"
+    study_file.write_edited(path, LAYOUTS[layout], [(one, "filled")])
+    assert read_study(path) == one
+    study_file.write_edited(path, path.read_text(), [(two, "filled again")])
+    assert read_study(path) == two
+
+
 def test_nothing_to_change_is_the_file_itself():
     study = parse_study(tomllib.loads(PLAIN))
     assert edited_text(PLAIN, [(study, "not needed")]) == PLAIN
