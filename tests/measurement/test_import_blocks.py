@@ -189,11 +189,13 @@ MEASURED = "serial,type,moment_x{0},moment_y{0},moment_z{0},sigma{0}{1}\n{2}a,1,
      "volume_m3 of block a .* must be positive"),
     ("serial,type,mx[A m^2],my[A m^2],mz[A m^2],sigma[%],volume[mm^3]\na,1,1,2,3,0.1,0\n",
      "volume_m3 of block a .* must be positive"),
+    ("serial,ring,slot,J[T],sigma[%],volume[cm^3]\na,1,1,1.2,0.1,1\n",
+     "the direction of its polarization .*columns polarization_x"),
     ("r[mm],phi[deg],z[mm],Br[T]\n9,0,0,1.3\n", r"x of each .*\(x = r cos\(phi\)"),
     ("x[m],y[m],z[m],shape,size_x[m],size_y[m],size_z[m],Br[T],angle[deg]\n"
      "0,0,0,cuboid,0.01,0.01,0.01,1.3,45\n", "direction of the magnetization as a rotation")])
 def test_what_a_table_does_not_say(tmp_path, text, asked):
-    """A temperature in °F was read as one in °C."""
+    """A temperature in °F was read as one in °C, and a length of J as measured along x."""
     with pytest.raises(MeasurementError, match=asked):
         imported(tmp_path, text)
 

@@ -333,6 +333,9 @@ def _missing(table: _Table, free: bool) -> list[str]:
         (not strength and "material" not in table,
          "its strength (columns moment_x, moment_y, moment_z, or polarization_x ..., or "
          "magnetization_x ...)"),
+        (not free and strength in table.cells,
+         f"the direction of its {strength} (a length alone does not: columns {strength}_x, "
+         f"{strength}_y, {strength}_z along the axes of the block)"),
         *((free, f"{name[-1]} of each block (a column {name})") for name in places),
         (free and polar, "x and y of its angle (x = r cos(phi), y = r sin(phi))"),
         (free and "shape" not in table,
