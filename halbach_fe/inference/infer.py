@@ -547,7 +547,7 @@ class _Place:
     ) -> tuple[Floats, Sequence[Map], _Estimate]:
         """Return terms, maps and magnet after a share of what the update found."""
         change, before = share * self.change, self.estimate.deviations
-        return (self.total + change, open_terms.applied(self.maps, change),
+        return (open_terms.together(self.total, change), open_terms.applied(self.maps, change),
                 self.estimate.updated(before + share * (self.deviations - before)))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
@@ -150,6 +151,16 @@ class OpenTerms:
             found.append(replace(one, study=one.study.with_(
                 instrument=instrument.with_(translation_m=(x, y, z)))))
         return with_pivots(found)
+
+    def together(self, before: Floats, change: Floats) -> Floats:
+        """Return changes (terms,) that are as two after each other; turns do not add up."""
+        found = before + change
+        for effect in self.effects:
+            turn = effect[POSE][3:]
+            both = Rotation.from_rotvec(turn @ change) * Rotation.from_rotvec(turn @ before)
+            own = turn.any(axis=0)
+            found[own] = both.as_rotvec() @ turn[:, own]
+        return found
 
     def columns(
         self, field: Callable[[Floats], Floats], maps: Sequence[Map], readings: Readings

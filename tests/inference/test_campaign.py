@@ -300,6 +300,23 @@ def test_sensors_whose_places_are_uncertain(generator, tmp_path):
     assert result.disagreement == ""
 
 
+def test_turns_after_each_other():
+    """What a result states as the change of a turn is that of its rotation vector: the sum of two
+    turns was off by 2 mrad, 300 of its bars. All other terms add up.
+    """
+    study = campaign_study().with_(maps=(), instrument_sd={
+        "translation_m": 3e-3, "rotation_rad": 0.05, "gain": 0.01})
+    maps = maps_of(study, field_map(BODY, np.ones_like(BODY)))
+    open_terms = infer_module.OpenTerms.of(maps)
+    one = np.array([1e-3, 0, 0, 0.02, -0.03, 0.01, 0.01, 0, 0])
+    two = np.array([0, 2e-3, 0, 0.01, 0.03, 0.05, 0.01, 0, 0])
+    both = open_terms.together(one, two)
+    found = open_terms.applied(open_terms.applied(maps, one), two)[0].study.instrument
+    assert both[3:6] == pytest.approx(found.rotation_rad, abs=1e-12)
+    assert np.abs(one + two - both)[3:6].max() > 5e-4  # the control
+    assert (one + two - both)[[0, 1, 2, 6, 7, 8]] == pytest.approx(0, abs=1e-15)
+
+
 def campaign_file(folder, maps, extra=""):
     """A study file that lists two maps, which are written beside it."""
     for name, data in maps.items():
