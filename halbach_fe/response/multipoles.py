@@ -34,6 +34,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.coils import points_in_winding
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
@@ -703,10 +704,26 @@ def _integrals_of_coils(
     """Return C_n (K,) of external coils and dipoles, integrated along all of z, in T m.
 
     The error bar in T m of all comes second. ``circle`` (angles, 3) in m are equidistant points.
+
+    Raises
+    ------
+    StudyError
+        If one of them is within the circle, at any z: then the integral has sources there.
     """
     external = External(coils=magnet.external.coils, dipoles=magnet.external.dipoles)
     if external == External():
         return np.zeros(highest, complex), 0.0
+    radius = np.hypot(*circle[0, :2])
+    for name, each in (*((f"coils[{number}]", points_in_winding(coil))
+                         for number, coil in enumerate(external.coils, start=1)),
+                       *((f"dipoles[{number}]", np.array([one.position_m]))
+                         for number, one in enumerate(external.dipoles, start=1))):
+        if (nearest := np.hypot(each[:, 0], each[:, 1]).min()) < radius:
+            raise StudyError(must_be(
+                f"`external.{name}`", f"study {magnet.name}", "outside the circle, at whatever z, "
+                f"for multipoles that are integrated along z: farther than {radius:g} m from the "
+                "axis", f"{nearest:.4g} m", "Ask on a circle at one place: --at-z-m Z, in Python "
+                "MultipoleReference(z_m=Z)."))
     alone = magnet.with_(external=external)
     angle = np.arctan2(circle[:, 1], circle[:, 0])
     wave = np.exp(-1j * np.outer(np.arange(highest), angle)) / len(angle)

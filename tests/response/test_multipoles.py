@@ -223,6 +223,21 @@ def test_the_integral_of_external_fields(session):
     assert abs(at_z.matrix[0, -1]) == pytest.approx(1e-3, rel=1e-9)
 
 
+@pytest.mark.parametrize(("external", "named"), [
+    ({"coils": [{"kind": "round", "radius_m": 0.1, "section_m": [0, 0], "current_A": 5.0,
+                 "centre_m": [0.01, 0, 0.4], "rotation_deg": [0, 90, 0]}]}, r"coils\[1\]"),
+    ({"dipoles": [{"position_m": [0.0, 0.01, 1.0], "moment_A_m2": [0, 3, 0]}]}, r"dipoles\[1\]")])
+def test_an_integral_that_has_sources_within_its_circle(session, external, named):
+    """It is no multipole series: a wire across the axis made multipoles of all orders. On a circle
+    at one z there is one.
+    """
+    magnet = magnet_of_blocks(ALONE).with_(external=external)
+    reference = MultipoleReference(0.02, (2, 3))
+    with pytest.raises(StudyError, match=f"{named}.* outside the circle.*--at-z-m"):
+        multipole_model(magnet, reference, session)
+    assert len(multipole_model(magnet, replace(reference, z_m=0.0), session).offset) == 3
+
+
 def test_what_is_cut_off_of_permeability_is_in_the_bar(session, monkeypatch):
     """The same cube summed over three times the distance. Measured: the continuation beyond the
     ends misses 8 % of itself, and all of it is in the bar; the control is the sum without it.
