@@ -315,7 +315,7 @@ def demagnetization(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """
     with common.session(arguments, magnet.study) as session, common.progress_bar(
             "cells", told=True) as show:
-        return hf.demagnetization(magnet, session, show=show, **(
+        return hf.demagnetization(magnet, session, progress=show, **(
             {"across": arguments.across} if arguments.across else {}))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as value_of
 from pathlib import Path
@@ -816,7 +816,7 @@ def tolerance(
 @alone
 def demagnetization(
     magnet: Magnet, session: Session = NOT_KEPT, across: int = demagnetization_room.ACROSS,
-    show: Callable[[int, int], object] = lambda done, total: None,
+    progress: Progress | None = None,
 ) -> DemagnetizationMap:
     """Map how near the blocks are to the knee of their demagnetization curve when they are hot.
 
@@ -828,7 +828,7 @@ def demagnetization(
         Its folder receives the runs of GetDP.
     across : int
         Number of cells across the radial thickness of a block.
-    show : callable, optional
+    progress : callable, optional
         Is told how many cells are done, and how many there are.
 
     Returns
@@ -850,7 +850,7 @@ def demagnetization(
     0.0
     """
     check_number("across", "demagnetization", across, *ACROSS, whole=True)
-    return demagnetization_room.demagnetization_map(magnet, session, across, show)
+    return demagnetization_room.demagnetization_map(magnet, session, across, progress)
 
 
 @typed

@@ -22,6 +22,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Edge, places_in
@@ -226,7 +227,7 @@ def knee(material: Demagnetization, temperature_C: Floats | float) -> Floats:
 
 def demagnetization_map(
     magnet: Magnet, session: Session, across: int = ACROSS,
-    show: Callable[[int, int], object] = lambda done, total: None,
+    progress: Progress | None = None,
 ) -> DemagnetizationMap:
     """Compute H in all blocks of the nominal magnet, at the temperature that the study states.
 
@@ -237,7 +238,7 @@ def demagnetization_map(
     across : int
         Number of cells across the radial thickness of a block. In the other directions the cells
         have about the same length, but are no fewer: through a thin block H varies most.
-    show : callable, optional
+    progress : callable, optional
         Is told how many cells are done, and how many there are.
 
     Raises
@@ -262,7 +263,7 @@ def demagnetization_map(
     cells, coarse = cut(blocks, magnetized, across), cut(blocks, magnetized, max(1, across // 2))
     number = np.append(cells.block, coarse.block)
     field = _field_strength(
-        warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session, show)
+        warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session, progress)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
     along, rest = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
     by_coarse = DemagnetizationMap(magnet, material, blocks, coarse, rest, np.nan)
@@ -389,14 +390,15 @@ def _count(length: float, size: float) -> int:
 
 def _field_strength(
     magnet: Magnet, blocks: Sequence[MagnetBlock], points: Floats, number: Ints, session: Session,
-    show: Callable[[int, int], object],
+    progress: Progress | None,
 ) -> Floats:
     """Return H (n, 3) in A/m at points (n, 3) in m inside the blocks of some numbers (n,)."""
     field = np.empty_like(points)  # mu_0 H in vacuum
     # of all blocks at some points, which take seconds
     for some in np.array_split(np.arange(len(points)), 1 + len(points) * len(blocks) // 10**7):
         field[some] = field_of(blocks, points[some])
-        show(int(some[-1]) + 1, len(points))
+        if progress is not None:
+            progress(int(some[-1]) + 1, len(points))
     reacting = magnet.with_(solver__method="reaction")
     if not magnet.is_vacuum and _by_moments(reacting):
         field += solve_separate(reacting, session, estimate=False).field(points)
