@@ -57,6 +57,7 @@ from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
 from halbach_fe.measurement.formats.files import WRITERS, export_map
 from halbach_fe.measurement.formats.files import import_map as read_foreign_map
 from halbach_fe.measurement.instrument import check_total_field
+from halbach_fe.response.block_variation import nominal_parameters
 from halbach_fe.response.field_on_lines import FieldOnLines, Lines, field_on_lines
 from halbach_fe.response.homogeneity import (
     SHOWN_DEGREES,
@@ -505,11 +506,11 @@ def field(
     >>> bool(sd[0, 0] > 0)
     True
     """
-    known = (assembled_prior(magnet, magnet.nominal_magnetization) if posterior is None
+    known = (assembled_prior(magnet, nominal_parameters(magnet)) if posterior is None
              else list(distributions_of(magnet, posterior).values())[-1])
     found = field_on_lines(magnet, lines, known, session, inside)
-    most = 0.01
-    if (spacing := found.relative_spacing) > most:
+    most, nothing_T = 0.01, 1e-12  # a smaller field is rounding, as on the axis of a quadrupole
+    if (spacing := found.relative_spacing) > most and np.abs(found.mean).max() > nothing_T:
         warnings.warn(f"The {lines.count} points of a line are too far apart for its integrals: "
                       f"that makes {100 * spacing:.2g} % of the integral of |B|, which is in "
                       "their error bars. Take more points (--count), or shorter lines.",

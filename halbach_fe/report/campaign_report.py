@@ -340,7 +340,12 @@ def _from_here(path: Path) -> str | None:
 
 
 def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
-    """Return an answer whose command has the folder of the files that its own command wrote."""
+    """Return an answer whose command has the folder of the files that its own command wrote.
+
+    Inputs that are not where they were from the folder of that run have the words for them.
+    """
+    gone = {path: word for word, path in chapter.record.named.items() if not Path(path).exists()}
+
     def named(found: re.Match[str]) -> str:
         if found[1] not in chapter.record.files:
             return found[0]
@@ -348,7 +353,8 @@ def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
         return shlex.quote(_from_here(place) or printable(
             f"{chapter.label}/{found[1]}" if place.is_absolute() else str(place), MAX_QUOTED))
 
-    return replace(answer, command=re.sub(r"DIR/(\S+)", named, answer.command))
+    words = (gone.get(word, word) for word in answer.command.split(" "))
+    return replace(answer, command=re.sub(r"DIR/(\S+)", named, " ".join(words)))
 
 
 def read_campaign(folders: Sequence[str | Path], output: Path | None = None) -> Campaign:

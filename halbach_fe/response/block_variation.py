@@ -343,14 +343,19 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
     if not isinstance(distribution, Gaussian):
         raise MeasurementError(must_be(
             name, f"study {magnet.name}", "a Gaussian", f"a {type(distribution).__name__}"))
-    variations = Variations.of(magnet)
-    expected = (len(magnet.nominal_magnetization) + (len(variations.names) if variations else 0)
-                + len(magnet.study.uncertain_of_magnet))
+    expected = len(nominal_parameters(magnet))
     if len(distribution.mean) != expected:
         raise MeasurementError(must_be(
             name, f"study {magnet.name}", f"of the {expected} parameters of its magnet",
             str(len(distribution.mean)), "Is it that of another magnet?"))
     return magnetized(magnet, distribution, name)
+
+
+def nominal_parameters(magnet: Magnet) -> Floats:
+    """Return the nominal parameters of a magnet in A/m: 0 for all but the magnetizations."""
+    variations = Variations.of(magnet)
+    return np.append(magnet.nominal_magnetization, np.zeros(
+        (len(variations.names) if variations else 0) + len(magnet.study.uncertain_of_magnet)))
 
 
 def magnetized(magnet: Magnet, distribution: Gaussian, name: str) -> Gaussian:

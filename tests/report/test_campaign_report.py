@@ -124,6 +124,19 @@ def test_the_map_and_blocks_that_all_results_use_are_named(tmp_path, monkeypatch
         assert ("--measurements map.csv" in commands[0]) == (name == "one")
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_a_study_that_is_not_here_is_not_named(tmp_path, monkeypatch, there):
+    """A path that held in the folder of the run leads nowhere from another one."""
+    monkeypatch.chdir(tmp_path)
+    results(tmp_path / "field", "solve", answer=Answer(
+        "Which?", "Some.", "Yes.", "Next.", "halbach-fe verify r.toml -o DIR"),
+        named={"STUDY": "r.toml"})
+    if there:
+        (tmp_path / "r.toml").touch()
+    (_, _, answer), = read_campaign([tmp_path / "field"]).answered
+    assert answer.command == f"halbach-fe verify {'r.toml' if there else 'STUDY'} -o DIR"
+
+
 def test_the_page_may_be_elsewhere(campaign, tmp_path):
     """Its links start from where it is; in a folder, that is owned."""
     path = hf.campaign_report([campaign / "field", str(campaign / "inferred")], tmp_path / "of all")

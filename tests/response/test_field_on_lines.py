@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from dataclasses import replace
 
 import magpylib
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
+import halbach_fe as hf
 from halbach_fe.cli import main
 from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
@@ -432,6 +434,23 @@ def test_points_that_are_too_far_apart_are_in_the_bars():
         assert np.abs(found_phi - right_phi) < 3 * bar
     through = Lines(np.array([0, 0.03, -0.05]), np.array([0, 0.03, 0.05]), count=8)
     assert solved(through, inside=True).relative_spacing > 0.01
+
+
+def test_a_study_with_uncertain_amplitudes_has_a_prior():
+    """The field is that without them. Where it is nothing but rounding, no spacing is too wide."""
+    magnet = magnet_of()
+    more = magnet.with_(uncertain=[{"name": "across", "sd": 1.0, "change": {
+        "array.free_blocks.y_m[1]": 1e-4}}])
+    lines = Lines(np.array([0.0, 0, 0.05]), np.array([0.0, 0, 0.2]), count=51)
+    np.testing.assert_allclose(hf.field(more, lines).mean, hf.field(magnet, lines).mean)
+    quadrupole = hf.halbach_ring(order=2, blocks=8, inner_radius_m=0.02, outer_radius_m=0.04,
+                                 length_m=0.05, remanence_T=1.2)
+    axis = Lines(np.array([0.0, 0, -0.2]), np.array([0.0, 0, 0.2]), count=51)
+    with warnings.catch_warnings(action="error"):
+        assert np.abs(hf.field(quadrupole, axis).mean).max() < 1e-15
+    with pytest.warns(HalbachWarning, match="too far apart"):  # the control
+        hf.field(quadrupole, replace(axis, start=axis.start + [0.001, 0, 0], count=11,
+                                     end=axis.end + [0.001, 0, 0]))
 
 
 def test_bars_of_a_line_are_its_own_and_of_all_sources():
