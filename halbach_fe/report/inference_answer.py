@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.numbers import in_a_row
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
@@ -68,8 +69,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         f"{verdict} and readings agree: chi² per reading before the update is "
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
-        f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}{_of_the_probe(result)}"
-        f"{_of_the_sign(result)}{solver}",
+        f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}{_of_amplitudes(result)}"
+        f"{_of_the_probe(result)}{_of_the_sign(result)}{solver}",
         *(LOOK if single or (shared and "update again" not in result.reservation) else
           AGAIN if shared else OF_THE_TABLE if result.table_doubts else _after_agreement(result)),
         sound=not result.reservation,
@@ -88,6 +89,19 @@ def _after_agreement(result: InferenceResult) -> tuple[str, str]:
             f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
             f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
             "DIR/posterior.h5 -o DIR")
+
+
+def _of_amplitudes(result: InferenceResult) -> str:
+    """Say that the update is linear in amplitudes, if it moved some by many of their bars."""
+    # The blocks' chi² was 9 where a gap had moved by 70, and 1 after a second update.
+    many = 10.0
+    found = result.amplitudes
+    if found is None or not (far := np.abs(found.change) > many * found.sd).any():
+        return ""
+    names = in_a_row([found.names[number] for number in np.flatnonzero(far)])
+    return (f" The update is linear in the amplitudes of [[uncertain]], and moved {names} by more "
+            f"than {many:.0f} error bars: the bars of the blocks may be too small. Put what was "
+            "found into the study and update again.")
 
 
 def _of_the_probe(result: InferenceResult) -> str:

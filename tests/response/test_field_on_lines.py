@@ -449,8 +449,8 @@ def test_a_study_with_uncertain_amplitudes_has_a_prior():
     with warnings.catch_warnings(action="error"):
         assert np.abs(hf.field(quadrupole, axis).mean).max() < 1e-15
     with pytest.warns(HalbachWarning, match="too far apart"):  # the control
-        hf.field(quadrupole, replace(axis, start=axis.start + [0.001, 0, 0], count=11,
-                                     end=axis.end + [0.001, 0, 0]))
+        hf.field(quadrupole, replace(
+            axis, count=11, start=np.array([0.001, 0, -0.2]), end=np.array([0.001, 0, 0.2])))
 
 
 def test_bars_of_a_line_are_its_own_and_of_all_sources():
