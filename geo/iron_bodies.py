@@ -119,9 +119,11 @@ def mesh_iron(name: str, bodies: Sequence[IronSolid], sizes: Sizes, mesh_path: P
         _set_sizes(bodies, pieces[:-2], sizes, shell)
         gmsh.model.mesh.generate(3)
         gmsh.model.mesh.setOrder(2)
-        gmsh.option.setNumber("General.AbortOnError", 0)  # it throws where nobody can catch it
-        gmsh.option.setNumber("General.AbortOnError", 0)  # it throws where nothing can catch
+        # an error of the optimizer is thrown where nothing can catch it, and would end the process
+        raising = gmsh.option.getNumber("General.AbortOnError")
+        gmsh.option.setNumber("General.AbortOnError", 0)
         gmsh.model.mesh.optimize("HighOrder")
+        gmsh.option.setNumber("General.AbortOnError", raising)
         _check_elements(name)
         write_mesh(mesh_path)
     return Regions(

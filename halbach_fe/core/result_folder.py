@@ -37,8 +37,8 @@ RECORD = "run.json"
 
 KEPT = ("*.msh", "*regions.json", "response.h5", "response-*.npy", "chains.nc",
         "[0-9][0-9][0-9][0-9]-*.json")
-"""Files that a later run may read instead of writing them again; each is verified when it is, but
-for sealed cases, the last."""
+"""Files that a later run may read instead of writing them again. The last are results of sealed
+cases, which are read as they are; each of the others is verified when it is read."""
 
 _OF_RUNS = ("mesh.msh", "meridian.msh", "iron.msh", "regions.json", "meridian-regions.json",
             "iron-regions.json", "response.h5", "response-*.npy", "chains.nc", "getdp-*")

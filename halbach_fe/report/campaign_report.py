@@ -342,14 +342,15 @@ def _from_here(path: Path) -> str | None:
 def _with_folder(answer: Answer, chapter: Chapter) -> Answer:
     """Return an answer whose command has the folder of the files that its own command wrote.
 
-    Inputs that are not where they were from the folder of that run have the words for them.
+    An input whose path leads nowhere from the current folder is called by its word, as STUDY: the
+    path was that from the folder in which the command ran.
     """
     gone = {path: word for word, path in chapter.record.named.items() if not Path(path).exists()}
 
     def named(found: re.Match[str]) -> str:
         if found[1] not in chapter.record.files:
             return found[0]
-        place = chapter.folder / found[1]  # as it was given; of the root the page says nothing
+        place = chapter.folder / found[1]  # as it was given; the page names no absolute path
         return shlex.quote(_from_here(place) or printable(
             f"{chapter.label}/{found[1]}" if place.is_absolute() else str(place), MAX_QUOTED))
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.core.numbers import in_a_row
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
@@ -17,6 +16,7 @@ from halbach_fe.report.words import (
     faults_in_words,
     flux_density,
     fraction,
+    in_a_row,
     place_of,
     rms,
     with_error,

@@ -662,18 +662,22 @@ def test_extrapolated_lines_are_no_spikes(generator):
     assert check_map(field_map(points, field)).broken == {"spike": [len(field) // 2 + 1]}
 
 
+def dipole_of_cubes(count, radius):
+    """A dipole of cubes of 12 mm, by magpylib."""
+    ring = magpylib.Collection()
+    for angle in 360.0 / count * np.arange(count):
+        cube = magpylib.magnet.Cuboid(dimension=(0.012,) * 3, position=(radius, 0.0, 0.0),
+                                      polarization=(1.27, 0.0, 0.0))
+        ring.add(cube.rotate_from_angax(angle, "z", anchor=0).rotate_from_angax(angle, "z"))
+    return ring
+
+
 @pytest.mark.parametrize("counts", [(10, 10, 3), (5, 6, 10), (20, 15, 1)])
 def test_the_corners_of_a_clean_map_are_no_spikes(generator, counts):
     """Towards magnets the field rises faster than quadratic functions of neighbours on one side.
     Up to eight corners of 300 rows were left out. Control: a corner that is off by the field.
     """
-    ring = magpylib.Collection()
-    for slot in range(12):
-        angle = 30.0 * slot
-        cube = magpylib.magnet.Cuboid(dimension=(0.012,) * 3, position=(0.056, 0.0, 0.0),
-                                      polarization=(1.27, 0.0, 0.0))
-        cube.rotate_from_angax(angle, "z", anchor=0).rotate_from_angax(angle, "z")
-        ring.add(cube)
+    ring = dipole_of_cubes(12, 0.056)
     lines = [half * np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
              for half, n in zip((0.027, 0.027, 0.02), counts, strict=True)]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
@@ -688,13 +692,7 @@ def test_the_tips_of_a_grid_cut_to_a_sphere_are_no_spikes():
     """A single row lies a spacing beyond all others at either end of each axis; quadratic functions
     extrapolate |B| there by as much as it varies. Control: off by five times that.
     """
-    ring = magpylib.Collection()
-    for slot in range(16):
-        angle = 22.5 * slot
-        cube = magpylib.magnet.Cuboid(dimension=(0.012,) * 3, position=(0.08, 0.0, 0.0),
-                                      polarization=(1.27, 0.0, 0.0))
-        cube.rotate_from_angax(angle, "z", anchor=0).rotate_from_angax(angle, "z")
-        ring.add(cube)
+    ring = dipole_of_cubes(16, 0.08)
     grid = np.linspace(-0.06, 0.06, 7)
     points = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1).reshape(-1, 3)
     points = points[np.linalg.norm(points, axis=1) < 0.0626]
