@@ -316,7 +316,10 @@ def only_of_orders(model: MultipoleModel) -> str:
     """Say of which orders multipoles are, if not of all that are given without being asked for."""
     if {*DEFAULT_ORDERS} - {model.main} <= {*model.orders}:
         return ""
-    return f" Only order {in_a_row([str(order) for order in model.orders])} was asked for."
+    orders = in_a_row([str(order) for order in model.orders])
+    if len(model.orders) == 1:
+        return f" Only order {orders} was asked for."
+    return f" Only orders {orders} were asked for."
 
 
 def lacks_main(known: Multipoles) -> bool:

@@ -444,8 +444,13 @@ def _draw_move(axis: Axes, ends: Floats, step: Step, label: str) -> None:
     """Draw a move at the slots (1 to 3, 2) where its blocks go."""
     kind = step.move.kind
     if kind in ("swap", "cycle"):
-        axis.plot(*np.vstack([ends, ends[:1]]).T, "-o", color=POSTERIOR, lw=1.2, ms=5,
-                  label=DRAWN_AS[kind])
+        axis.plot(*ends.T, "o", color=POSTERIOR, ms=5, label=DRAWN_AS[kind])
+        ways = list(zip(ends, np.roll(ends, -1, axis=0), strict=True))
+        # Arcs, of which two in one ring are told apart; to the left, as numbers are at the right.
+        for start, end in ways[:1] if kind == "swap" else ways:
+            axis.annotate("", end, start, arrowprops={
+                "arrowstyle": "-", "color": POSTERIOR, "lw": 1.2,
+                "connectionstyle": f"arc3,rad={0.25 * np.sign(end[1] - start[1])}"})
     else:
         axis.plot(*ends.T, "o" if kind == "turn" else "s", mfc="none", ms=11, mew=1.8,
                   color=SECOND if kind == "turn" else PUBLISHED, label=DRAWN_AS[kind])
