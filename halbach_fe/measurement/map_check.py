@@ -1042,6 +1042,8 @@ def _stated(
     makes the parts of the map disagree, and bars long. If there are such readings, the map is asked
     again without the tenths of it that are roughest. Its instrument is that of the region which
     shows most, and, if that is not all of the map, the field elsewhere is fitted with it as it is.
+    By how much the regions differ beyond their bars is what the charges do to a term: bars contain
+    it, see `_with_other_regions`.
     """
     regions = [rows]
     rough = fitted.model.scatter[rows]
@@ -1061,9 +1063,11 @@ def _stated(
                                other for _, other in asked[:number] + asked[number + 1:]),
                                strict=True)]) for number, (_, terms) in enumerate(asked)]
     best = int(np.argmax([each.sum() for each in supported]))  # the largest that shows as much
+    terms = tuple(_with_other_regions(term, others) for term, *others in zip(
+        asked[best][1], *(told for _, told in asked[:best] + asked[best + 1:]), strict=True))
+    (whole, _), (inner, _) = asked[0], asked[best]
     if best == 0:
-        return asked[0]
-    (whole, _), (inner, terms) = asked[0], asked[best]
+        return whole, terms
     model = whole.model.with_terms(inner.model.prior_sd > 0).settled()
     settled = replace(whole, model=model, at=replace(inner.at, amplitudes=whole.at.amplitudes))
     return settled.weighted(rows), tuple(
@@ -1093,6 +1097,21 @@ def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
     told = [other for other in others if other.determined]
     return any(other.found for other in others) and all(
         abs(term.value - other.value) <= SEEN * np.hypot(term.sd, other.sd) for other in told)
+
+
+def _with_other_regions(term: InstrumentTerm, others: list[InstrumentTerm]) -> InstrumentTerm:
+    """Return a term that was found with the rms difference of other regions from it in its bar.
+
+    Of two regions of which one contains the other, estimates differ by the root of the difference
+    of their variances. A measured dipole's probe was turned by 49.4 +- 1.2 mrad by all of a map
+    that touches its blocks, by 55.7 +- 0.4 without the roughest tenths, and by 56.2 +- 0.4 in
+    another map: the readings near the blocks lead astray by five of their bars.
+    """
+    beyond = [max(0.0, (other.value - term.value)**2 - abs(other.sd**2 - term.sd**2))
+              for other in others if other.determined]
+    if not (term.found and beyond):
+        return term
+    return replace(term, sd=float(np.hypot(term.sd, np.sqrt(np.mean(beyond)))))
 
 
 def _asked(

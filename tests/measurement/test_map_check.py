@@ -41,7 +41,7 @@ from halbach_fe.report.map_check import (
     weighted_note,
 )
 from halbach_fe.report.map_check import page as page_of_check
-from tests.support.hard_maps import ERRORS, hard_map
+from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 from tests.support.short_dipole import FRINGE, sectors, truth
 
 NOISE_T = 2e-5
@@ -360,9 +360,10 @@ def test_an_imperfect_instrument(generator):
 
 def trust_white_noise(monkeypatch):
     """Let the check believe that whatever the charges do not follow is white noise: the parts of
-    the map tell what the whole map does.
+    the map tell what the whole map does, and its regions do not differ.
     """
     selected = map_check.selected
+    monkeypatch.setattr(map_check, "_with_other_regions", lambda term, others: term)
     monkeypatch.setattr(map_check, "selected", lambda parameters, told, **_: selected(
         parameters, map_check.EvidenceByPart.of([told.whole] * 3)))
 
@@ -401,6 +402,18 @@ def test_a_turn_is_found_where_the_field_is_not_rough(monkeypatch, shares, found
     (term,) = [term for term in check_map(hard_map(21, "roll")).terms if term.name == name]
     assert term.found == found
     assert abs(term.value - value) < 2 * term.sd
+
+
+@pytest.mark.parametrize("merged", [True, False])
+def test_bars_contain_how_regions_of_a_map_differ(monkeypatch, merged):
+    """Readings next to the blocks move the gain by 0.3 % of 1.9 %; the control leaves it out."""
+    if not merged:
+        monkeypatch.setattr(map_check, "_with_other_regions", lambda term, others: term)
+    data = hard_map(12, "gain")
+    own, share = gain_of(data["B_T"].values)
+    term = named(check_map(data), f"gain of B{'xyz'[own]} relative to that of |B|")
+    assert term.found
+    assert (abs(term.value - 100 * GAIN * (1 - share)) < 2 * term.sd) == merged
 
 
 def test_one_component_may_be_nearly_all_of_the_field(generator, monkeypatch):
@@ -446,6 +459,7 @@ def test_edges_of_magnets_are_no_errors_of_the_probe(shape, monkeypatch):
             with monkeypatch.context() as without:
                 without.setattr(map_check, "selected", lambda parameters, told, **_: selected(
                     parameters, replace(told, flat=None)))
+                without.setattr(map_check, "_with_other_regions", lambda term, others: term)
                 asked += [term.name for term in check_map(data).terms if term.found]
     assert shape is sectors or asked
 
