@@ -10,12 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.grades import (
-    Material,
-    doubted_strength,
-    with_grade,
-    without_old_grade,
-)
+from halbach_fe.study.grades import Material, doubted_strength, with_grade, without_old_grade
 from halbach_fe.study.types import (
     Angle,
     Coordinate,

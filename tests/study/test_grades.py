@@ -202,8 +202,9 @@ def test_two_rows_must_not_share_a_name(tmp_path: Path, alias: str):
         read(tmp_path, ROW, other | {"aliases": alias})
 
 
-CUBES = {"multipole_order": 1, "blocks_per_ring": 12, "inner_radius_m": 0.06, "outer_radius_m": 0.08,
-         "ring_length_m": 0.02, "block": {"shape": "cuboid", "width_m": 0.02}}
+CUBES = {"multipole_order": 1, "blocks_per_ring": 12, "inner_radius_m": 0.06,
+         "outer_radius_m": 0.08, "ring_length_m": 0.02,
+         "block": {"shape": "cuboid", "width_m": 0.02}}
 
 
 def study_with(**array: Any) -> Study:
@@ -221,13 +222,14 @@ def study_with(**array: Any) -> Study:
 def test_another_grade_replaces_what_the_first_one_said():
     changed = study_with(material="N52").with_(array__material="N35H")
     told = study_with(material="N35H")
-    assert changed.array == told.array and changed.array.remanence_T == 1.19
+    assert changed.array == told.array
+    assert changed.array.remanence_T == 1.19
     assert changed.prior == told.prior
     assert changed.demagnetization == told.demagnetization
     assert changed.demagnetization.squareness == 0.8  # the study's own
     own = study_with(material="N52", remanence_T=1.43).with_(array__recoil_permeability=1.02)
     kept = own.with_(array__material="N50M")  # 1.43 T is in the range of both
-    assert kept.array.remanence_T == 1.43 and kept.array.recoil_permeability == 1.02
+    assert (kept.array.remanence_T, kept.array.recoil_permeability) == (1.43, 1.02)
     assert kept.prior.common_mode_sd == own.prior.common_mode_sd
     both = study_with(material="N52").with_(array__material="N35H", array__remanence_T=1.2)
     assert both.array.remanence_T == 1.2
