@@ -336,8 +336,8 @@ def multipole_models(
         try:
             if integrated:
                 matrix, offset, error = _along_all_z(magnet, observation, model, part)
-            why = (f"no multipole of order {main}, which cancels there: its table, in units of 1e-4 "
-                   "of that,")
+            why = (f"no multipole of order {main}, which cancels there: its table, in units of "
+                   "1e-4 of that,")
             turn = _turn(magnet, matrix[main - 1], model)
         except StudyError:
             if len(left_out) == len(references) - 1:

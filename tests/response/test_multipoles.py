@@ -238,7 +238,7 @@ def test_an_integral_that_has_sources_within_its_circle(session, external, named
     at_z = replace(reference, z_m=0.0)
     assert len(multipole_model(magnet, at_z, session).offset) == 3
     # beside that circle, as the command asks for both, the table of the integral is left out
-    with pytest.warns(HalbachWarning, match="integrated along z has a coil or dipole within the ci"):
+    with pytest.warns(HalbachWarning, match="along z has a coil or dipole within the circle"):
         models, said = multipoles.multipole_models(magnet, (reference, at_z), session)
     assert [model.z for model in models] == [0.0]
     assert len(said) == 1
