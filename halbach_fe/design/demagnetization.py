@@ -17,6 +17,7 @@ from typing import Any
 
 import meshio
 import numpy as np
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
@@ -51,6 +52,10 @@ sides.
 SHARES = (0.0, 0.01)
 """Shares of the magnet's volume for which the limit temperature is reported."""
 
+OPPOSED = -0.2
+"""Cells with less of mu_0 H along the magnetization, over the remanence, are looked at in more
+places than their middles. Knees of magnets are below -0.5 at room temperature."""
+
 LINEAR = 0.25, 2.0
 """Change of the coercivity up to which its coefficient is believed: that of NdFeB doubles at about
 -145 °C, where its easy axis turns (-138 °C), and linear laws of data sheets end above 1/4."""
@@ -80,6 +85,25 @@ class Cells:
 
 
 @dataclass(frozen=True)
+class Places:
+    """Places anywhere in cells that are in an opposed field, and the middles of other ones.
+
+    Attributes
+    ----------
+    cell : ndarray, shape (n,)
+        Number of the cell of each place.
+    volumes : ndarray, shape (n,), in m^3 (in 2D areas in m^2)
+        What of the volume of its cell each stands for.
+    along : ndarray, shape (n,), in A/m
+        H along the magnetization.
+    """
+
+    cell: Ints
+    volumes: Floats
+    along: Floats
+
+
+@dataclass(frozen=True)
 class DemagnetizationMap(ShownInNotebook):
     """H in the blocks of a magnet at a given temperature, compared with the knee.
 
@@ -93,11 +117,10 @@ class DemagnetizationMap(ShownInNotebook):
         Blocks with their remanence at the material's temperature.
     cells : Cells
     along : ndarray, shape (cells,), in A/m
-        H along the magnetization; negative where H opposes the magnetization.
-    margin : ndarray, shape (cells,), in A/m
-        Margin between H and the knee; negative past the knee.
-    coarse_share : float
-        `share_beyond_now` by cells of about twice the length.
+        H along the magnetization in the middles; negative where H opposes the magnetization.
+    places : Places
+        H along the magnetization anywhere in the cells, of which shares and limits follow: the
+        middles miss what is past the knee in parts of cells alone, as at faces and edges.
     """
 
     magnet: Magnet
@@ -105,7 +128,7 @@ class DemagnetizationMap(ShownInNotebook):
     blocks: tuple[MagnetBlock, ...]
     cells: Cells
     along: Floats
-    coarse_share: float
+    places: Places
 
     @property
     def study(self) -> Study:
@@ -114,15 +137,22 @@ class DemagnetizationMap(ShownInNotebook):
 
     @property
     def share_error(self) -> float:
-        """By how much `share_beyond_now` depends on the size of the cells.
+        """By how much `share_beyond_now` depends on the places: on every second one of them.
 
-        Two sizes may agree by chance: it is at least the share of a cell of twice the length, if
-        anything is past the knee.
+        These may agree by chance: it is at least the share of the volume of a place of twice the
+        length, if anything is past the knee.
         """
-        volumes = self.cells.volumes
-        cells = 2 ** self.magnet.dimension  # of which one of twice the length consists
-        least = cells * float(volumes.max() / volumes.sum()) if self.share_beyond_now else 0.0
-        return max(abs(self.share_beyond_now - self.coarse_share), least)
+        past, volumes = self.past_the_knee, self.places.volumes
+        if not past.any():
+            return 0.0
+        least = 2 ** self.magnet.dimension * float(volumes[past].max() / volumes.sum())
+        half = volumes[::2][past[::2]].sum() / volumes[::2].sum()
+        return max(abs(self.share_beyond_now - float(half)), least)
+
+    @property
+    def past_the_knee(self) -> NDArray[np.bool_]:
+        """Whether the places (n,) are past the knee at the temperature of the map."""
+        return np.asarray(self.places.along < -knee(self.material, self.material.temperature_C))
 
     @property
     def margin(self) -> Floats:
@@ -132,8 +162,8 @@ class DemagnetizationMap(ShownInNotebook):
     @property
     def share_beyond_now(self) -> float:
         """Share of the volume that is past the knee at the temperature of the map."""
-        volumes = self.cells.volumes
-        return float(volumes[self.margin < 0].sum() / volumes.sum())
+        volumes = self.places.volumes
+        return float(volumes[self.past_the_knee].sum() / volumes.sum())
 
     def share_beyond(self, temperature_C: Floats) -> Floats:
         """Return the share of the volume past the knee, for temperatures (t,) in °C.
@@ -141,11 +171,11 @@ class DemagnetizationMap(ShownInNotebook):
         H is assumed to be proportional to the remanence when the temperature changes. This is exact
         without iron and for iron of constant permeability.
         """
-        weight = self.cells.volumes / self.cells.volumes.sum()
+        weight = self.places.volumes / self.places.volumes.sum()
         grown = (remanence_factor(self.material, temperature_C)
                  / remanence_factor(self.material, self.material.temperature_C))
         limit = knee(self.material, temperature_C)
-        return np.array([weight[self.along * g < -h].sum()
+        return np.array([weight[self.places.along * g < -h].sum()
                          for g, h in zip(grown, limit, strict=True)])
 
     @property
@@ -161,9 +191,9 @@ class DemagnetizationMap(ShownInNotebook):
         and the signs of the infinities are the others.
         """
         material = self.material
-        at_reference = -self.along / remanence_factor(material, material.temperature_C)
+        at_reference = -self.places.along / remanence_factor(material, material.temperature_C)
         # solve -along (1 + alpha d) = knee (1 + beta d) for the temperature difference d of each
-        # cell, where alpha and beta are the coefficients of remanence and coercivity
+        # place, where alpha and beta are the coefficients of remanence and coercivity
         rate = (at_reference * material.remanence_coefficient_per_K
                 - knee(material, material.reference_temperature_C)
                 * material.coercivity_coefficient_per_K)
@@ -173,7 +203,7 @@ class DemagnetizationMap(ShownInNotebook):
             limit = np.where(sign * rate > 0, spare / rate,
                              np.where(spare > 0, sign * np.inf, -sign * np.inf))
         order = np.argsort(sign * limit)
-        passed = np.cumsum(self.cells.volumes[order]) / self.cells.volumes.sum()
+        passed = np.cumsum(self.places.volumes[order]) / self.places.volumes.sum()
         first = int(np.searchsorted(passed, share + 1e-12))
         found = float(limit[order][min(first, len(limit) - 1)] + material.reference_temperature_C)
         return found if found > ABSOLUTE_ZERO_C else -np.inf
@@ -194,6 +224,7 @@ class DemagnetizationMap(ShownInNotebook):
         share_of_coercivity = float(knee(self.material, self.material.temperature_C)
                                     / self.material.intrinsic_coercivity_A_per_m)
         rows: list[dict[str, Any]] = []
+        past, block = self.past_the_knee, self.cells.block[self.places.cell]
         for number in np.unique(self.cells.block):
             mine = self.cells.block == number
             along, volume = self.along[mine], self.cells.volumes[mine]
@@ -205,7 +236,8 @@ class DemagnetizationMap(ShownInNotebook):
                 "mean_H_A_per_m": float(np.average(along, weights=volume)),
                 "least_H_A_per_m": float(along[worst]), "x_m": x, "y_m": y, "z_m": z,
                 "margin_A_per_m": float(self.margin[mine].min()),
-                "share_beyond_knee": float(volume[self.margin[mine] < 0].sum() / volume.sum()),
+                "share_beyond_knee": float(
+                    self.places.volumes[past & (block == number)].sum() / volume.sum()),
                 "needed_coercivity_A_per_m": max(0.0, -float(along[worst])) / share_of_coercivity,
             })
         return rows
@@ -260,14 +292,38 @@ def demagnetization_map(
     warm = at_temperature(magnet, material)
     blocks = warm.blocks
     magnetized = [number for number, block in enumerate(blocks) if block.remanence]
-    cells, coarse = cut(blocks, magnetized, across), cut(blocks, magnetized, max(1, across // 2))
-    number = np.append(cells.block, coarse.block)
-    field = _field_strength(
-        warm, blocks, np.vstack([cells.middles, coarse.middles]), number, session, progress)
+    cells = cut(blocks, magnetized, across)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
-    along, rest = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
-    by_coarse = DemagnetizationMap(magnet, material, blocks, coarse, rest, np.nan)
-    return DemagnetizationMap(magnet, material, blocks, cells, along, by_coarse.share_beyond_now)
+    field = _vacuum_field(blocks, cells.middles, progress)
+    strength = np.array([abs(block.remanence) for block in blocks])[cells.block]
+    opposed = np.einsum("nc,nc->n", field, easy[cells.block]) < OPPOSED * strength
+    cell, points = _anywhere(cells, np.flatnonzero(opposed))
+    number = np.append(cells.block, cells.block[cell])
+    field = _field_strength(
+        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, progress)]),
+        np.vstack([cells.middles, points]), number, session)
+    along, other = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
+    cell = np.append(np.flatnonzero(~opposed), cell)
+    return DemagnetizationMap(magnet, material, blocks, cells, along, Places(
+        cell, (cells.volumes / np.maximum(1, np.bincount(cell, minlength=len(opposed))))[cell],
+        np.append(along[~opposed], other)))
+
+
+def _anywhere(cells: Cells, numbers: Ints) -> tuple[Ints, Floats]:
+    """Return the cells (n,) and points (n, 3) in m of places anywhere in cells of some numbers.
+
+    There is at least one in each cell. They follow the sequence R3 of M. Roberts (2018), whose
+    steps are the powers of 1/1.2207: no place in a cell is preferred.
+    """
+    within = 0.005  # of the cell: at its rim a place may be outside of an arc
+    enough, most = 20_000, 8  # places, and in each cell
+    each = min(-(-enough // max(1, len(numbers))), most)
+    cell, steps = np.repeat(numbers, each), 1.2207440846057596 ** -np.arange(1.0, 4.0)
+    u, v, w = (within + (1 - 2 * within) * ((0.5 + np.outer(np.arange(len(cell)), steps)) % 1.0)).T
+    weights = np.array([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v]).T
+    if cells.corners.shape[1] > weights.shape[1]:
+        weights = np.hstack([weights * (1 - w)[:, None], weights * w[:, None]])
+    return cell, np.asarray(np.einsum("nc,nck->nk", weights, cells.vertices[cells.corners[cell]]))
 
 
 def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
@@ -388,17 +444,28 @@ def _count(length: float, size: float) -> int:
     return max(1, round(length / size))
 
 
-def _field_strength(
-    magnet: Magnet, blocks: Sequence[MagnetBlock], points: Floats, number: Ints, session: Session,
-    progress: Progress | None,
+def _vacuum_field(
+    blocks: Sequence[MagnetBlock], points: Floats, progress: Progress | None
 ) -> Floats:
-    """Return H (n, 3) in A/m at points (n, 3) in m inside the blocks of some numbers (n,)."""
-    field = np.empty_like(points)  # mu_0 H in vacuum
+    """Return mu_0 H (n, 3) in T of blocks in vacuum at points (n, 3) in m inside of them."""
+    field = np.empty_like(points)
     # of all blocks at some points, which take seconds
     for some in np.array_split(np.arange(len(points)), 1 + len(points) * len(blocks) // 10**7):
         field[some] = field_of(blocks, points[some])
-        if progress is not None:
+        if progress is not None and len(some):
             progress(int(some[-1]) + 1, len(points))
+    return field
+
+
+def _field_strength(
+    magnet: Magnet, blocks: Sequence[MagnetBlock], vacuum: Floats, points: Floats, number: Ints,
+    session: Session,
+) -> Floats:
+    """Return H (n, 3) in A/m at points (n, 3) in m inside the blocks of some numbers (n,).
+
+    ``vacuum`` is that of `_vacuum_field` there.
+    """
+    field = vacuum
     reacting = magnet.with_(solver__method="reaction")
     if not magnet.is_vacuum and _by_moments(reacting):
         field += solve_separate(reacting, session, estimate=False).field(points)

@@ -596,7 +596,8 @@ def _check_near(table: BlockTable, deviations: Floats) -> None:
     row = int(far[0])
     ratio = ratios[row]
     angle = np.degrees(np.arccos(np.clip((deviations[row, 0] + 1) / ratio, -1, 1)))
-    hint = ("Are the moments in the block's own axes as mounted (x radially outward), and is that "
+    where = "as mounted" if table.ring[row] else "as mounted in the first slot of its type"
+    hint = (f"Are the moments in the block's own axes {where} (x radially outward), and is that "
             "its type?")
     if not 0.03 < np.median(ratios) < 30 or (
             angle < along_deg and np.ptp(ratios) < FAR * np.median(ratios)):

@@ -44,6 +44,9 @@ PAST = "#D55E00"
 ROOM_C = 20.0
 """Temperature in °C at which a magnet is kept at least."""
 
+VERY_EDGES = 1e-3
+"""Share of the volume that counts as the very edges of blocks, where H has no bound."""
+
 AT_ROOM = "It loses magnetization at room temperature already."
 """Sentence about a magnet that does not keep its magnetization there."""
 
@@ -106,7 +109,8 @@ class _Losses:
     @classmethod
     def of(cls, found: DemagnetizationMap) -> _Losses:
         """Return those of a map of margins."""
-        limit, now = found.limit_temperature(SHARES[-1]), found.share_beyond_now > 0
+        limit, now = (found.limit_temperature(SHARES[-1]),
+                      found.share_beyond_now > VERY_EDGES)
         at_room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
         low, high = LINEAR
         on_the_way = now and math.isfinite(limit) and (
@@ -126,6 +130,9 @@ def _past_the_knee(found: DemagnetizationMap) -> str:
     lost = found.share_beyond_now
     if not lost:
         return "no cell is past the knee of the demagnetization curve"
+    if lost <= VERY_EDGES:
+        return (f"no more than {100 * lost:.1g} % of the magnet's volume, at the very edges of "
+                "blocks, is past the knee of its demagnetization curve")
     error = f" ± {_percent(found.share_error)}" if found.share_error else ""
     return (f"{100 * lost:.3g}{error} % of the magnet's volume is past the knee of its "
             "demagnetization curve and loses magnetization for good")
@@ -133,12 +140,12 @@ def _past_the_knee(found: DemagnetizationMap) -> str:
 
 def _percent(share: float) -> str:
     """Return an error of a share in per cent."""
-    return f"{100 * share:.1g}"
+    return f"{float(f'{100 * share:.1g}'):g}"
 
 
 def _worst_block(found: DemagnetizationMap) -> str:
     """Say which block loses most, if any does."""
-    if not found.share_beyond_now:
+    if found.share_beyond_now <= VERY_EDGES:
         return ""
     most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
     by_name = {each.name: each for each in found.blocks}
@@ -151,8 +158,8 @@ def _margins(found: DemagnetizationMap) -> str:
     worst = int(np.argmin(found.margin))
     block = place_of(found.blocks[found.cells.block[worst]])
     limits = "; ".join(_limit_in_words(found, share) for share in SHARES)
-    return (f"The smallest margin is {1e-3 * found.margin[worst]:+.0f} kA/m, in {block}; "
-            f"{limits}.")
+    return (f"The smallest margin in the middle of a cell is {1e-3 * found.margin[worst]:+.0f} "
+            f"kA/m, in {block}; {limits}.")
 
 
 def _trust(found: DemagnetizationMap, state: _Losses) -> str:
@@ -166,9 +173,10 @@ def _trust(found: DemagnetizationMap, state: _Losses) -> str:
         first = ("Yes, as far as coercivity and coefficients of the study are right: data sheets "
                  "state them within some per cent.")
     sentences = [first, "The very edges of blocks are worse than any cell (the option --across "
-                 "makes them smaller)." + ("" if not found.share_error else
-                                           f" ± {_percent(found.share_error)} % is what cells of "
-                                           "twice the length change of the share of the volume.")]
+                 "makes them smaller)." + (
+                     "" if found.share_beyond_now <= VERY_EDGES else
+                     f" ± {_percent(found.share_error)} % is what the share of the volume depends "
+                     "on the places in the cells that were computed.")]
     if is_nonlinear(found.study):
         sentences.append("At other temperatures the field of the iron is scaled with the "
                          "remanence.")

@@ -369,7 +369,8 @@ def page(result: InferenceResult) -> Page:
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
         remarks=order,
-        new_study=None if result.terms is None else (STUDY_FILE, lambda: [(result.study, NOTE)]))
+        new_study=None if result.terms is None and not result.far_amplitudes else (
+            STUDY_FILE, lambda: [(result.study_as_found, NOTE)]))
 
 
 def _doubtful(result: InferenceResult) -> list[Text]:
@@ -461,7 +462,7 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
                   "They have not come to rest: their error bars may be too small."]
     if result.amplitudes:
         found.append("What the study has in tables [[uncertain]] is given as the change from what "
-                     "it says.")
+                     "it says." + bool(result.far_amplitudes) * f" {STUDY_FILE} has them as found.")
     return [
         Section([] if not overlaps else [
             "Where two maps overlap, the readings of one are compared with what an update by the "

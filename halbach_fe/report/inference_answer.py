@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
-from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult
+from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
 from halbach_fe.report.words import (
@@ -16,7 +16,6 @@ from halbach_fe.report.words import (
     faults_in_words,
     flux_density,
     fraction,
-    in_a_row,
     place_of,
     rms,
     with_error,
@@ -38,6 +37,12 @@ OF_THE_TABLE = ("Answer what is asked of the table of blocks, correct it or the 
 """The next step, and its command, if the table of blocks may not be of this magnet."""
 
 
+AS_FOUND = ("Update again with study.updated.toml, the study with the amplitudes that were found: "
+            "an update is linear in them.",
+            "halbach-fe infer DIR/study.updated.toml --measurements MAP -o DIR")
+"""The next step, and its command, if amplitudes moved farther than the update is linear in them."""
+
+
 def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> Answer:
     """Say what field the updated magnet has, how well it predicts, and what to do next.
 
@@ -52,7 +57,8 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
                  if result.disagreement == result.too_near else "Model and measurement disagree")
         return Answer(question, f"{wrong}, so that these numbers and their "
                       f"error bars are not to be used as they stand. {said}",
-                      f"No. {result.disagreement}{solver}",
+                      f"No. {result.disagreement}{solver}"
+                      f"{' ' * bool(far := far_in_words(result.far_amplitudes))}{far}",
                       *_after_a_conflict(result), sound=False, numbers=numbers,
                       gist=f"{wrong}: these numbers are not to be used.")
     tested = "" if result.held_out.any() else (
@@ -69,10 +75,11 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         question, f"{main_field_in_words(tables) or _largest_field(result)} {said}".lstrip(),
         f"{verdict} and readings agree: chi² per reading before the update is "
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
-        f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}{_of_amplitudes(result)}"
+        f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}"
         f"{_of_the_probe(result)}{_of_the_sign(result)}{solver}",
         *(LOOK if single or (shared and "update again" not in result.reservation) else
-          AGAIN if shared else OF_THE_TABLE if result.table_doubts else _after_agreement(result)),
+          AGAIN if shared else OF_THE_TABLE if result.table_doubts else
+          AS_FOUND if result.far_amplitudes else _after_agreement(result)),
         sound=not result.reservation,
         gist=_blocks(result, "The blocks deviate"), numbers=numbers)
 
@@ -89,19 +96,6 @@ def _after_agreement(result: InferenceResult) -> tuple[str, str]:
             f"{'' if of_order else 'multipoles and '}shim {'says' if of_order else 'say'} more.",
             f"halbach-fe {'multipoles' if of_order else 'homogeneity'} STUDY --posterior "
             "DIR/posterior.h5 -o DIR")
-
-
-def _of_amplitudes(result: InferenceResult) -> str:
-    """Say that the update is linear in amplitudes, if it moved some by many of their bars."""
-    # The blocks' chi² was 9 where a gap had moved by 70, and 1 after a second update.
-    many = 10.0
-    found = result.amplitudes
-    if found is None or not (far := np.abs(found.change) > many * found.sd).any():
-        return ""
-    names = in_a_row([found.names[number] for number in np.flatnonzero(far)])
-    return (f" The update is linear in the amplitudes of [[uncertain]], and moved {names} by more "
-            f"than {many:.0f} error bars: the bars of the blocks may be too small. Put what was "
-            "found into the study and update again.")
 
 
 def _of_the_probe(result: InferenceResult) -> str:
@@ -145,7 +139,7 @@ def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
         return ("First lower the solver's error, as is said above, and update again: as it is, it "
                 "hides what the study may lack. This command shows how it falls.",
                 "halbach-fe verify STUDY -o DIR")
-    return LOOK
+    return AS_FOUND if result.far_amplitudes else LOOK
 
 
 def _of_the_sign(result: InferenceResult) -> str:

@@ -12,6 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from halbach_fe.core.arrays import Floats
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.design.tolerance import QUANTILES, HomogeneityTolerance, Tolerance
+from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference.block_prior import types_of
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.homogeneity import SIZES, solver_error_text
 from halbach_fe.report.multipoles import (
@@ -135,6 +137,10 @@ def _sorting(found: Tolerance | HomogeneityTolerance) -> tuple[str, str]:
     if found.table_doubts:
         return ("Answer what is asked of the table of blocks, correct it or the study, and ask "
                 "again.", f"halbach-fe tolerance STUDY --blocks BLOCKS{at_z(found.model)} -o DIR")
+    if all(len(blocks) == 1 for blocks in types_of(build_magnet(found.study)).values()):
+        return ("Every slot is a type of its own, so that no blocks can change places: state in "
+                "prior.types which slots take the same ones, then sort measured blocks.",
+                f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")
     measure = "Measure the blocks before assembly, and see" if found.table_doubts is None else "See"
     return (f"{measure} what sorting them into the slots that they fit gains.",
             f"halbach-fe sort STUDY BLOCKS{at_z(found.model)} -o DIR")

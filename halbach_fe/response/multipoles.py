@@ -303,8 +303,8 @@ def multipole_models(
 ) -> tuple[list[MultipoleModel], tuple[str, ...]]:
     """Return the `multipole_model` of several references, which share the solves.
 
-    Those at which the main multipole of the nominal magnet vanishes are left out, unless it does at
-    all of them; the sentences that say so come second.
+    Those at which the main multipole of the nominal magnet vanishes, or that have sources within
+    the circle, are left out, unless all are; the sentences that say so come second.
 
     Warns
     -----
@@ -329,27 +329,29 @@ def multipole_models(
         integrated = magnet.dimension == 3 and z is None
         matrix = _complexes(model.matrix[part])
         offset, error = _complexes(model.offset[part]), model.error[part]
-        if integrated:
-            matrix, offset, error = _along_all_z(magnet, observation, model, part)
         index = np.array([main, *orders]) - 1
+        place = ("The field integrated along z" if integrated
+                 else f"The circle at z = {1e3 * (z or 0.0):.4g} mm")
+        why = "a coil or dipole within the circle, and no multipoles there: its table"
         try:
+            if integrated:
+                matrix, offset, error = _along_all_z(magnet, observation, model, part)
+            why = (f"no multipole of order {main}, which cancels there: its table, in units of "
+                   "1e-4 of that,")
             turn = _turn(magnet, matrix[main - 1], model)
         except StudyError:
             if len(left_out) == len(references) - 1:
                 raise
-            left_out.append("The field integrated along z" if integrated
-                            else f"The circle at z = {1e3 * (z or 0.0):.4g} mm")
+            left_out.append(f"{place} has {why} is left out.")
             continue
         phases = np.exp(-1j * turn * (index + 1))
         models.append(MultipoleModel(
             orders, main, radius, z, integrated, phases[:, None] * matrix[index],
             phases * offset[index], error[index], model.nominal, -turn,
             magnet.external.background_T if integrated else (0.0, 0.0, 0.0)))
-    said = tuple(f"{place} has no multipole of order {main}, which cancels there: its table, in "
-                 "units of 1e-4 of that, is left out." for place in left_out)
-    for each in said:
+    for each in left_out:
         warnings.warn(each, HalbachWarning, stacklevel=2)
-    return models, said
+    return models, tuple(left_out)
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:

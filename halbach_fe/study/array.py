@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+import warnings
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.grades import Material, with_grade
+from halbach_fe.study.grades import Material, doubted_strength, with_grade, without_old_grade
 from halbach_fe.study.types import (
     Angle,
     Coordinate,
@@ -156,7 +158,18 @@ class BlockException(StudyModel):
     tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
 
 
-class Ring(StudyModel):
+class _OfGrade(StudyModel):
+    """A table with a grade: another one has a remanence and a permeability of its own."""
+
+    def with_(self, **changes: Any) -> Self:
+        """Return a copy with other values of some keys; see `StudyModel.with_`."""
+        changed = super().with_(**without_old_grade(self, changes))
+        if "material" in changes and (doubt := doubted_strength(changed)):
+            warnings.warn(doubt, HalbachWarning, stacklevel=4)
+        return changed
+
+
+class Ring(_OfGrade):
     """A ring of its own: what differs from the values of the array.
 
     Every key that is left out has the array's value. Rings without ``z_m`` are stacked along z in
@@ -202,7 +215,7 @@ PLACEHOLDERS: dict[str, Any] = {"blocks_per_ring": 4, "inner_radius_m": 0.1,
 """Values for the keys of rings in an array that has free blocks only."""
 
 
-class Array(StudyModel):
+class Array(_OfGrade):
     """The permanent-magnet array: rings of blocks, free blocks, or both.
 
     ``rings`` equal rings have ``blocks_per_ring`` = N blocks each. The middle of slot ``i`` (from

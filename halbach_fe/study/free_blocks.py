@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,6 +188,14 @@ class FreeBlocks(StudyModel):
     def _once(cls, given: Any, handler: ModelWrapValidatorHandler[FreeBlocks]) -> FreeBlocks:
         """Accept a validated table as it is: large ones take seconds, and studies change often."""
         return given if isinstance(given, cls) else handler(given)
+
+    def with_(self, **changes: Any) -> Self:
+        """Return a copy with other values; rows of another grade have what that says."""
+        filled = columns_with_grades({"material": self.material}) if "material" in changes else {}
+        for key in filled.keys() - changes.keys():
+            changes[key] = tuple(None if value == old else value for value, old in zip(
+                getattr(self, key), filled[key], strict=True))
+        return super().with_(**changes)
 
     def _check_sizes(self) -> None:
         # Arcs of this angle or more are cut in two, so that their sector has more than four edges.

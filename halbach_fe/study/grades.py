@@ -310,6 +310,28 @@ def with_grade(values: dict[str, Any]) -> dict[str, Any]:
     return filled
 
 
+def without_old_grade(table: Any, changes: dict[str, Any]) -> dict[str, Any]:
+    """Return changes of a table, of which another grade replaces what it has of its own grade.
+
+    A table keeps no note of who gave a value: what is exactly that of its grade counts as such.
+    """
+    old = grade_of(table)
+    if old is None or grade_of(changes) is None:
+        return changes
+    filled = {"remanence_T": old.nominal_remanence, "recoil_permeability": old.recoil_permeability}
+    return {key: None for key, value in filled.items() if getattr(table, key) == value} | changes
+
+
+def doubted_strength(table: Any) -> str:
+    """Return a sentence where a table's own remanence is none of its grade, else an empty text."""
+    found, given = grade_of(table), getattr(table, "remanence_T", None)
+    if found is None or given is None or found.remanence_T[0] <= given <= found.remanence_T[1]:
+        return ""
+    low, high = found.remanence_T
+    return (f"remanence_T = {given:g} wins over its material, as {found.name} has {low:g} to "
+            f"{high:g} T. Leave remanence_T out for that of {found.name}.")
+
+
 def columns_with_grades(columns: dict[str, Any]) -> dict[str, Any]:
     """Do for every row of a table, given by column, what `with_grade` does for one."""
     materials = columns.get("material")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -172,6 +172,24 @@ class Study(StudyModel, metaclass=_OfKeys):
         if isinstance(demagnetization, dict):
             values["demagnetization"] = found.demagnetization_defaults | demagnetization
         return values
+
+    def with_(self, **changes: Any) -> Self:
+        """Return a copy with other values of some keys; see `StudyModel.with_`.
+
+        What the grade of the array says about prior and demagnetization follows another grade.
+        """
+        changed = super().with_(**changes)
+        old, new = grade_of(self.array), grade_of(changed.array)
+        if old is None or new is None or new is old:
+            return changed
+        tables: dict[str, Any] = {}
+        if self.prior.common_mode_sd == changed.prior.common_mode_sd == old.remanence_sd:
+            tables["prior__common_mode_sd"] = new.remanence_sd
+        if found := changed.demagnetization:
+            given = {key: value for key, value in dict(found).items()
+                     if old.demagnetization_defaults.get(key) != value}
+            tables["demagnetization"] = new.demagnetization_defaults | given
+        return super(Study, changed).with_(**tables)
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:

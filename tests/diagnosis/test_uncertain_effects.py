@@ -22,6 +22,8 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.inference.storage import read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.report.diagnosis_answer import answer
+from halbach_fe.report.inference import STUDY_FILE as UPDATED
+from halbach_fe.report.inference_answer import answer as inference_answer
 from halbach_fe.response.block_variation import shared_deviations
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.stats.gaussian import Gaussian
@@ -261,6 +263,39 @@ def test_amplitudes_of_a_magnet_are_estimated_with_its_blocks(session, generator
     assert shim(result, session.within("shim"), swaps=1, turns=0).before.orders
     with pytest.raises(MeasurementError, match="uncertain"):
         read_posterior(build_magnet(study.with_(uncertain=())), session.folder / "posterior.h5")
+
+
+def test_an_update_of_the_study_as_found_comes_to_rest(session, tmp_path, generator):
+    """A block is 3 mm farther in, of which the readings are no linear function: the first update,
+    the control, is off by more than its bars, does not say Yes and writes the study as found.
+    """
+    place, moved_m = {"ring": 1, "slot": 3, "displacement_m": [0.0, 0.0, 0.0]}, -3e-3
+    study = parse_study(DOCUMENT | {
+        "array": DOCUMENT["array"] | SHORT | {"exceptions": [place]},
+        "uncertain": [{"name": "out_m", "sd": 4e-3,
+                       "change": {"array.exceptions[1].displacement_m[1]": 1.0}}]})
+    blocks, polarizations = build_magnet(study).blocks, drawn(study, generator)
+    mine = np.array([(block.ring, block.slot) == (1, 3) for block in blocks])
+    angle = np.radians(study.array.first_block_angle_deg + 2 * 360 / study.array.blocks_per_ring)
+    moved = moved_m * np.array([np.cos(angle), np.sin(angle), 0.0])
+    own = polarizations * mine[:, None]
+    true = field(study, polarizations - own, POINTS) + field(
+        study, own, POINTS - moved)
+    shown = field_map(POINTS, true + NOISE_T * generator.standard_normal(true.shape))
+    first = infer(build_magnet(study), shown, session.within("first"))
+    (change,), (sd,) = first.amplitudes.change, first.amplitudes.sd
+    assert abs(change - moved_m) > 3.5 * sd
+    assert not inference_answer(first).trust.startswith("Yes")
+    write_result(first, tmp_path)
+    assert f"halbach-fe infer DIR/{UPDATED}" in inference_answer(first).command
+    again = read_study(tmp_path / UPDATED)
+    assert again.uncertain == study.uncertain
+    found = again.array.exceptions[0].displacement_m[0]
+    assert found == pytest.approx(change, rel=1e-12)
+    second = infer(build_magnet(again), shown, session.within("second"))
+    assert abs(found + second.amplitudes.change[0] - moved_m) < 3.5 * second.amplitudes.sd[0]
+    assert second.far_amplitudes == ()
+    assert inference_answer(second).trust.startswith("Yes")
 
 
 def test_the_current_of_a_coil_is_estimated_with_the_blocks(session, generator):

@@ -21,7 +21,7 @@ from halbach_fe.api import tolerance
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError
 from halbach_fe.geometry.blocks import rotation_about_z
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks
+from halbach_fe.inference.block_prior import loose_blocks, prior_from_blocks, with_types
 from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.doubted_terms import ALL_BLOCKS, shared_doubts
@@ -198,9 +198,13 @@ def test_rotation_from_block_axes(vacuum_dipole, generator):
     with pytest.warns(HalbachWarning, match="on average 7.7 % weaker"):
         wrong = prior_from_blocks(build_magnet(study), next_slot).gaussian.mean
     assert np.abs(wrong - truth.ravel()).max() > 0.3 * np.abs(truth).max()
-    with pytest.raises(MeasurementError, match="own axes as mounted"):
-        prior_from_blocks(build_magnet(study),
-                          table_of(study, slots, truth, rings, moment=VOLUME * truth))
+    in_magnet = table_of(study, slots, truth, rings, moment=VOLUME * truth)
+    with pytest.raises(MeasurementError, match=r"own axes as mounted \(x"):
+        prior_from_blocks(build_magnet(study), in_magnet)
+    spare = replace(with_types(build_magnet(study), in_magnet), ring=0 * in_magnet.ring,
+                    slot=0 * in_magnet.slot)
+    with pytest.raises(MeasurementError, match="own axes as mounted in the first slot of its type"):
+        prior_from_blocks(build_magnet(study), spare)
 
 
 def test_moments_in_another_unit_are_asked_for_it(vacuum_dipole, generator):

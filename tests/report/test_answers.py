@@ -399,6 +399,16 @@ def of_tolerance(given):
         with_error(100 * found.share, 100 * found.share_sd), "200 magnets"]
 
 
+@pytest.mark.parametrize(("types", "told"), [({}, True), ({"a": [1, 2, 3, 4, 5, 6, 7, 8]}, False)])
+def test_tolerance_sends_to_sort_where_blocks_can_change_places(types, told):
+    """Of one ring without prior.types `sort` has nothing to sort."""
+    magnet = hf.halbach_ring(order=2, blocks=8, inner_radius_m=0.02, outer_radius_m=0.04).with_(
+        prior__types=types)
+    step = tolerance.answer(hf.tolerance(magnet, draws=200)).step
+    assert ("Every slot is a type of its own" in step) == told
+    assert "prior.types" in step or not told
+
+
 def of_demagnetization(given):
     found = hf.demagnetization(given.magnet, given.session, across=2)
     return demagnetization.answer(found), [

@@ -10,9 +10,9 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.infer import infer
-from halbach_fe.inference.result import HELD_OUT
+from halbach_fe.inference.result import HELD_OUT, InferenceResult, far_in_words
 from halbach_fe.report.inference import score_table, term_table
-from halbach_fe.report.inference_answer import _of_amplitudes, answer
+from halbach_fe.report.inference_answer import answer
 from halbach_fe.report.words import flux_density
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
@@ -107,12 +107,17 @@ def test_answer_and_table_have_the_same_numbers(campaign, session):
     assert flux_density(6.1e-6) == "6.1\u00a0µT"
 
 
-@pytest.mark.parametrize(("change", "told"), [(9.0, False), (-11.0, True)])
-def test_amplitudes_that_were_moved_far(change, told):
+@pytest.mark.parametrize(("change", "key", "told"), [
+    (9.0, "array.exceptions[1].shift_m[3]", False), (-11.0, "array.exceptions[1].shift_m[3]", True),
+    (-11.0, "external.coils[1].current_A", False)])  # the field is linear in a current
+def test_amplitudes_that_were_moved_far(change, key, told):
     found = SimpleNamespace(names=("gap", "other"), change=np.array([change, 1.0]), sd=np.ones(2))
-    said = _of_amplitudes(SimpleNamespace(amplitudes=found))
-    assert ("moved gap by more than 10 error bars" in said) == told
-    assert _of_amplitudes(SimpleNamespace(amplitudes=None)) == ""
+    study = SimpleNamespace(uncertain=[
+        SimpleNamespace(name=name, change={key: 1.0}) for name in found.names])
+    names = InferenceResult.far_amplitudes.fget(SimpleNamespace(amplitudes=found, study=study))
+    assert names == (("gap",) if told else ())
+    assert ("moved gap by more than 10 error bars" in far_in_words(names)) == told
+    assert InferenceResult.far_amplitudes.fget(SimpleNamespace(amplitudes=None)) == ()
 
 
 @pytest.mark.parametrize(("name", "key", "said"), [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from halbach_fe import api
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import HalbachWarning, StudyError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.measurement.observation import observe
@@ -235,7 +235,13 @@ def test_an_integral_that_has_sources_within_its_circle(session, external, named
     reference = MultipoleReference(0.02, (2, 3))
     with pytest.raises(StudyError, match=f"{named}.* outside the circle.*--at-z-m"):
         multipole_model(magnet, reference, session)
-    assert len(multipole_model(magnet, replace(reference, z_m=0.0), session).offset) == 3
+    at_z = replace(reference, z_m=0.0)
+    assert len(multipole_model(magnet, at_z, session).offset) == 3
+    # beside that circle, as the command asks for both, the table of the integral is left out
+    with pytest.warns(HalbachWarning, match="along z has a coil or dipole within the circle"):
+        models, said = multipoles.multipole_models(magnet, (reference, at_z), session)
+    assert [model.z for model in models] == [0.0]
+    assert len(said) == 1
 
 
 def test_what_is_cut_off_of_permeability_is_in_the_bar(session, monkeypatch):

@@ -157,6 +157,12 @@ def test_grades_of_rows():
         found.recoil_permeability, found.recoil_permeability, 1.2, None)
 
 
+def test_rows_of_another_grade():
+    blocks = FreeBlocks(**table(3, material=["N52", None, "N52"], remanence_T=[None, 1.0, 1.44]))
+    changed_blocks = blocks.with_(material=("N35H", None, "N35H"))
+    assert changed_blocks.remanence_T == (grade("N35H").nominal_remanence, 1.0, 1.44)
+
+
 def test_a_validated_table_is_not_validated_again(monkeypatch):
     """Otherwise every change of a study with 100 000 blocks would take half a second."""
     document = changed(DIPOLE, dimension=3, array={"free_blocks": table(3)})

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import csv
 import math
+import warnings
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 from scipy import stats
 
+from halbach_fe.core.errors import HalbachWarning
+from halbach_fe.magnets import write_study
 from halbach_fe.study import grades as module
 from halbach_fe.study.grades import check_grade, grade, grades, read_grades
 from halbach_fe.study.magnet import Demagnetization
+from halbach_fe.study.model import Study
+from halbach_fe.study.reader import parse_study, read_study
 
 FOLDER = resources.files("halbach_fe.study")
 TABLE, SOURCES = FOLDER / "grades.csv", FOLDER / "grade_sources.csv"
@@ -194,3 +200,50 @@ def test_two_rows_must_not_share_a_name(tmp_path: Path, alias: str):
     assert set(read(tmp_path, ROW, other)) == {"X1", "X2"}
     with pytest.raises(ValueError, match="grade X2: X1 is also called"):
         read(tmp_path, ROW, other | {"aliases": alias})
+
+
+CUBES = {"multipole_order": 1, "blocks_per_ring": 12, "inner_radius_m": 0.06,
+         "outer_radius_m": 0.08, "ring_length_m": 0.02,
+         "block": {"shape": "cuboid", "width_m": 0.02}}
+
+
+def study_with(**array: Any) -> Study:
+    """Return a study of cubes with other keys of its array."""
+    return parse_study({
+        "name": "cubes", "array": CUBES | array, "mesh": {"block_size_m": 0.01},
+        "observation": {"quantity": "flux_density",
+                        "positions": {"kind": "points", "points_m": [[0, 0, 0]]}},
+        "demagnetization": {"temperature_C": 60.0, "squareness": 0.8,
+                            "remanence_coefficient_per_K": -0.0012,
+                            "coercivity_coefficient_per_K": -0.006}
+        | ({} if "material" in array else {"intrinsic_coercivity_A_per_m": 9e5})})
+
+
+def test_another_grade_replaces_what_the_first_one_said():
+    changed = study_with(material="N52").with_(array__material="N35H")
+    told = study_with(material="N35H")
+    assert changed.array == told.array
+    assert changed.array.remanence_T == 1.19
+    assert changed.prior == told.prior
+    assert changed.demagnetization == told.demagnetization
+    assert changed.demagnetization.squareness == 0.8  # the study's own
+    own = study_with(material="N52", remanence_T=1.43).with_(array__recoil_permeability=1.02)
+    kept = own.with_(array__material="N50M")  # 1.43 T is in the range of both
+    assert (kept.array.remanence_T, kept.array.recoil_permeability) == (1.43, 1.02)
+    assert kept.prior.common_mode_sd == own.prior.common_mode_sd
+    both = study_with(material="N52").with_(array__material="N35H", array__remanence_T=1.2)
+    assert both.array.remanence_T == 1.2
+
+
+def test_a_remanence_that_is_none_of_the_grade_is_doubted(tmp_path):
+    with pytest.warns(HalbachWarning, match="= 1.3 wins over its material, as N52 has 1.42 to"):
+        doubted = study_with(remanence_T=1.3).with_(array__material="N52")
+    assert doubted.array.remanence_T == 1.3
+    path = tmp_path / "study.toml"
+    write_study(doubted, path)
+    with pytest.warns(HalbachWarning, match="`array`: remanence_T = 1.3 wins over"):
+        read_study(path)
+    write_study(study_with(remanence_T=1.44, material="N52"), tmp_path / "control.toml")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_study(tmp_path / "control.toml")
