@@ -24,7 +24,9 @@ from halbach_fe.response.multipoles import (
     met,
     multipole_model,
     multipole_models,
+    solved_circles,
 )
+from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.reader import parse_study
@@ -353,6 +355,18 @@ def test_circles_that_are_read(session, generator, quantity):
         b, a = known.mean.reshape(2, -1)
         np.testing.assert_allclose(b + 1j * a, UNITS * truth / main, atol=1e-4)
     assert models[3].of(exact).mean[0] < 0.8 * UNITS  # the ends are weaker
+
+
+def test_a_main_multipole_that_is_lost_in_the_error_is_no_unit():
+    """As between the poles of an undulator, whose field on the axis changes its sign there."""
+    magnet = build_magnet(study_of(**RINGS, observation={
+        "quantity": "flux_density", "positions": CIRCLES}))
+    points = points_from(magnet.study.observation.positions)
+    field = field_of(magnet.blocks, points)
+    main = solved_circles(magnet, points, field, np.zeros(field.size))[0][1].main
+    for error, found in ((0.1, 4), (2.0, 0)):  # each of a component of B
+        assert len(solved_circles(magnet, points, field, np.full(field.size, error * main))
+                   ) == found
 
 
 @pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import gmsh
 import meshio
 import numpy as np
 import pytest
@@ -231,12 +232,12 @@ def test_two_unknowns_that_change_places_are_told(session, monkeypatch):
     iron_bodies._assembled.cache_clear()
 
 
-def nodes_of(*bodies):
+def nodes_of(*bodies, growth=2.2):
     """Return the number of nodes of the mesh."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "iron.msh"
         mesh_iron("gap", build_magnet(study_with(*bodies)).iron, Sizes.of(
-            MeshSettings(block_size_m=0.02, growth=2.2)), path)
+            MeshSettings(block_size_m=0.02, growth=growth)), path)
         return len(meshio.read(path).points)
 
 
@@ -254,13 +255,29 @@ def test_edges_at_narrow_gaps_have_small_elements():
     assert narrow < glued < 10 * wide
 
 
-@pytest.mark.parametrize(("size_m", "refused"), [(4e-5, True), (1e-4, False)])
-def test_a_mesh_that_gmsh_cannot_curve(size_m, refused):
-    """A plate of 40 mm whose file is in m, read as mm: Gmsh's optimizer would end the process."""
-    plate = {"kind": "stl", "centre_m": [0.0, 0.0, 0.012],
-             "triangles_m": triangles_of_box([size_m, size_m, size_m / 4]).tolist()}
-    with pytest.raises(MeshError, match="other units") if refused else nullcontext():
-        nodes_of(plate)
+def test_a_mesh_that_gmsh_cannot_curve_at_once():
+    """A plate of 40 mm whose file is in m, read as mm: Gmsh's optimizer would end the process, and
+    the mesh was refused before it was made again.
+    """
+    assert nodes_of({"kind": "stl", "centre_m": [0.0, 0.0, 0.012],
+                     "triangles_m": triangles_of_box([4e-5, 4e-5, 1e-5]).tolist()}) > 1000
+
+
+@pytest.mark.parametrize("failures", [0, 1, 3])
+def test_a_mesh_that_the_optimizer_leaves_inside_out_is_made_again(failures, monkeypatch):
+    """A sphere, which always has an element to mend; with smaller elements, but not for ever."""
+    made, mend = [], gmsh.model.mesh.optimize
+
+    def optimize(how):
+        made.append(gmsh.model.mesh.getNodes()[0].size)
+        if len(made) > failures:
+            mend(how)
+
+    monkeypatch.setattr(gmsh.model.mesh, "optimize", optimize)
+    with pytest.raises(MeshError, match="other units") if failures == 3 else nullcontext():
+        nodes_of({"kind": "sphere", "radius_m": 0.02}, growth=1.4)
+    assert len(made) == min(failures + 1, 3)
+    assert sorted(made) == made
 
 
 def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
