@@ -130,13 +130,39 @@ def test_scans_that_are_named_after_their_axis_are_no_components(tmp_path, field
 
 
 @pytest.mark.parametrize("name", ["Standard deviation of B{}", "Std. dev. of B{}", "delta {}",
-                                  "Gradient {}", "Background {}", "residual B{}"])
+                                  "Gradient {}", "Background {}", "residual B{}", "B{}-B0",
+                                  "Campo {} - B mean"])
 def test_what_is_no_component_is_not_known_by_its_axis(tmp_path, name):
     path = tmp_path / "file.txt"
     path.write_text("x[mm],y[mm],z[mm]," + ",".join(name.format(axis) + " (mT)" for axis in "xyz")
                     + "\n1,2,3,0.1,0.1,0.1\n")
     with pytest.raises(MeasurementError, match="which columns are Bx, By or Bz"):
         import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize("name", ["-Bx [T]", "- mf.Bx (T)", "\u2212Bx [T]"])
+def test_a_minus_before_a_name_is_not_lost(tmp_path, name):
+    """-Bx was read as Bx. Negative controls: a dash within a name, and --columns."""
+    path = tmp_path / "file.txt"
+    header = "x[mm],y[mm],z[mm],{},By[T],Bz[T]\n" + table(",")
+    path.write_text(header.format(name))
+    with pytest.raises(MeasurementError, match="with a minus before it"):
+        import_map(path, DeclaredFormat())
+    assert same(import_map(path, DeclaredFormat(columns=TRIPLE)).data)
+    path.write_text(header.format("B-x [T]"))
+    assert same(import_map(path, DeclaredFormat()).data)
+
+
+@pytest.mark.parametrize("imaginary", [0.0, 0.2])
+def test_imaginary_parts_are_told_of(tmp_path, imaginary):
+    """Negative control: those that are zero."""
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm],BxRe[T],BxIm[T],ByRe[T],BzRe[T]\n" + table(
+        ",", [*mm_T()[:4], imaginary + 0 * LENGTH, *FIELD.T[1:]]))
+    found = import_map(path, DeclaredFormat())
+    assert same(found.data)
+    assert any("'BxIm[T]' is not zero, up to 0.2" in remark
+               for remark in found.remarks) == bool(imaginary)
 
 
 def test_the_noise_of_x_in_a_unit_of_the_field_is_that_of_Bx(tmp_path):
@@ -305,6 +331,11 @@ def test_positions_of_another_length(tmp_path):
         positions.write_text(text)
         with pytest.raises(MeasurementError, match=asked):
             import_map(path, DeclaredFormat(positions=positions))
+    positions.write_text("x,y,z\n" + table(",", mm_T()[:3]))
+    assert same(import_map(path, DeclaredFormat(positions=positions, length_unit="mm")).data)
+    positions.write_text("x[mm],y[mm],z[mm]\n" + table(",", mm_T()[:3]))
+    with pytest.raises(MeasurementError, match="mm in the file and --length-unit cm"):
+        import_map(path, DeclaredFormat(positions=positions, length_unit="cm"))
 
 
 def carried_out(path, sentence):

@@ -92,7 +92,7 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
                                        "comma (--decimal-comma)", name, "Remove the option."))
     table = READERS[name](raw, declared, where)
     if declared.positions is not None:
-        table = with_positions(table, declared.positions)
+        table = with_positions(table, declared.positions, declared.length_unit)
     found = to_map(table, declared)
     data = found.data
     check_readings(data, path)
@@ -120,8 +120,10 @@ def _with_doubt(file: ImportedMap, declared: DeclaredFormat) -> ImportedMap:
     return replace(file, remarks=(*file.remarks, remark))
 
 
-def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
+def with_positions(table: ForeignTable, path: Path, length_unit: str = "") -> ForeignTable:
     """Return a table of readings with the columns x, y and z of a file of positions.
+
+    The user may state the ``length_unit`` of those that have none.
 
     Raises
     ------
@@ -133,9 +135,9 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
     order = [[column.quantity for column in found.columns].index(name) for name in COMPONENTS
              if name in [column.quantity for column in found.columns]]
     if len(order) < len(COMPONENTS) or not all(
-            unit_symbol(found.columns[number].unit) for number in order):
+            unit_symbol(found.columns[number].unit or length_unit) for number in order):
         raise MeasurementError(must_be("header", where, "with x, y and z and their units, as in "
-                                       "x[mm],y[mm],z[mm]", ",".join(
+                                       "x[mm],y[mm],z[mm], or by --length-unit", ",".join(
                                            column.text for column in found.columns
                                            if column.text)[:60] or "none"))
     if len(found.values) != len(table.values):
