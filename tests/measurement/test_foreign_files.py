@@ -7,6 +7,7 @@ import subprocess
 from contextlib import nullcontext
 from time import process_time
 
+import meshio
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from tests.measurement.foreign_files import (
     LENGTH,
     POINTS,
     TRIPLE,
+    VTK,
     Foreign,
     mm_T,
     table,
@@ -163,6 +165,50 @@ def test_imaginary_parts_are_told_of(tmp_path, imaginary):
     assert same(found.data)
     assert any("'BxIm[T]' is not zero, up to 0.2" in remark
                for remark in found.remarks) == bool(imaginary)
+
+
+def test_vectors_of_other_programs_in_vtu(tmp_path):
+    """Which vector is B is not guessed. Negative control: that of halbach-fe itself has units."""
+    path, units = tmp_path / "file.vtu", {"length_unit": "mm", "field_unit": "T"}
+    cells = [("vertex", np.arange(len(POINTS))[:, None])]
+
+    def written(**vectors):
+        meshio.write(path, meshio.Mesh(1e3 * POINTS, cells, point_data=vectors))
+
+    written(B=FIELD, J=2 * FIELD)
+    assert same(import_map(path, DeclaredFormat(**units)).data)
+    written(H=2 * FIELD, A=FIELD)
+    with pytest.raises(MeasurementError, match=r"one vector B; .* '[HA]', '[HA]'. .*--columns"):
+        import_map(path, DeclaredFormat(**units))
+    names = ("x", "y", "z", *(("Bx", "By", "Bz") if one == "A" else ("-",) * 3
+                              for one in meshio.read(path).point_data))
+    assert same(import_map(path, DeclaredFormat(columns=tuple(np.hstack(names)), **units)).data)
+    written(B=LENGTH)
+    with pytest.raises(MeasurementError, match=r"no vector\. .*Cell Data to Point Data"):
+        import_map(path, DeclaredFormat(**units))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(MeasurementError, match=r"damaged.*Save Data"):
+        import_map(path, DeclaredFormat(**units))
+    own = path.with_name("own.vtu")
+    write_map(field_map(POINTS, FIELD), own)
+    assert same(import_map(own, DeclaredFormat()).data)
+
+
+@pytest.mark.parametrize(("says", "claims"), [
+    ("DIMENSIONS 2 2 1", "DIMENSIONS 3000 3000 3000"), ("POINT_DATA 4", "POINT_DATA 99999999999"),
+    ("B 3 4 double", "B 3 99999999999 double"), ("", "")])
+def test_a_vtk_file_that_claims_more_than_it_holds(tmp_path, says, claims):
+    """meshio makes room for what a file claims. Negative control: the sound file."""
+    path = tmp_path / "file.vtk"
+    path.write_text((VTK + "STRUCTURED_POINTS\nDIMENSIONS 2 2 1\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+                     "POINT_DATA 4\nFIELD FieldData 1\nB 3 4 double\n" + "0.1 0 0.2\n" * 4).replace(
+                         says, claims))
+    declared = DeclaredFormat(length_unit="mm", field_unit="T")
+    if not says:
+        assert import_map(path, declared).data.sizes["point"] == 4
+        return
+    with pytest.raises(MeasurementError, match="that is whole"):
+        import_map(path, declared)
 
 
 def test_the_noise_of_x_in_a_unit_of_the_field_is_that_of_Bx(tmp_path):
