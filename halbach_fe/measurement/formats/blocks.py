@@ -502,7 +502,8 @@ def _whole(cell: str, name: str, line: int, table: _Table) -> int:
 
 def _less_whole_turns(turns: dict[str, Floats]) -> dict[str, Floats]:
     """Return the components (n,) in rad of rotation vectors, without whole turns of 360 degrees."""
-    size = np.linalg.norm([np.nan_to_num(one) for one in turns.values()], axis=0) if turns else 0.0
+    squares = [np.nan_to_num(one)**2 for one in turns.values()]
+    size = np.sqrt(np.sum(squares, axis=0))
     left = np.where(size > 2 * np.pi, np.mod(size, 2 * np.pi) / np.maximum(size, 1.0), 1.0)
     return {name: left * one for name, one in turns.items()}
 
@@ -544,10 +545,9 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
         else:
             vectors = _turned(vectors, declared.axes)
             if declared.along_block:
-                turns = np.column_stack([
-                    table.si(f"rotation_{axis}") if f"rotation_{axis}" in table
-                    else np.zeros(len(vectors)) for axis in COMPONENTS])
-                vectors = Rotation.from_rotvec(np.nan_to_num(turns)).apply(vectors)
+                turn = np.column_stack([turns.get(f"rotation_{axis}", np.zeros(len(vectors)))
+                                        for axis in COMPONENTS])
+                vectors = Rotation.from_rotvec(np.nan_to_num(turn)).apply(vectors)
             for axis, values in zip(COMPONENTS, vectors.T, strict=True):
                 columns[f"remanence_{axis}_T"] = values.tolist()
     try:
