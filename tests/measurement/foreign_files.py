@@ -385,6 +385,12 @@ FILES = [
     Foreign("OPAL", "3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + table(" ", FIELD.T), {
         "skip_lines": 4, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
             ("--skip-lines 4",)),
+    Foreign("FairRoot, limits of the grid above", "nosym\n-1 1 3\n-1 1 3\n-2 2 5\n" + table(
+        " ", FIELD.T), {"skip_lines": 4, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
+            ("--skip-lines 4", "z changes fastest")),
+    Foreign("limits of the grid above without a word", "-1 1 3\n-1 1 3\n-2 2 5\n" + table(
+        " ", FIELD.T), {"skip_lines": 3, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
+            ("--skip-lines 3",)),
     Foreign("spherical coordinates", "r [mm],theta [deg],phi [deg],Br [T],Btheta [T],Bphi [T]\n"
             + table(",", spherical())),
     Foreign("spherical coordinates of mathematicians", "r [mm],theta [deg],phi [deg],Bx [T],By [T],"

@@ -239,6 +239,17 @@ def test_rows_that_begin_as_a_grid_of_astra_are_rows(tmp_path):
             assert import_map(path, DeclaredFormat(**stated)).data.sizes["point"] == 5
 
 
+def test_limits_above_rows_are_no_readings(tmp_path):
+    """With --columns too. Negative control: rows of three numbers that are no such limits."""
+    path, declared = tmp_path / "file.txt", DeclaredFormat(
+        columns=("z[mm]", "Bx[mT]", "By[mT]"), at={"x": 0.0, "y": 0.0})
+    for rows in (45, 46):
+        path.write_text("-1 1 3\n-2 2 3\n-3 3 5\n" + "".join(f"{n} {n} 1\n" for n in range(rows)))
+        with pytest.raises(MeasurementError, match="skip-lines 3") if rows == 45 else (
+                nullcontext()):
+            assert import_map(path, declared).data.sizes["point"] == 3 + rows
+
+
 @pytest.mark.parametrize("last", ["999,0,0", "9.99,1,0", "0,0,0.099"])
 def test_nines_beside_others_of_their_size_are_readings(tmp_path, last):
     """Negative control of placeholders: what the others are a third of may have been read."""
