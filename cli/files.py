@@ -181,8 +181,9 @@ def import_map(arguments: argparse.Namespace) -> int:
 
     Reads tables of columns (separated by commas, semicolons, tabs or spaces, with or without a
     header), Opera's .table files, text files exported by COMSOL, maps of G4beamline, BDSIM, SRW and
-    FLUKA, and openPMD-beamphysics field meshes. Units, columns and constant coordinates that the
-    file does not state must be given as options; nothing is guessed.
+    FLUKA, openPMD-beamphysics field meshes, and vectors of ParaView's .vtk and .vtu files. Units,
+    columns and constant coordinates that the file does not state must be given as options; nothing
+    is guessed.
     """
     import numpy as np
 

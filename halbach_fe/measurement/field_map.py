@@ -541,7 +541,7 @@ def _read_vtu(raw: bytes, path: Path) -> xr.Dataset:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise MeasurementError(must_be(
             "content", where, "a VTU file with point data `B_T` (n, 3)", f"'{error}'",
-            "Save files of other programs as CSV, in ParaView by Save Data.")) from None
+            "Files of other programs are converted by `halbach-fe import-map`.")) from None
     return data
 
 

@@ -108,6 +108,9 @@ mesh = { block_size_m = 0.02 }
 observation = { quantity = "flux_density", positions = { kind = "points", points_m = [[0, 0, 0]] } }
 """
 
+VTK = (b"# vtk DataFile Version 3.0\nof a magnet\nASCII\nDATASET STRUCTURED_POINTS\n"
+       b"DIMENSIONS 2 2 1\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 4\nVECTORS B double\n"
+       + b"0.1 0 -0.2\n" * 4)
 STL = b"solid a\n" + b"".join(
     b"facet normal 0 0 0\nouter loop\n" + b"".join(
         b"vertex %g %g %g\n" % corner for corner in corners) + b"endloop\nendfacet\n"
@@ -523,8 +526,9 @@ NAMES = (
     "free blocks (HDF5)", "map (CSV)",
     "map (HDF5)", "map (VTU)", "block table", "order of assembly", "joined maps",
     "import: columns", "import: opera", "import: comsol",
-    "import: openpmd", "import as columns", "import as opera", "import as comsol",
-    "import as openpmd", "posterior", "stored response", "stored matrix", "stored chains",
+    "import: openpmd", "import: paraview", "import as columns", "import as opera",
+    "import as comsol", "import as openpmd",
+    "posterior", "stored response", "stored matrix", "stored chains",
     "results: run.json", "results: page.json", "mesh",
     "regions", "GetDP: unknowns", "GetDP: unknowns of edges", "GetDP: solutions",
     "GetDP: saved solutions", "GetDP: matrix", "GetDP: vectors", "GetDP: log", "cached answer")
@@ -580,6 +584,8 @@ def readers() -> tuple[Reader, ...]:
             sheet, comsol_grid().encode(), comsol_grid(brackets=True).encode(),
             comsol_sections().encode())),
         replace(foreign, name="import: srw and fluka", seeds=(srw().encode(), fluka().encode())),
+        replace(foreign, name="import: paraview", seeds=(ascii_vtu().replace(b"B_T", b"B"), VTK),
+                tokens=(*XML, b"POINT_DATA", b"DIMENSIONS 2 2 1", b"BINARY", b"VECTORS B float")),
         Reader("blocks in own columns", "own.csv", (
             b"id;ring;slot;Jx [mT];Jy [mT];Jz [mT];Volume [cm^3];sd [%]\nA;1;1;1300;0;0;12;0.1\n",
             b"id,shape,xc [mm],yc [mm],zc [mm],dx [mm],dy [mm],dz [mm],Br [T]\n"

@@ -141,6 +141,8 @@ LVM = ("LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nSeparator\t
        "***End_of_Header***\t\n\nChannels\t6\nSamples\t45\t45\t45\t45\t45\t45\n"
        "***End_of_Header***\t\t\t\t\t\t\t\n")
 LVM_COLUMNS = ("-", "x[mm]", "y[mm]", "z[mm]", "Bx[T]", "By[T]", "Bz[T]", "-")
+VTK = "# vtk DataFile Version 3.0\nof a magnet\nASCII\nDATASET "
+POINT_DATA = "POINT_DATA 45\nVECTORS B double\n"
 METER = ("Header Information\nInstrument serial number:,0001\nProbe temperature:,24.1\n\n"
          "time elapsed,date,time,magnitude,x,y,z,set point,input state\n")
 METER_ROWS = "".join(f"{n},06/01/20,{clock(n)}.00,{LENGTH[n]:.9g},{b[0]:.9g},{b[1]:.9g},{b[2]:.9g},"
@@ -365,11 +367,17 @@ FILES = [
         " ", [100 * LINE[:, 2], 0 * LENGTH, 1e4 * FIELD[:, 0], 1e4 * FIELD[:, 2]]), {
             "columns": ("x[cm]", "z[cm]", "Bx[G]", "Bz[G]"), "at": {"y": 0.0}},
         ("x for r", "--at y=0"), LINE[:, [2, 0, 1]], FIELD * [1, np.nan, 1]),
-    Foreign("VTK, points in the header", "# vtk DataFile Version 3.0\nB\nASCII\nDATASET "
-            "STRUCTURED_POINTS\nDIMENSIONS 3 3 5\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 45\n"
-            "VECTORS B double\n" + table(" ", FIELD.T), {
-                "skip_lines": 9, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
-            ("--skip-lines",)),
+    Foreign("VTK, points in the header", VTK + "STRUCTURED_POINTS\nDIMENSIONS 3 3 5\nORIGIN -10 "
+            "-10 -20\nSPACING 10 10 10\n" + POINT_DATA + table(" ", FIELD.T, BY_X), MM_T_OPTIONS,
+            UNITS),
+    Foreign("VTK, points before the field", VTK + "STRUCTURED_GRID\nDIMENSIONS 5 3 3\nPOINTS 45 "
+            "double\n" + table(" ", mm_T()[:3]) + POINT_DATA + table(" ", FIELD.T), MM_T_OPTIONS,
+            UNITS),
+    Foreign("VTK, axes before the field, B in its unit", VTK + "RECTILINEAR_GRID\nDIMENSIONS 3 3 "
+            "5\nX_COORDINATES 3 double\n-10 0 10\nY_COORDINATES 3 double\n-10 0 10\n"
+            "Z_COORDINATES 5 double\n-20 -10 0 10 20\n" + POINT_DATA.replace(
+                " B ", " B_field_mT ") + table(" ", 1e3 * FIELD.T, BY_X), {"length_unit": "mm"},
+            UNITS[:1]),
     Foreign("Poisson, T7 with the grid above", "2DMagnetoStatic ZX\n-2 2 4\n0.2 1.0 14\n" + table(
         " ", FIELD[:, [2, 0]].T), {"skip_lines": 3, "columns": ("Bz[T]", "Bx[T]"),
                                   "positions": True}, ("add --skip-lines 3",),
@@ -377,6 +385,12 @@ FILES = [
     Foreign("OPAL", "3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + table(" ", FIELD.T), {
         "skip_lines": 4, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
             ("--skip-lines 4",)),
+    Foreign("FairRoot, limits of the grid above", "nosym\n-1 1 3\n-1 1 3\n-2 2 5\n" + table(
+        " ", FIELD.T), {"skip_lines": 4, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
+            ("--skip-lines 4", "z changes fastest")),
+    Foreign("limits of the grid above without a word", "-1 1 3\n-1 1 3\n-2 2 5\n" + table(
+        " ", FIELD.T), {"skip_lines": 3, "columns": ("Bx[T]", "By[T]", "Bz[T]"), "positions": True},
+            ("--skip-lines 3",)),
     Foreign("spherical coordinates", "r [mm],theta [deg],phi [deg],Br [T],Btheta [T],Bphi [T]\n"
             + table(",", spherical())),
     Foreign("spherical coordinates of mathematicians", "r [mm],theta [deg],phi [deg],Bx [T],By [T],"

@@ -7,6 +7,7 @@ import subprocess
 from contextlib import nullcontext
 from time import process_time
 
+import meshio
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from tests.measurement.foreign_files import (
     LENGTH,
     POINTS,
     TRIPLE,
+    VTK,
     Foreign,
     mm_T,
     table,
@@ -130,13 +132,83 @@ def test_scans_that_are_named_after_their_axis_are_no_components(tmp_path, field
 
 
 @pytest.mark.parametrize("name", ["Standard deviation of B{}", "Std. dev. of B{}", "delta {}",
-                                  "Gradient {}", "Background {}", "residual B{}"])
+                                  "Gradient {}", "Background {}", "residual B{}", "B{}-B0",
+                                  "Campo {} - B mean"])
 def test_what_is_no_component_is_not_known_by_its_axis(tmp_path, name):
     path = tmp_path / "file.txt"
     path.write_text("x[mm],y[mm],z[mm]," + ",".join(name.format(axis) + " (mT)" for axis in "xyz")
                     + "\n1,2,3,0.1,0.1,0.1\n")
     with pytest.raises(MeasurementError, match="which columns are Bx, By or Bz"):
         import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize("name", ["-Bx [T]", "- mf.Bx (T)", "\u2212Bx [T]"])
+def test_a_minus_before_a_name_is_not_lost(tmp_path, name):
+    """-Bx was read as Bx. Negative controls: a dash within a name, and --columns."""
+    path = tmp_path / "file.txt"
+    header = "x[mm],y[mm],z[mm],{},By[T],Bz[T]\n" + table(",")
+    path.write_text(header.format(name))
+    with pytest.raises(MeasurementError, match="with a minus before it"):
+        import_map(path, DeclaredFormat())
+    assert same(import_map(path, DeclaredFormat(columns=TRIPLE)).data)
+    path.write_text(header.format("B-x [T]"))
+    assert same(import_map(path, DeclaredFormat()).data)
+
+
+@pytest.mark.parametrize("imaginary", [0.0, 0.2])
+def test_imaginary_parts_are_told_of(tmp_path, imaginary):
+    """Negative control: those that are zero."""
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm],BxRe[T],BxIm[T],ByRe[T],BzRe[T]\n" + table(
+        ",", [*mm_T()[:4], imaginary + 0 * LENGTH, *FIELD.T[1:]]))
+    found = import_map(path, DeclaredFormat())
+    assert same(found.data)
+    assert any("'BxIm[T]' is not zero, up to 0.2" in remark
+               for remark in found.remarks) == bool(imaginary)
+
+
+def test_vectors_of_other_programs_in_vtu(tmp_path):
+    """Which vector is B is not guessed. Negative control: that of halbach-fe itself has units."""
+    path, units = tmp_path / "file.vtu", {"length_unit": "mm", "field_unit": "T"}
+    cells = [("vertex", np.arange(len(POINTS))[:, None])]
+
+    def written(**vectors):
+        meshio.write(path, meshio.Mesh(1e3 * POINTS, cells, point_data=vectors))
+
+    written(B=FIELD, J=2 * FIELD)
+    assert same(import_map(path, DeclaredFormat(**units)).data)
+    written(H=2 * FIELD, A=FIELD)
+    with pytest.raises(MeasurementError, match=r"one vector B; .* '[HA]', '[HA]'. .*--columns"):
+        import_map(path, DeclaredFormat(**units))
+    names = ("x", "y", "z", *(("Bx", "By", "Bz") if one == "A" else ("-",) * 3
+                              for one in meshio.read(path).point_data))
+    assert same(import_map(path, DeclaredFormat(columns=tuple(np.hstack(names)), **units)).data)
+    written(B=LENGTH)
+    with pytest.raises(MeasurementError, match=r"no vector\. .*Cell Data to Point Data"):
+        import_map(path, DeclaredFormat(**units))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(MeasurementError, match=r"damaged.*Save Data"):
+        import_map(path, DeclaredFormat(**units))
+    own = path.with_name("own.vtu")
+    write_map(field_map(POINTS, FIELD), own)
+    assert same(import_map(own, DeclaredFormat()).data)
+
+
+@pytest.mark.parametrize(("says", "claims"), [
+    ("DIMENSIONS 2 2 1", "DIMENSIONS 3000 3000 3000"), ("POINT_DATA 4", "POINT_DATA 99999999999"),
+    ("B 3 4 double", "B 3 99999999999 double"), ("", "")])
+def test_a_vtk_file_that_claims_more_than_it_holds(tmp_path, says, claims):
+    """meshio makes room for what a file claims. Negative control: the sound file."""
+    path = tmp_path / "file.vtk"
+    path.write_text((VTK + "STRUCTURED_POINTS\nDIMENSIONS 2 2 1\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+                     "POINT_DATA 4\nFIELD FieldData 1\nB 3 4 double\n" + "0.1 0 0.2\n" * 4).replace(
+                         says, claims))
+    declared = DeclaredFormat(length_unit="mm", field_unit="T")
+    if not says:
+        assert import_map(path, declared).data.sizes["point"] == 4
+        return
+    with pytest.raises(MeasurementError, match="that is whole"):
+        import_map(path, declared)
 
 
 def test_the_noise_of_x_in_a_unit_of_the_field_is_that_of_Bx(tmp_path):
@@ -165,6 +237,17 @@ def test_rows_that_begin_as_a_grid_of_astra_are_rows(tmp_path):
         with nullcontext() if stated else pytest.raises(
                 MeasurementError, match="what its 6 columns are"):
             assert import_map(path, DeclaredFormat(**stated)).data.sizes["point"] == 5
+
+
+def test_limits_above_rows_are_no_readings(tmp_path):
+    """With --columns too. Negative control: rows of three numbers that are no such limits."""
+    path, declared = tmp_path / "file.txt", DeclaredFormat(
+        columns=("z[mm]", "Bx[mT]", "By[mT]"), at={"x": 0.0, "y": 0.0})
+    for rows in (45, 46):
+        path.write_text("-1 1 3\n-2 2 3\n-3 3 5\n" + "".join(f"{n} {n} 1\n" for n in range(rows)))
+        with pytest.raises(MeasurementError, match="skip-lines 3") if rows == 45 else (
+                nullcontext()):
+            assert import_map(path, declared).data.sizes["point"] == 3 + rows
 
 
 @pytest.mark.parametrize("last", ["999,0,0", "9.99,1,0", "0,0,0.099"])
@@ -305,6 +388,11 @@ def test_positions_of_another_length(tmp_path):
         positions.write_text(text)
         with pytest.raises(MeasurementError, match=asked):
             import_map(path, DeclaredFormat(positions=positions))
+    positions.write_text("x,y,z\n" + table(",", mm_T()[:3]))
+    assert same(import_map(path, DeclaredFormat(positions=positions, length_unit="mm")).data)
+    positions.write_text("x[mm],y[mm],z[mm]\n" + table(",", mm_T()[:3]))
+    with pytest.raises(MeasurementError, match="mm in the file and --length-unit cm"):
+        import_map(path, DeclaredFormat(positions=positions, length_unit="cm"))
 
 
 def carried_out(path, sentence):

@@ -156,6 +156,48 @@ def test_an_option_that_would_have_no_effect_is_refused(tmp_path, text, declared
         imported(tmp_path, text, **declared)
 
 
+LYING = {"rotation vector": ("Rot x (deg);Rot y (deg);Rot z (deg)", "30;40;50",
+                             ("rotation_x", "rotation_y", "rotation_z")),
+         "turned by 'phi": ("phi (deg);n;m", "50;1;1", ("rotation_z", "-", "-")),
+         "turned by 'Roll', 'Pitch' and 'Yaw'": ("Roll;Pitch;Yaw", "0;0;50",
+                                                 ("-", "-", "rotation_z[deg]")),
+         "Length .mm.' and 'Width": ("Length [mm];Width [mm];Height [mm]", "10;20;30",
+                                     ("size_z", "size_x", "size_y"))}
+
+
+@pytest.mark.parametrize("asked", LYING)
+def test_how_a_block_lies_is_not_guessed(tmp_path, asked):
+    """Angles of Euler were read as a rotation vector, a lone angle was left out, and the length
+    was that along x. What the refusal asks for is read as it is named.
+    """
+    header, cells, named = LYING[asked]
+    sizes = "" if "size_z" in named else "dx [mm];dy [mm];dz [mm];"
+    text = (f"x [mm];y [mm];z [mm];{sizes}Br [T];{header}\n"
+            f"0;0;0;{'10;20;30;' if sizes else ''}1.3;{cells}\n")
+    shape = {"fixed": {"shape": "cuboid"}}
+    with pytest.raises(MeasurementError, match=asked):
+        imported(tmp_path, text, **shape)
+    found = imported(tmp_path, text, columns=(
+        "at_x", "at_y", "at_z", *(("size_x", "size_y", "size_z") if sizes else ()),
+        "polarization", *named), **shape)
+    if not sizes:
+        assert (found.size_x_m, found.size_y_m, found.size_z_m) == ((0.02,), (0.03,), (0.01,))
+    else:
+        assert found.rotation_z_deg == (50.0,)
+
+
+@pytest.mark.parametrize(("header", "turn"), [
+    ("Rot x (deg);Rot y (deg);Rot z (deg)", "0;0;50"),
+    ("rotvec x (deg);rotvec y (deg);rotvec z (deg)", "30;40;50"),
+    ("rotation_x_deg;rotation_y_deg;rotation_z_deg", "30;40;50"),
+    ("Rot x (deg);Rot y (deg);Rot z (deg)", "0;0;770")])
+def test_turns_that_are_rotation_vectors(tmp_path, header, turn):
+    """Negative control of the above: about one axis both are the same, and a whole turn is none."""
+    found = imported(tmp_path, f"x [mm];y [mm];z [mm];dx [mm];dy [mm];dz [mm];Br [T];{header}\n"
+                     f"0;0;0;10;20;30;1.3;{turn}\n", fixed={"shape": "cuboid"})
+    assert found.rotation_z_deg == (50.0,)
+
+
 def test_free_blocks_without_names_and_with_edges_of_own_names(tmp_path):
     """The warning names the columns; the units of the header hold beside --columns."""
     text = ("x [mm],y [mm],z [mm],a [mm],b [mm],c [cm],Jx [T],Jy [T],Jz [mT]\n"
@@ -178,7 +220,8 @@ MEASURED = "serial,type,moment_x{0},moment_y{0},moment_z{0},sigma{0}{1}\n{2}a,1,
     (MEASURED.format("[A m^2]", ",temperature[F]", "", "68"), "the unit of temperature.* not 'F'"),
     (MEASURED.format("[A m^2]", ",temp (degF)", "", "68"), "the unit of temperature.* not 'degF'"),
     (MEASURED.format("", ",volume[cm^3]", "", "1"),
-     r"the unit of moment_x, moment_y, moment_z, sigma \(one of Am\^2"),
+     r"the unit of moment_x, moment_y, moment_z, sigma \(one of Am\^2.* of J or M.*polarization_x"),
+    ("x[mm],y[mm],z[mm],-Jx[T],Jy[T],Jz[T]\n0,0,0,1.3,0,0\n", "does not say its strength"),
     ("x,y,z,size_x,size_y,size_z,Br[T]\n0,0,0,10,10,10,1.3\n",
      r"the unit of at_x, at_y, at_z, size_x, size_y, size_z \(one of m, .*: --length-unit"),
     ("serial,type,jx[T],jy[T],jz[T],sigma[%],volume[cm^3]\na,1,1300,0,0,0.1,1\n",

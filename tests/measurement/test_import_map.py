@@ -342,7 +342,7 @@ def test_comsol_spreadsheets(tmp_path):
     assert same(imported(tmp_path, commas))
     assert "24 points" in said(tmp_path, "".join(text.splitlines(keepends=True)[:-1]))
     turned = text.replace("mf.Bx (T)", "-mf.Bx (T)")
-    assert "whether '-mf.Bx(T)' is Bx" in said(tmp_path, turned)
+    assert "'-mf.Bx(T)', with a minus before it" in said(tmp_path, turned)
     assert same(imported(tmp_path, turned, columns=("x", "y", "z", "-", "By", "Bz")),
                 field=np.where([False, True, True], FIELD, np.nan))
 

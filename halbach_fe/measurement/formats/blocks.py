@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be, printable
 from halbach_fe.core.files import file_bytes
-from halbach_fe.core.numbers import MU_0
+from halbach_fe.core.numbers import MU_0, in_a_row
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.formats import names, units
 from halbach_fe.measurement.formats.declared import DeclaredFormat
@@ -68,6 +68,10 @@ WORDS = {word: name for name, words in _WORDS.items() for word in words.split()}
         "magnetization": ("magnetization{}", "mag{}")}.items() for spelling in spellings} | {
     "length": "size_x", "width": "size_y", "height": "size_z", "thickness": "size_z"}
 """Quantities by the names of columns, without spaces and marks, in lower case."""
+WITHOUT_AXIS = ("length", "width")
+"""Names of edges that do not say their axis; height and thickness are along z."""
+TURN = re.compile(r"(?i)\W*(?:rot|turn|angle|phi|theta|euler|roll|pitch|yaw|tilt|azimuth|orient)")
+"""Beginnings of names of columns that say how a block lies."""
 LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
 KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys(
     LENGTHS, "length") | {
@@ -113,7 +117,10 @@ class DeclaredBlocks(DeclaredFormat):
 
 @dataclass(frozen=True)
 class _Table:
-    """Cells by quantity, unit of each, and numbers of the lines; SI values on demand."""
+    """Cells by quantity, unit of each, and numbers of the lines; SI values on demand.
+
+    ``named`` are the columns by quantity as the table names them, of those that no user has named.
+    """
 
     cells: dict[str, list[str]]
     unit: dict[str, str]
@@ -121,14 +128,19 @@ class _Table:
     where: str
     decimal_comma: bool
     unknown: tuple[str, ...]
+    named: dict[str, str]
 
     def __contains__(self, name: object) -> bool:
         return name in self.cells
 
+    def numbers(self, name: str) -> Floats:
+        """Return the numbers (n,) of a quantity in the unit of its column; NaN where empty."""
+        return np.array([_number(cell, name, line, self) for cell, line in zip(
+            self.cells[name], self.lines, strict=True)])
+
     def si(self, name: str) -> Floats:
         """Return the numbers (n,) of a quantity in SI units, angles in rad; NaN where empty."""
-        found = np.array([_number(cell, name, line, self) for cell, line in zip(
-            self.cells[name], self.lines, strict=True)])
+        found = self.numbers(name)
         return units.in_si(found, self.unit[name]) if name in KIND else found
 
     def vector(self, name: str) -> Floats:
@@ -201,8 +213,10 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
     unknown = [] if declared.columns else [
         text.strip() for text, (name, _) in zip(own, header, strict=False)
         if not name and text.strip()]
+    named = {} if declared.columns else {
+        name: text.strip() for text, (name, _) in zip(own, header, strict=False) if name}
     return _Table(table, _with_stated(unit, declared, where), tuple(number for number, _ in body),
-                  where, declared.decimal_comma, tuple(unknown))
+                  where, declared.decimal_comma, tuple(unknown), named)
 
 
 def _header(
@@ -297,7 +311,7 @@ def quantity_of(text: str) -> tuple[str, str]:
             if units.unit_symbol(" ".join(parts[n:])) or parts[n:] in (["C"], ["K"], ["degC"]):
                 base, unit = "_".join(parts[:n]), " ".join(parts[n:])
                 break
-    key = re.sub(r"[\s_.|-]", "", base.lower())
+    key = "" if names.is_signed(base) else re.sub(r"[\s_.|-]", "", base.lower())
     name = base if base in QUANTITIES else WORDS.get(key, "")
     if name.startswith("moment") and units.kind_of(unit) == "field":
         name = name.replace("moment", "magnetization")  # Mx in A/m
@@ -338,6 +352,7 @@ def _missing(table: _Table, free: bool) -> list[str]:
          f"{strength}_y, {strength}_z along the axes of the block)"),
         *((free, f"{name[-1]} of each block (a column {name})") for name in places),
         (free and polar, "x and y of its angle (x = r cos(phi), y = r sin(phi))"),
+        *((free, text) for text in _unclear(table)),
         (free and "shape" not in table,
          f"the shape (--fixed shape=cuboid, or one of {', '.join(SIZES)})"),
         (not free and "sigma" not in table,
@@ -348,6 +363,38 @@ def _missing(table: _Table, free: bool) -> list[str]:
         (bool(strength) and of_moment == free and "volume" not in table and not sizes,
          "the volume (a column, or --fixed 'volume=12 cm^3')")]
     return [text for lacks, text in wanted if lacks] + _without_unit(table)
+
+
+def _unclear(table: _Table) -> list[str]:
+    """Return what the names of columns leave open of how free blocks lie."""
+    turns = [name for name in table.cells if name.startswith("rotation_")]
+    several = len(turns) > 1 and (np.count_nonzero(np.nan_to_num(np.column_stack(
+        [table.numbers(name) for name in turns])), axis=1) > 1).any()
+    said = [text for name in turns if names.split_unit(text := table.named.get(name, name))[0]
+            != name and "rotvec" not in text.lower()] if several else []
+    sizes = [text for name, text in table.named.items() if name in ("size_x", "size_y")
+             and names.split_unit(text)[0].lower().strip() in WITHOUT_AXIS]
+    other = [text for text in table.unknown if "at_x" in table and (
+        units.kind_of(names.split_unit(text)[1]) == "angle"
+        or TURN.match(names.split_unit(text)[0]))]
+    found = []
+    if said:
+        found.append(
+            f"whether {_quoted(said)}, of which several are not zero, are a rotation vector "
+            "(rotation_x, rotation_y, rotation_z in --columns) or turns one after the other (a "
+            "vector of these, if x, y, z is their order: scipy's Rotation.from_euler('xyz', "
+            "angles, degrees=True).as_rotvec(degrees=True))")
+    if sizes:
+        found.append(f"along which axes {_quoted(sizes)} lie (size_x, size_y, size_z in --columns)")
+    if other:
+        found.append(f"how a block is turned by {_quoted(other)} (rotation_z in --columns, if that "
+                     "is about z; - if it is not)")
+    return found
+
+
+def _quoted(texts: Sequence[str]) -> str:
+    """Return texts in quotes, in a row."""
+    return in_a_row([f"'{text}'" for text in texts])
 
 
 def _without_unit(table: _Table) -> list[str]:
@@ -364,8 +411,9 @@ def _without_unit(table: _Table) -> list[str]:
     return [f"the unit of {', '.join(named)} (one of "
             f"{', '.join(TEMPERATURES if kind == 'temperature' else units.KINDS[kind])}"
             + (f", not '{unit[:20]}'" if unit else "")
-            + (f": --{kind}-unit, or in the header)" if kind in ("length", "field", "angle")
-               and not unit else ")")
+            + (f": --{kind}-unit, or in the header" if kind in ("length", "field", "angle")
+               and not unit else "; of J or M, as of Radia, name them polarization_x or "
+               "magnetization_x ... in --columns" if kind == "moment" and not unit else "") + ")"
             for (kind, unit), named in of.items()]
 
 
@@ -413,9 +461,7 @@ def _measured_blocks(
     with np.errstate(divide="ignore", invalid="ignore"):  # zero is refused below
         _check_strength(moment * (MU_0 / volume)[:, None], strength, table)
     if table.unit["sigma"] == "%":
-        sigma = np.array([_number(cell, "sigma", line, table) for cell, line in zip(
-            table.cells["sigma"], table.lines, strict=True)])
-        sigma = sigma / 100 * np.linalg.norm(moment, axis=1)
+        sigma = table.numbers("sigma") / 100 * np.linalg.norm(moment, axis=1)
     else:
         sigma = table.si("sigma")
         if table.unit["sigma"] in units.FIELDS:
@@ -454,6 +500,14 @@ def _whole(cell: str, name: str, line: int, table: _Table) -> int:
     return int(value)
 
 
+def _less_whole_turns(turns: dict[str, Floats]) -> dict[str, Floats]:
+    """Return the components (n,) in rad of rotation vectors, without whole turns of 360 degrees."""
+    squares = [np.nan_to_num(one)**2 for one in turns.values()]
+    size = np.sqrt(np.sum(squares, axis=0))
+    left = np.where(size > 2 * np.pi, np.mod(size, 2 * np.pi) / np.maximum(size, 1.0), 1.0)
+    return {name: left * one for name, one in turns.items()}
+
+
 def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
     """Return the table of free blocks."""
     numbers = [str(number) for number, _ in enumerate(table.lines, 1)]  # names, if there are none
@@ -466,13 +520,16 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
         if name in table:
             columns[name] = [_whole(cell, name, line, table) if cell else None for cell, line in
                              zip(table.cells[name], table.lines, strict=True)]
+    turns = _less_whole_turns({name: table.si(name) for name in table.cells
+                               if name.startswith("rotation_")})
     for name in table.cells:
         own = name.removeprefix("at_") if name.startswith("at_") else name
         own, values = (f"{own}_deg", np.degrees) if KIND.get(name) == "angle" else (
             f"{own}_m", np.asarray)
         if own in FREE_COLUMNS:
+            si = turns[name] if name in turns else table.si(name)
             columns[own] = [None if np.isnan(value) else value
-                            for value in np.round(values(table.si(name)), 12).tolist()]
+                            for value in np.round(values(si), 12).tolist()]
     strength = _strength(table)
     if strength:
         vectors = table.vector(strength)
@@ -488,10 +545,9 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
         else:
             vectors = _turned(vectors, declared.axes)
             if declared.along_block:
-                turns = np.column_stack([
-                    table.si(f"rotation_{axis}") if f"rotation_{axis}" in table
-                    else np.zeros(len(vectors)) for axis in COMPONENTS])
-                vectors = Rotation.from_rotvec(np.nan_to_num(turns)).apply(vectors)
+                turn = np.column_stack([turns.get(f"rotation_{axis}", np.zeros(len(vectors)))
+                                        for axis in COMPONENTS])
+                vectors = Rotation.from_rotvec(np.nan_to_num(turn)).apply(vectors)
             for axis, values in zip(COMPONENTS, vectors.T, strict=True):
                 columns[f"remanence_{axis}_T"] = values.tolist()
     try:

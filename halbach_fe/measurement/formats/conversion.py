@@ -371,8 +371,12 @@ def _remarks(
         if index in used.values() or not column.text or (
                 declared.columns and declared.columns[index].strip() == "-"):
             continue
-        if names.is_time(column):
-            looks = look_like_clock(table.values[:, index])
+        values = table.values[:, index]
+        if names.is_imaginary(column.text) and np.nan_to_num(values).any():
+            said.append(f"'{column.text}' is not zero, up to {np.nanmax(np.abs(values)):.4g}: of a "
+                        "field that changes in time only the real part was read.")
+        elif names.is_time(column):
+            looks = look_like_clock(values)
             said.append(f"The times in '{column.text}' are not used, as their unit is not stated"
                         f"{' (they look like HHMMSS)' if looks else ''}: state "
                         "t[s], t[min], t[h] or t[hhmmss] in its place in --columns.")
@@ -400,6 +404,13 @@ def _with_times(columns: Sequence[ColumnName], table: ForeignTable) -> tuple[Col
 def _columns(table: ForeignTable, declared: DeclaredFormat) -> tuple[ColumnName, ...]:
     """Return the file's columns with the names and units that the user states instead."""
     if not declared.columns:
+        signed = [column.text for column in table.columns if names.is_signed(column.text)
+                  and names.parse(column.text.replace("-", "", 1)).quantity]
+        if signed:
+            raise MeasurementError(must_be(
+                "header", table.where, "made of positions and components", f"{_quoted(signed)}, "
+                "with a minus before it", "Change the sign of these numbers and remove the minus; "
+                "if it means nothing, name all columns by --columns (- ignores a column)."))
         return _of_h(names.with_polar(table.columns, declared.at))
     count = len(table.columns) - table.added
     more = declared.columns[count:]  # delimiters at the ends of lines have no column in the table

@@ -14,7 +14,8 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import as_path
 from halbach_fe.measurement.formats.units import ANGLES, KINDS, kind_of, unit_symbol
 
-FORMATS = ("columns", "opera", "comsol", "openpmd", "g4beamline", "bdsim", "srw", "fluka")
+FORMATS = ("columns", "opera", "comsol", "openpmd", "g4beamline", "bdsim", "srw", "fluka",
+           "paraview")
 """Names of the formats of other programs that can be read."""
 
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "spaces": None}

@@ -83,6 +83,7 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If there are no numbers, or lines of different length.
     """
     lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
+    _refuse_limits_above(lines, where)
     if not declared.columns:
         _refuse_grid_above(lines[:4], where)
     return read_lines([one for one in lines if one[1]], declared, where)
@@ -174,6 +175,25 @@ def _refuse_grid_above(first: Sequence[Line], where: str) -> None:
             " of one component on the grid of its first three lines", "Write a table with a row "
             "x, y, z, Bx, By, Bz for every point from its three files, in which x changes fastest "
             "and z slowest."))
+
+
+def _refuse_limits_above(lines: Sequence[Line], where: str) -> None:
+    """Raise MeasurementError for rows below three lines of the first and last coordinate of a grid
+    and their number, as in maps of FairRoot below the word nosym: these lines are no readings.
+    """
+    least = 4  # lines, so that there are rows
+    for start in (0, 1):
+        limits = [line[:MAX_HEADER].split() for _, line in lines[start:start + 3]]
+        if len(lines) < start + least or not all(
+                len(axis) == 3 and _rises(axis[:2]) and re.fullmatch(r"[1-9]\d{0,8}", axis[2])
+                for axis in limits):
+            continue
+        if math.prod(int(axis[2]) for axis in limits) == len(lines) - start - 3:
+            raise MeasurementError(must_be(
+                "content", where, "rows with positions", "rows below the limits of their grid",
+                f"Add --skip-lines {lines[start + 2][0]}, --columns Bx[T],By[T],Bz[T] with its "
+                "unit, and --positions TABLE: x, y and z of every row, of which z changes fastest "
+                "in maps of FairRoot."))
 
 
 def _rises(cells: Sequence[str]) -> bool:

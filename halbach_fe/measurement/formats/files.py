@@ -29,6 +29,7 @@ from halbach_fe.measurement.formats import (
     g4beamline,
     openpmd,
     opera,
+    paraview,
 )
 from halbach_fe.measurement.formats.conversion import ForeignTable, ImportedMap, to_map
 from halbach_fe.measurement.formats.declared import FORMATS, DeclaredFormat
@@ -46,7 +47,7 @@ from halbach_fe.study.types import COMPONENTS, look_like_mm
 
 READERS: dict[str, Callable[[bytes, DeclaredFormat, str], ForeignTable]] = dict(zip(
     FORMATS, (delimited_table.read, opera.read, comsol.read, openpmd.read, g4beamline.read,
-              bdsim.read, read_srw, read_fluka), strict=True))
+              bdsim.read, read_srw, read_fluka, paraview.read), strict=True))
 """Readers of foreign formats by name; each gets the file's content, the user's declarations and the
 file's name for messages."""
 RECOGNIZED: dict[str, Callable[[Sequence[Line]], bool]] = {
@@ -87,12 +88,12 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
     if not name and (own := _own(path, raw, declared)) is not None:
         return _with_doubt(own, declared)
     name = name or format_of(raw, declared, where)
-    if declared.decimal_comma and name in ("opera", "openpmd"):
+    if declared.decimal_comma and name in ("opera", "openpmd", "paraview"):
         raise MeasurementError(must_be("format", where, "one in which numbers may have a decimal "
                                        "comma (--decimal-comma)", name, "Remove the option."))
     table = READERS[name](raw, declared, where)
     if declared.positions is not None:
-        table = with_positions(table, declared.positions)
+        table = with_positions(table, declared.positions, declared.length_unit)
     found = to_map(table, declared)
     data = found.data
     check_readings(data, path)
@@ -120,8 +121,10 @@ def _with_doubt(file: ImportedMap, declared: DeclaredFormat) -> ImportedMap:
     return replace(file, remarks=(*file.remarks, remark))
 
 
-def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
+def with_positions(table: ForeignTable, path: Path, length_unit: str = "") -> ForeignTable:
     """Return a table of readings with the columns x, y and z of a file of positions.
+
+    The user may state the ``length_unit`` of those that have none.
 
     Raises
     ------
@@ -133,9 +136,9 @@ def with_positions(table: ForeignTable, path: Path) -> ForeignTable:
     order = [[column.quantity for column in found.columns].index(name) for name in COMPONENTS
              if name in [column.quantity for column in found.columns]]
     if len(order) < len(COMPONENTS) or not all(
-            unit_symbol(found.columns[number].unit) for number in order):
+            unit_symbol(found.columns[number].unit or length_unit) for number in order):
         raise MeasurementError(must_be("header", where, "with x, y and z and their units, as in "
-                                       "x[mm],y[mm],z[mm]", ",".join(
+                                       "x[mm],y[mm],z[mm], or by --length-unit", ",".join(
                                            column.text for column in found.columns
                                            if column.text)[:60] or "none"))
     if len(found.values) != len(table.values):
@@ -154,7 +157,8 @@ def _own(path: Path, raw: bytes, declared: DeclaredFormat) -> ImportedMap | None
     MeasurementError
         If it cannot be read, or the user states what the file says otherwise.
     """
-    if path.suffix != ".vtu" and not (raw.startswith(openpmd.SIGNATURE) and openpmd.is_map(raw)):
+    own_vtu = path.suffix == ".vtu" and (b'"B_T"' in raw or not paraview.is_paraview(raw))
+    if not own_vtu and not (raw.startswith(openpmd.SIGNATURE) and openpmd.is_map(raw)):
         return None
     data = read_map(path)
     stated = replace(declared, origin_m=None, encoding=DeclaredFormat.encoding,
@@ -175,6 +179,8 @@ def format_of(raw: bytes, declared: DeclaredFormat, where: str) -> str:
     """Return the name in `READERS` of the format of a file, recognized by its first lines."""
     if raw.startswith(openpmd.SIGNATURE):
         return "openpmd"
+    if paraview.is_paraview(raw):
+        return "paraview"
     lines = lines_of(raw, declared, where)
     return next((name for name, of in RECOGNIZED.items() if of(lines)), "columns")
 

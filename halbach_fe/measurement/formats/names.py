@@ -73,6 +73,8 @@ NO_AXIS = NOISE_WORDS | {"offset", "shift", "step", "size", "delta", "difference
 GLUED = re.compile(r"(?:sigma|σ|std|stdev|err|error|unc|noise|delta|d|u)(b|b[xyzr]|bphi)"
                    r"|(b|b[xyzr]|bphi)(?:sigma|std|stdev|err|error|unc|noise)")
 """Names that join such a word and a component without a space: dBx, sigmaBx, Bxerr."""
+IMAGINARY = re.compile(r"(?:im|imag)\(?[bh][xyz]\)?|[bh][xyz](?:im|imag)")
+"""Names of imaginary parts: BxIm of CST, imag(Bx)."""
 OF_FIELD = re.compile(r"\((B\w{0,4})\)")
 """The component in brackets in sigma(Bx)."""
 
@@ -82,7 +84,11 @@ TEX = str.maketrans({"\u1d67": "y"} | dict.fromkeys("$\\{}"))
 """Marks of TeX in names, and the letter that stands for a lowered y, which Unicode lacks."""
 MAX_NAME = 60
 BRACKETS = re.compile(r"(.*?)\s*[\[(<]([^\[\]()<>]*)[\])>]\s*")
-PREFIX = re.compile(r"[a-z]\w*\.")  # of mf.Bx; -mf.Bx keeps its sign and is not recognized as Bx
+PREFIX = re.compile(r"[a-z]\w*\.")  # of mf.Bx
+SIGNED = re.compile(r"\W{0,3}-\s*[^\W\d]")
+"""A name with a minus before it, as -Bx: the quantity with its sign changed."""
+DIFFERENCE = re.compile(r"(?i)[^\W\d_]\w*\s*-\s*<?b(?![xyz]\b)")
+"""A name with a field after a minus, as Bx-B0: a difference to another field."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +126,15 @@ def parse(text: str, stated: bool = False) -> ColumnName:
     base, unit = split_unit(OF_FIELD.sub(r"_\1", text) if "(B" in text else text)
     base = unicodedata.normalize("NFKC", base.translate(TEX))  # lowered letters become plain ones
     key = _key(base)
-    quantity = _measured(key, unit_symbol(unit)) or _other_quantity(base, key, unit.strip()) or (
-        key if stated and key in STATED else "")
+    quantity = "" if is_signed(base) else (
+        _measured(key, unit_symbol(unit)) or _other_quantity(base, key, unit.strip()) or (
+            key if stated and key in STATED else ""))
     return ColumnName(text, quantity, unit.strip())
+
+
+def is_signed(text: str) -> bool:
+    """Return whether the name of a column begins with a minus, so that its numbers are negated."""
+    return bool(SIGNED.match(text))
 
 
 def _measured(key: str, unit: str) -> str:
@@ -212,7 +224,8 @@ def with_axes(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
         for index, column in enumerate(columns):
             base, unit = split_unit(column.text)
             axes = AXIS.findall(base)
-            of_kind = not column.quantity and kind_of(unit) == kind
+            of_kind = not column.quantity and kind_of(unit) == kind and not (
+                is_signed(base) or DIFFERENCE.search(base))
             if of_kind and len(axes) == 1 and not NO_AXIS & set(_words(base)):
                 found.append((axes[0].lower(), index, unit))
         if sorted(axis for axis, *_ in found) == ["x", "y", "z"] and not known & set(quantities):
@@ -220,6 +233,11 @@ def with_axes(columns: Sequence[ColumnName]) -> tuple[ColumnName, ...]:
                 renamed[index] = replace(columns[index], unit=unit, quantity=(
                     axis if kind == "length" else f"B{axis}"))
     return tuple(renamed)
+
+
+def is_imaginary(text: str) -> bool:
+    """Return whether the name of a column is that of the imaginary part of a component."""
+    return bool(IMAGINARY.fullmatch(_key(split_unit(text)[0])))
 
 
 def is_clock(column: ColumnName) -> bool:
