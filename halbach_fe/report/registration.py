@@ -127,7 +127,7 @@ def answer(
     nothing.
     """
     best = found[0]
-    along = ", ".join(f"{name} of the map along {axis.replace('-', '−')}" for name, axis in
+    along = ", ".join(f"{own} of the map along {axis.replace('-', '−')}" for own, axis in
                       axes_of_map(best.instrument).items())
     place = point_mm(best.middle_m, best.translation_sd_m)
     said = (f"The middle of the map lies at {place} mm in the magnet, with {along} of the "
@@ -138,17 +138,12 @@ def answer(
         said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
                  "likely.")
     trust = [*_other_poses(found), *_reversed(best, assumed), _fit(best, before)]
-    sound = is_sound(best)
-    maps = "" if name else " --measurements MAP"
-    own = f" --measurements DIR/{MAP_FILE}" if best.component else maps
+    stated = assumed or Instrument()
     if best.explains and not best.at_rest:
         said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
     if best.explains:
         said = _component(found) + said
-        trust.insert(0, NOT_AT_REST if not best.at_rest else DOUBTED if best.doubts else
-                     _apart(best, name) if best.apart else
-                     AT_REST if all(is_symmetric_to(best, each) for each in rivals(found))
-                     else UNDECIDED)
+        trust.insert(0, _verdict(found, name))
     else:
         said = (f"This magnet does not explain the map. The least bad answer{least_bad}: "
                 f"{said[0].lower()}{said[1:]}")
@@ -160,25 +155,8 @@ def answer(
     trust[1:1] = _doubts(best)
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
-        " ".join(trust), *(
-            ("Update the blocks with the map in this pose. The update finds pose and probe again, "
-             "together with the blocks.",
-             f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR") if sound else
-            # doubts about what the file says of its numbers, not about the magnet
-            _after_doubts(best, maps) if best.doubts and (
-                _is_a_factor(best) or len(_measured(best)) == 1) else
-            ("Do not update the blocks in this pose. Measure lines beside this one, or the "
-             "components of B that are missing, or narrow the search by what is known of the place "
-             "(--across-m, --turn-rad), and register again.",
-             f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
-            if best.explains and not best.apart else
-            ("Look for what the model lacks. The map lies about where the study states it, and "
-             "diagnose finds small shifts and turns by itself.",
-             f"halbach-fe diagnose STUDY{maps} -o DIR")
-            if _is_near(best, assumed or Instrument()) and not best.apart else
-            ("Look for what the model lacks.",
-             f"halbach-fe diagnose DIR/{STUDY_FILE}{own} -o DIR")), sound=sound,
-        changes_study=not _is_as_assumed(best, assumed or Instrument()), gist="" if not sound else
+        " ".join(trust), *_next_step(best, name, stated), sound=is_sound(best),
+        changes_study=not _is_as_assumed(best, stated), gist="" if not is_sound(best) else
         f"By the coordinates of {f'map {name}' if name else 'the map'}, the middle of the magnet "
         f"is at {_magnet_on_stage(best)}.")
 
@@ -236,6 +214,42 @@ def _is_a_factor(best: Registration) -> bool:
 def _are_alike(best: Registration) -> bool:
     """Tell whether the readings are like the nominal field, so that a factor may relate both."""
     return abs(best.likeness) >= UNLIKE
+
+
+def _verdict(found: Sequence[Registration], name: str) -> str:
+    """Say in a sentence whether the first pose, which explains the map, may be used."""
+    best = found[0]
+    if not best.at_rest:
+        return NOT_AT_REST
+    if best.doubts:
+        return DOUBTED
+    if best.apart:
+        return _apart(best, name)
+    decided = all(is_symmetric_to(best, each) for each in rivals(found))
+    return AT_REST if decided else UNDECIDED
+
+
+def _next_step(best: Registration, name: str, stated: Instrument) -> tuple[str, str]:
+    """Return what to do next, and its command; ``stated`` is the instrument of the study."""
+    maps = "" if name else " --measurements MAP"
+    own = f" --measurements DIR/{MAP_FILE}" if best.component else maps
+    if is_sound(best):
+        return ("Update the blocks with the map in this pose. The update finds pose and probe "
+                "again, together with the blocks.",
+                f"halbach-fe infer DIR/{STUDY_FILE}{own} -o DIR")
+    # doubts about what the file says of its numbers, not about the magnet
+    if best.doubts and (_is_a_factor(best) or len(_measured(best)) == 1):
+        return _after_doubts(best, maps)
+    if best.explains and not best.apart:
+        return ("Do not update the blocks in this pose. Measure lines beside this one, or the "
+                "components of B that are missing, or narrow the search by what is known of the "
+                "place (--across-m, --turn-rad), and register again.",
+                f"halbach-fe register STUDY{maps.replace('MAP', 'NEW_MAP')} -o DIR")
+    if _is_near(best, stated) and not best.apart:
+        return ("Look for what the model lacks. The map lies about where the study states it, and "
+                "diagnose finds small shifts and turns by itself.",
+                f"halbach-fe diagnose STUDY{maps} -o DIR")
+    return "Look for what the model lacks.", f"halbach-fe diagnose DIR/{STUDY_FILE}{own} -o DIR"
 
 
 def _after_doubts(best: Registration, maps: str) -> tuple[str, str]:
