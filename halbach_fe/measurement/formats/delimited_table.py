@@ -91,51 +91,23 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
 
 def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> ForeignTable:
     """Read a table of columns from lines, as `read` does."""
-    apart = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
-             for number, line in lines]
-    try:
-        start = _first_numbers(lines, declared, where)
-    except MeasurementError as error:  # unless the numbers of all rows run together
-        try:
-            start = _first_numbers(apart, declared, where)
-        except MeasurementError:
-            raise error from None
-        lines = apart
-    if delimiter_of(lines[start][1], declared) is None:
-        while start and _are_alike(apart[start - 1][1], apart[start][1]) and (
-                apart[start - 1] != lines[start - 1]):  # a first row of numbers run together
-            start -= 1
-        lines = [*lines[:start], *apart[start:]]
+    lines, start = _with_numbers_apart(lines, declared, where)
     first = _below_counts(lines, start, declared, where)
     counts, preface = lines[start:first], lines[:first]
     header = {line.strip() for _, line in preface}  # repeated above every part of some files
     body = [line for line in lines[first:]
             if is_comment(line[1]) or line[1].strip() not in header]
-    delimiter = delimiter_of(body[0][1], declared)
-    remarks: tuple[str, ...] = ()
-    try:
-        values, texts = rows_of(body, len(cells_of(body[0][1], delimiter)), delimiter, declared,
-                                where)
-    except MeasurementError as error:
-        if delimiter != "\t" or declared.delimiter:
-            raise
-        delimiter = None
-        try:
-            values, texts = rows_of(body, len(body[0][1].split()), None, declared, where)
-        except MeasurementError:
-            raise error from None
-        remarks = ("Some cells are separated by several tabs, which were taken for one: then all "
-                   "rows are equally long.",)
+    values, texts, delimiter, remarks = _rows(body, declared, where)
     if counts:
         remarks += (_counted(counts[0], len(values), where),)
     values = _without_empty_end(values, texts, lines[:start], delimiter)
     count = values.shape[1]
     _refuse_lost_rows(lines[:start], count, delimiter, declared, where)
     named = [text for text in declared.columns if text != "-"]
-    if (apart := len(named) // count) > 1 and len(declared.columns) == apart * count:
+    if (each := len(named) // count) > 1 and len(declared.columns) == each * count:
         raise MeasurementError(must_be(
             "--columns", where, f"of {count} columns, as the file has", len(declared.columns),
-            joining(apart, body[0][0], delimiter) + " Else name each column; - ignores a column."))
+            joining(each, body[0][0], delimiter) + " Else name each column; - ignores a column."))
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
     own = {column.text for column in columns} <= OWN_COLUMNS
     stated = [names.parse(text, stated=True) for text in declared.columns] or columns
@@ -151,6 +123,48 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
         attributes={part[1]: part[2].strip() for _, line in preface if (
             part := ATTRIBUTE.fullmatch(line.strip())) and part[0].isprintable()} if own else {},
         remarks=remarks if own else remarks + unused_lines(preface, columns))
+
+
+def _with_numbers_apart(
+    lines: Sequence[Line], declared: DeclaredFormat, where: str
+) -> tuple[Sequence[Line], int]:
+    """Return the lines, in which no numbers run together, and the index of the first row."""
+    apart = [(number, line if is_comment(line) else RUN_TOGETHER.sub(r"\1 ", line))
+             for number, line in lines]
+    try:
+        start = _first_numbers(lines, declared, where)
+    except MeasurementError as error:  # unless the numbers of all rows run together
+        try:
+            start = _first_numbers(apart, declared, where)
+        except MeasurementError:
+            raise error from None
+        lines = apart
+    if delimiter_of(lines[start][1], declared) is None:
+        while start and _are_alike(apart[start - 1][1], apart[start][1]) and (
+                apart[start - 1] != lines[start - 1]):  # a first row of numbers run together
+            start -= 1
+        lines = [*lines[:start], *apart[start:]]
+    return lines, start
+
+
+def _rows(
+    body: Sequence[Line], declared: DeclaredFormat, where: str
+) -> tuple[Floats, dict[int, dict[int, Line]], str | None, tuple[str, ...]]:
+    """Return what `rows_of` does, the delimiter of the cells, and a remark if tabs are repeated."""
+    delimiter = delimiter_of(body[0][1], declared)
+    try:
+        return *rows_of(body, len(cells_of(body[0][1], delimiter)), delimiter, declared,
+                        where), delimiter, ()
+    except MeasurementError as error:
+        if delimiter != "\t" or declared.delimiter:
+            raise
+        try:
+            found = rows_of(body, len(body[0][1].split()), None, declared, where)
+        except MeasurementError:
+            raise error from None
+    return *found, None, (
+        "Some cells are separated by several tabs, which were taken for one: then all rows are "
+        "equally long.",)
 
 
 def _refuse_grid_above(first: Sequence[Line], where: str) -> None:
