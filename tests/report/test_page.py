@@ -165,27 +165,27 @@ def test_a_question_is_one_module(dipole, tmp_path, capsys, monkeypatch):
     (tmp_path / "toy_question.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     toy = importlib.import_module("toy_question")
-    found = toy.count(build_magnet(dipole()))
+    found = toy.tally(build_magnet(dipole()))
     said = f"There are {sum(found.blocks)}."
     shown = hf.write_report(found, tmp_path / "api")
     assert sorted(path.name for path in shown.parent.iterdir()) == [
-        "count.csv", "count.html", "count.json", "page.json", "run.json"]
+        "page.json", "run.json", "tally.csv", "tally.html", "tally.json"]
     record = json.loads((tmp_path / "api" / "page.json").read_text())
     assert record["answer"]["said"] == said
     assert record["rows"] == [{"ring": "1", "blocks": str(found.blocks[0])}]
     assert said in shown.read_text()
-    assert "count.csv, count.json, page.json" in shown.read_text()
+    assert "tally.csv, tally.json, page.json" in shown.read_text()
     assert said in found._repr_html_()
     study = tmp_path / "study.toml"
     study.write_text(tomlkit.dumps(DIPOLE))
     for as_json in (False, True):
-        arguments = Namespace(verb="count", study=study, output=tmp_path / "cli", json=as_json)
+        arguments = Namespace(verb="tally", study=study, output=tmp_path / "cli", json=as_json)
         assert common.with_folder(
             lambda given: common.finish(given, toy.page(found)), arguments) == 0
         printed = capsys.readouterr()
         assert (said in printed.err) != as_json
         assert ("Blocks by ring" in printed.out) != as_json
     assert json.loads(printed.out)["blocks"] == list(found.blocks)
-    assert json.loads((tmp_path / "cli" / "run.json").read_text())["command"] == "halbach-fe count"
+    assert json.loads((tmp_path / "cli" / "run.json").read_text())["command"] == "halbach-fe tally"
     with pytest.raises(hf.HalbachError, match="has returned; instead received a str"):
         hf.write_report("text", tmp_path / "none")
