@@ -225,11 +225,14 @@ def _fitted(
                 "components.")
         remark = ("is of |B|, fitted as B along the nominal field. "
                   f"{_to_first_order(np.array([np.sqrt(2) * differs]))}")
-    fields = told @ fields
-    if not remark and np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
+    part = None if remark else told
+    if part is None:
+        fields = told @ fields
+    elif np.linalg.norm(main - told @ main) > ALONG * np.linalg.norm(main):
         return None, noise, (f"has no {lacking}, along which much of the main field is: it does "
                              "not tell how homogeneous |B| is.")
-    known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True)
+    known = model.of_fields(fields[..., 0], fields[..., 1:], measured=True,
+                            told=part if lacking else None)
     left = PPM * _open(fields[..., 1:], known.direction, model.weights) / known.mean_T
     if left > OPEN * known.rms_ppm:
         return None, noise, (f"leaves {left:.0f} ppm rms of the field in the region open, of "
@@ -241,7 +244,7 @@ def _fitted(
     has = " and ".join(f"B{name}" for name in COMPONENTS if f"B{name}" not in lacking)
     size, whole = (np.linalg.norm(each, axis=1) for each in (nominal @ told, nominal))
     across = np.sqrt(np.maximum(whole**2 / size**2 - 1, 0.0))
-    differs = _differs(np.linalg.norm(fields[..., 0], axis=1), size, model.weights)
+    differs = _differs(np.linalg.norm(fields[..., 0] @ told, axis=1), size, model.weights)
     return replace(known, components=has), noise, (
         f"has no {lacking}. What is said of it is the size of {has} alone, as the main field is "
         f"along it. {_to_first_order(across + np.sqrt(2) * differs)}")

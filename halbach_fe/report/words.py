@@ -83,7 +83,7 @@ def rms(values: Floats) -> float:
 
 def ppm(value: float) -> str:
     """Return a number of ppm as text, without an exponent."""
-    return (f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 1000
+    return (f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 999.5
             else "0" if abs(value) < 1e-3 else f"{value:.3g}")
 
 

@@ -15,7 +15,7 @@ after.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from math import factorial
@@ -533,18 +533,22 @@ class HomogeneityModel:
         return np.asarray(self.response.offset[rows, None] + values).reshape(
             -1, 3, magnetizations.shape[1])
 
-    def of_fields(self, field: Floats, drawn: Floats, measured: bool = False) -> Homogeneity:
+    def of_fields(
+        self, field: Floats, drawn: Floats, measured: bool = False, told: Floats | None = None
+    ) -> Homogeneity:
         """Return the homogeneity for a mean field (n, 3) and drawn fields (n, 3, d) in T.
 
         The n points are those of the region. Of a ``measured`` field the deviations are medians of
-        the drawn ones.
+        the drawn ones. ``told`` is a projector (3, 3) to the part of B whose size stands for |B|.
         """
+        size, rms, whole = self.deviations(field[..., None], told)
+        sizes, every_rms, every_whole = self.deviations(drawn, told)
+        if told is not None:
+            field, drawn = field @ told, told @ drawn
         mean = self.weights @ field
         direction = mean / np.linalg.norm(mean)
         along = np.einsum("n,ncd->cd", self.weights, drawn)
         aside = along / np.linalg.norm(along, axis=0) - direction[:, None]
-        size, rms, whole = self.deviations(field[..., None])
-        sizes, every_rms, every_whole = self.deviations(drawn)
         ranges = _quantiles(every_rms), _quantiles(every_whole)
         return Homogeneity(
             float(size[0]), float(np.std(sizes)), direction,
@@ -561,15 +565,18 @@ class HomogeneityModel:
         size[self.in_air] = np.linalg.norm(field.reshape(-1, 3), axis=1)
         return slices_of(self.region, size)
 
-    def deviations(self, fields: Floats) -> tuple[Floats, Floats, Floats]:
+    def deviations(
+        self, fields: Floats, told: Floats | None = None
+    ) -> tuple[Floats, Floats, Floats]:
         """Return mean |B| (d,) in T, rms and peak-to-peak deviations (d,) in ppm.
 
-        They are those of fields (n, 3, d) in T at the points of the region.
+        They are those of fields (n, 3, d) in T at the points of the region, or of the part of them
+        that a projector (3, 3) has ``told``.
         """
-        size = np.linalg.norm(fields, axis=1)
+        size = _size(fields, told)
         mean = self.weights @ size
         deviation = PPM * (size / mean - 1)
-        low, high = extremes(self.region, self.sampling.points, self.sampling.steps, fields)
+        low, high = extremes(self.region, self.sampling.points, self.sampling.steps, fields, told)
         return mean, np.sqrt(self.weights @ deviation**2), PPM * (high - low) / mean
 
     def _harmonics(
@@ -590,7 +597,7 @@ class HomogeneityModel:
 
 
 def extremes(
-    region: Region, points: Floats, steps: Floats, fields: Floats
+    region: Region, points: Floats, steps: Floats, fields: Floats, told: Floats | None = None
 ) -> tuple[Floats, Floats]:
     """Return the least and the largest |B| (d,) in a region, of fields (n, 3, d) at its points.
 
@@ -605,8 +612,10 @@ def extremes(
     steps : ndarray, shape (n, 3)
         Distance of each point from those next to it, relative to the half axes.
     fields : ndarray, shape (n, 3, d)
+    told : ndarray, shape (3, 3), optional
+        Projector to the part of B whose size is meant: that part alone is no field of potentials.
     """
-    size = np.linalg.norm(fields, axis=1)
+    size = _size(fields, told)
     unit = (points - region.centre_m) / region.half_axes_m
     found = []
     for sign in (-1.0, 1.0):
@@ -617,17 +626,24 @@ def extremes(
             for start in np.unique(best):
                 own = np.flatnonzero(best == start)
                 value[own] = np.maximum(value[own], _climbed(
-                    region, unit, int(start), steps[start], fields[..., own], sign))
+                    region, unit, int(start), steps[start], fields[..., own],
+                    lambda field, sign=sign: sign * _size(field, told)))
                 near = np.linalg.norm((unit - unit[start]) / steps[start], axis=1) <= 2
                 left[np.ix_(near, own)] = -np.inf
         found.append(sign * value)
     return found[0], found[1]
 
 
+def _size(fields: Floats, told: Floats | None) -> Floats:
+    """Return |B| (n, d) of fields (n, 3, d), or the size of the part that a projector tells."""
+    return np.asarray(np.linalg.norm(fields if told is None else told @ fields, axis=1))
+
+
 def _climbed(
-    region: Region, unit: Floats, start: int, step: Floats, fields: Floats, sign: float
+    region: Region, unit: Floats, start: int, step: Floats, fields: Floats,
+    size: Callable[[Floats], Floats],
 ) -> Floats:
-    """Return ``sign`` times the extremes (d,) of |B| near a point; see `extremes`.
+    """Return the largest ``size`` (d,) of fields (n, 3, d) near a point; see `extremes`.
 
     ``unit`` are the points relative to the half axes of the region, as is their ``step`` (3,).
     """
@@ -655,12 +671,12 @@ def _climbed(
     # and its neighbours gives the rest.
     tried, width = 7, 1.5
     places = region.around(unit[start], width * step, tried).reshape(-1, 3) - unit[start]
-    found = sign * np.linalg.norm(solid_harmonic_fields(
-        places * region.half_axes_m / scale, local_degrees) @ amplitudes, axis=1)
+    found = size(solid_harmonic_fields(
+        places * region.half_axes_m / scale, local_degrees) @ amplitudes)
     value = _vertex(found.reshape(*3 * [tried], -1))
-    sampled = sign * np.linalg.norm(fields[start], axis=0)
+    sampled = size(fields[start][None])[0]
     # a fit through too few points may leave no rest: it adds no more than they differ by
-    spread = np.ptp(np.linalg.norm(fields[near], axis=1), axis=0)
+    spread = np.ptp(size(fields[near]), axis=0)
     return np.where((value - sampled > rest) & (value - sampled <= spread), value, sampled)
 
 

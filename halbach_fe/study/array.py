@@ -10,7 +10,14 @@ from pydantic import Field, ValidationError, model_validator
 from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
-from halbach_fe.study.grades import Material, doubted_strength, with_grade, without_old_grade
+from halbach_fe.study.grades import (
+    STRENGTHS,
+    Material,
+    doubted_strength,
+    grade_of,
+    with_grade,
+    without_old_grade,
+)
 from halbach_fe.study.types import (
     Angle,
     Coordinate,
@@ -161,10 +168,15 @@ class BlockException(StudyModel):
 class _OfGrade(StudyModel):
     """A table with a grade: another one has a remanence and a permeability of its own."""
 
+    @property
+    def doubt(self) -> str:
+        """A sentence about a strength that is not that of the table's grade; empty if it is."""
+        return doubted_strength(self)
+
     def with_(self, **changes: Any) -> Self:
         """Return a copy with other values of some keys; see `StudyModel.with_`."""
         changed = super().with_(**without_old_grade(self, changes))
-        if "material" in changes and (doubt := doubted_strength(changed)):
+        if changes.keys() & {"material", *STRENGTHS} and (doubt := changed.doubt):
             warnings.warn(doubt, HalbachWarning, stacklevel=4)
         return changed
 
@@ -255,6 +267,18 @@ class Array(_OfGrade):
     ring: tuple[Ring, ...] = ()
     free_blocks: FreeBlocks | None = None
     exceptions: tuple[BlockException, ...] = ()
+
+    @property
+    def doubt(self) -> str:
+        """A sentence about a strength that is not that of the grade, or of no block."""
+        found = grade_of(self)
+        of_grade = found is not None and self.remanence_T == found.nominal_remanence
+        idle = [key for key in ("remanence_T", "block_moment_A_m2")
+                if getattr(self, key) is not None]
+        if self.rings or not idle or of_grade:
+            return super().doubt
+        return (f"{idle[0]} of [array] is without effect: all blocks are free, and have a "
+                "strength of their own in their table.")
 
     @model_validator(mode="before")
     @classmethod

@@ -22,7 +22,6 @@ from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
-from halbach_fe.study.grades import doubted_strength
 from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl
 from halbach_fe.study.model import Study, iron_of
 
@@ -135,7 +134,7 @@ def _doubted_units(study: Study) -> list[str]:
     found += (f"`array{key}`: {doubt}" for key, one in (
         ("", study.array), *((f".ring[{number}]", ring)
                              for number, ring in enumerate(study.array.ring, start=1)))
-        if (doubt := doubted_strength(one)))
+        if (doubt := one.doubt))
     return found
 
 

@@ -13,7 +13,7 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.inference.result import HELD_OUT, InferenceResult, far_in_words
 from halbach_fe.report.inference import score_table, term_table
 from halbach_fe.report.inference_answer import answer
-from halbach_fe.report.words import flux_density
+from halbach_fe.report.words import flux_density, ppm
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.simulate import simulate_campaign
 from tests.conftest import changed
@@ -105,6 +105,7 @@ def test_answer_and_table_have_the_same_numbers(campaign, session):
     assert flux_density(1.1e-4, zeros=True) == "110\u00a0µT"
     assert flux_density(0.0, zeros=True) == "0\u00a0mT"
     assert flux_density(6.1e-6) == "6.1\u00a0µT"
+    assert [ppm(value) for value in (999.4, 999.6, 1030.0)] == ["999", "1\u202f000", "1\u202f030"]
 
 
 @pytest.mark.parametrize(("change", "key", "told"), [

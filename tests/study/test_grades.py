@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from halbach_fe.core.errors import HalbachWarning
-from halbach_fe.magnets import write_study
+from halbach_fe.magnets import magnet_of_blocks, write_study
 from halbach_fe.study import grades as module
 from halbach_fe.study.grades import check_grade, grade, grades, read_grades
 from halbach_fe.study.magnet import Demagnetization
@@ -247,3 +247,17 @@ def test_a_remanence_that_is_none_of_the_grade_is_doubted(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read_study(tmp_path / "control.toml")
+
+
+def test_a_strength_beside_free_blocks_alone_is_doubted():
+    """They have their own; that of the grade, which says their permeability too, is none given."""
+    magnet = magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.04], "y_m": [0.0], "z_m": [0.0], "size_x_m": [0.02],
+        "size_y_m": [0.02], "size_z_m": [0.02], "remanence_T": [1.2]})
+    for key, value in {"remanence_T": 1.45, "block_moment_A_m2": 9.0}.items():
+        with pytest.warns(HalbachWarning, match=rf"{key} of \[array\] is without effect"):
+            changed = magnet.with_(**{f"array__{key}": value})
+        assert (changed.field_T([0, 0, 0]) == magnet.field_T([0, 0, 0])).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        magnet.with_(array__material="N52")
