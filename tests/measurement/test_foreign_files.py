@@ -92,6 +92,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + "0 0.1 0\n" * 45, "OPAL.*skip-lines 4"),
     ("2 0.02\n2 -0.01 0.01\n2 -0.01 0.01\n1\n" + "0.1\n" * 27, "TraceWin.*x changes fastest"),
     ("x[m] y[m] z[m] mf.Bx[T]\n" + "0 0 1 0.1+0i\n" * 2, r"real\(mf.Bx\)"),
+    ("# ID kick map\n# Horizontal kick angles (T2m2)\nSTART\n-1 0 1\n-1 1 2 3\n", "map of kicks"),
     (HEADER + "10,0,0,0.1+0.0i,0+0i,0.2+0i\n" * 2, "Write real parts alone"),
     ("x[mm],y[mm],z[mm],dB [ppm]\n0,0,0,12\n", r"\(1 \+ ppm / 1e6\) times"),
     (HEADER.replace("mm", "ft") + "1,0,0,1,0,0\n" * 2, r"the unit of x, y, z, .*x\[N m\], with"),

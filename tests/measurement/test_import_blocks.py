@@ -186,6 +186,18 @@ def test_how_a_block_lies_is_not_guessed(tmp_path, asked):
         assert found.rotation_z_deg == (50.0,)
 
 
+def test_lengths_of_J_with_a_direction_and_diameters(tmp_path):
+    """J was taken along x beside its direction. Negative controls: without one, and by radius."""
+    text = ("x [mm];y [mm];z [mm];Diameter [mm];Height [mm];Br [T];{}\n0;0;0;30;10;1.3;0;1\n")
+    shape = {"fixed": {"shape": "cylinder"}}
+    with pytest.raises(MeasurementError, match="polarization_x.* 'Dir_x' and 'Dir_y'; the radius, "
+                                               r"half of 'Diameter .mm.' \(radius.0.5 mm"):
+        imported(tmp_path, text.format("Dir_x;Dir_y"), **shape)
+    found = imported(tmp_path, text.format("n;m"), columns=(
+        "at_x", "at_y", "at_z", "radius[0.5 mm]", "size_z", "polarization", "-", "-"), **shape)
+    assert (found.radius_m, found.remanence_T) == ((0.015,), (1.3,))
+
+
 @pytest.mark.parametrize(("header", "turn"), [
     ("Rot x (deg);Rot y (deg);Rot z (deg)", "0;0;50"),
     ("rotvec x (deg);rotvec y (deg);rotvec z (deg)", "30;40;50"),

@@ -67,6 +67,8 @@ CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]
 COORDINATE = re.compile(
     r"(?i)([xyz])\s*[=:]\s*([-+\d.e]{1,30})\s*[\[(]?\s*([^\W\d]{1,12})?\W?")
 """A comment that is a coordinate of the rows below it."""
+KICKS = re.compile(r"(?i)\bkick[ _-]?(?:map|angles?)\b|\b(?:horizontal|vertical) kicks?\b")
+"""Words of the comments of a map of kicks, as tracking programs read it."""
 MAX_COUNTS = 4
 MAX_HEADER = 20_000
 """Number of characters of a line that are read as names of columns."""
@@ -83,6 +85,10 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If there are no numbers, or lines of different length.
     """
     lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
+    if any(KICKS.search(line[:MAX_LINE]) for _, line in lines[:20] if is_comment(line)):
+        raise MeasurementError(must_be(
+            "content", where, "readings of a field", "a map of kicks, which are integrals along "
+            "lines", "Import the map of the field from which it was made."))
     _refuse_limits_above(lines, where)
     if not declared.columns:
         _refuse_grid_above(lines[:4], where)
