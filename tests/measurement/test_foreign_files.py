@@ -112,6 +112,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("".join(f"run {n}\n1 2\n3 4\n5 6 7\n" for n in range(4)), "tables are below each other"),
     (HEADER + "1,2,3,0,0,1\n,,,0,0,2\n", "If the row is no reading, remove it"),
     ('[{"x": 0, "y": 0, "z": 0, "Bx": 0.1}]', "x, y, z, Bx, By, Bz of numbers for each point"),
+    ('{\n "x": [1, 2,\n 3],\n "B": [\n 1, 2,\n 3]\n}', "JSON.*to_csv"),
 ], ids=str)
 def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
     path = tmp_path / "file.txt"

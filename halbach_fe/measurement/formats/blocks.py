@@ -354,7 +354,7 @@ def _missing(table: _Table, free: bool) -> list[str]:
          f"{strength}_y, {strength}_z along the axes of the block)"),
         *((free, f"{name[-1]} of each block (a column {name})") for name in places),
         (free and polar, "x and y of its angle (x = r cos(phi), y = r sin(phi))"),
-        *((free, text) for text in _unclear(table)),
+        *((True, text) for text in (_unclear(table) if free else [])),
         (free and "shape" not in table,
          f"the shape (--fixed shape=cuboid, or one of {', '.join(SIZES)})"),
         (not free and "sigma" not in table,

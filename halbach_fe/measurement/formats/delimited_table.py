@@ -67,6 +67,7 @@ CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]
 COORDINATE = re.compile(
     r"(?i)([xyz])\s*[=:]\s*([-+\d.e]{1,30})\s*[\[(]?\s*([^\W\d]{1,12})?\W?")
 """A comment that is a coordinate of the rows below it."""
+JSON = re.compile(rb'\s*(?:\[\s*)?\{\s*"')
 KICKS = re.compile(r"(?i)\bkick[ _-]?(?:map|angles?)\b|\b(?:horizontal|vertical) kicks?\b")
 """Words of the comments of a map of kicks, as tracking programs read it."""
 MAX_COUNTS = 4
@@ -85,6 +86,11 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If there are no numbers, or lines of different length.
     """
     lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
+    if JSON.match(raw[:MAX_LINE]):
+        raise MeasurementError(must_be(
+            "content", where, "a table with lines of numbers", "JSON", "Write it with a row x, y, "
+            "z, Bx, By, Bz of numbers for each point, as CSV; in Python by pandas.DataFrame(...)"
+            ".to_csv('map.csv', index=False)."))
     if any(KICKS.search(line[:MAX_LINE]) for _, line in lines[:20] if is_comment(line)):
         raise MeasurementError(must_be(
             "content", where, "readings of a field", "a map of kicks, which are integrals along "
