@@ -359,6 +359,15 @@ def test_a_line_of_counts_that_does_not_count(tmp_path):
                                         length_unit="mm", field_unit="T"))
 
 
+@pytest.mark.parametrize("mark", ",;\t")
+def test_whole_numbers_above_a_row_with_an_empty_cell_are_no_counts(tmp_path, mark):
+    """They were read as counts of points, so that a reading was lost."""
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm],Bx[mT]\n1,2,3,100\n1,2,4,\n1,2,5,101\n".replace(",", mark))
+    found = import_map(path, DeclaredFormat()).data
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.1, 0.101])
+
+
 def test_a_centre_in_a_comment_says_how_to_use_it(tmp_path):
     path = tmp_path / "file.txt"
     lab = mm_T()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -344,3 +347,39 @@ def test_the_sheet_with_the_numbers_is_read(tmp_path):
     book.save(path)
     with pytest.warns(HalbachWarning, match="sheet 'Data' is read; 'Other' would have to be saved"):
         assert import_map(path, DeclaredFormat()).data.equals(found)
+
+
+def test_workbooks_whose_numbers_are_texts_with_decimal_commas(tmp_path):
+    """The option that the refusal advises had made it no table; numbers among them stay numbers."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, path = openpyxl.Workbook(), tmp_path / "map.xlsx"
+    for row in (["x", "y", "z", "Bx"], ["mm", "mm", "mm", "mT"], [1.5, 2, 3, "100,5"],
+                [1.5, 2, 4, "101,0"]):
+        book.active.append(row)
+    book.save(path)
+    with pytest.raises(MeasurementError, match="add --decimal-comma"):
+        import_map(path, DeclaredFormat())
+    found = import_map(path, DeclaredFormat(decimal_comma=True)).data
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.1005, 0.101])
+    np.testing.assert_allclose(found["x_m"], 0.0015)
+
+
+@pytest.mark.parametrize(("saved", "text"), [("", False), ("101", False), ("", True)])
+def test_a_formula_without_its_value_is_not_left_out(tmp_path, saved, text):
+    """Negative controls: one that was saved with its value, and an empty text."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, whole, path = openpyxl.Workbook(), tmp_path / "whole.xlsx", tmp_path / "map.xlsx"
+    for row in (["x [mm]", "y [mm]", "z [mm]", "Bx [mT]"], [1, 2, 3, 100], [1, 2, 4, "=D2+1"]):
+        book.active.append(row)
+    book.save(whole)
+    with zipfile.ZipFile(whole) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            content = re.sub(rb"</f><v\s*(?:/>|></v>)", b"</f><v>%s</v>" % saved.encode(),
+                             old.read(name))
+            new.writestr(name, content.replace(b'r="D3"', b'r="D3" t="str"') if text else content)
+    if saved or text:
+        found = import_map(path, DeclaredFormat()).data
+        assert found.sizes["point"] == (2 if saved else 1)
+        return
+    with pytest.raises(MeasurementError, match=r"the formula in D3 has no value.*as CSV"):
+        import_map(path, DeclaredFormat())

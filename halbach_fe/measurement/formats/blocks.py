@@ -162,7 +162,7 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
         table with positions makes no free blocks.
     """
     where = f"table of blocks {path}"
-    raw = text_of_table(file_bytes(path, where, workbooks=True), where)
+    raw = text_of_table(file_bytes(path, where, workbooks=True), where, declared.decimal_comma)
     table = _table(lines_of(raw, declared, where), declared, where)
     free = any(f"at_{axis}" in table for axis in COMPONENTS)
     missing = _missing(table, free)

@@ -251,10 +251,11 @@ def _below_counts(
 ) -> int:
     """Return the index of the first row of readings: below a line of one to four counts."""
     rows = [index for index in range(start, len(lines)) if not is_comment(lines[index][1])][:2]
-    cells = [[cell for cell in cells_of(lines[index][1], delimiter_of(lines[index][1], declared))
-              if cell] for index in rows]
-    if len(rows) < 2 or len(cells[0]) == len(cells[1]) or len(cells[0]) > MAX_COUNTS or not all(
-            re.fullmatch(r"[1-9]\d{0,8}", cell) for cell in cells[0]):
+    whole = [cells_of(lines[index][1], delimiter_of(lines[index][1], declared)) for index in rows]
+    cells = [[cell for cell in row if cell] for row in whole]
+    if len(rows) < 2 or len(whole[0]) == len(whole[1]) or len(cells[0]) == len(cells[1]) or (
+            len(cells[0]) > MAX_COUNTS) or not all(
+                re.fullmatch(r"[1-9]\d{0,8}", cell) for cell in cells[0]):
         return start
     return rows[1]
 
