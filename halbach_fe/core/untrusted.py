@@ -59,18 +59,25 @@ def read_dataset(path: Path, group: str | None = None) -> xr.Dataset:
         return opened.load()
 
 
-def sheet_text(raw: bytes) -> tuple[bytes, str, list[str]]:
+NO_VALUE = re.compile(rb'<c r="([A-Z]{1,3}\d{1,7})"(?![^>]*t="str")[^>]*>\s*'
+                      rb'<f[^>]*(?:/>|>[^<]*</f>)\s*(?:<v\s*/>|<v></v>)?\s*</c>')
+"""A cell of a workbook with a formula of a number and without its value when it was saved."""
+
+
+def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, list[str]]:
     """Return a sheet of an Excel workbook (.xlsx) as CSV in UTF-8, its name, and those of others.
 
     It is the first one with two rows of numbers, else the first with cells; the others are all
-    that have such rows too. Formulas have the values that the workbook was saved with.
+    that have such rows too. Cells are separated by semicolons; numbers have a ``decimal_comma``,
+    if those that are texts have one. Formulas have the values that the workbook was saved with.
 
     Raises
     ------
     ExtraMissingError
         If openpyxl, which reads it, is not installed.
     ValueError
-        If the file is damaged, or larger than 200 million cells or bytes.
+        If the file is damaged, larger than 200 million cells or bytes, or has a formula without a
+        value.
     """
     max_sheet = 200_000_000  # size in bytes of the largest unpacked workbook that is read
     openpyxl = import_extra("openpyxl", "spreadsheet",
@@ -79,29 +86,35 @@ def sheet_text(raw: bytes) -> tuple[bytes, str, list[str]]:
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
             if sum(part.file_size for part in packed.infolist()) > max_sheet:
                 raise ValueError(f"it unpacks to more than {max_sheet} bytes")
+            for name in packed.namelist():
+                if name.startswith("xl/worksheets/") and (found := NO_VALUE.search(
+                        packed.read(name))):
+                    raise ValueError(f"the formula in {found[1].decode()} has no value")
         book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
         first: tuple[bytes, str] | None = None
-        found: tuple[bytes, str] | None = None
+        chosen: tuple[bytes, str] | None = None
         others = []
         for sheet in book.worksheets:
             values = list(sheet.iter_rows(values_only=True))
-            rows = [["" if cell is None else str(cell) for cell in row] for row in values]
+            rows = [["" if cell is None else str(cell).replace(".", ",")
+                     if decimal_comma and isinstance(cell, float) else str(cell)
+                     for cell in row] for row in values]
             width = max((n for row in rows for n, cell in enumerate(row, 1) if cell), default=0)
             if not width:
                 continue
             of_numbers = sum(sum(isinstance(cell, int | float) for cell in row) > 1
                              for row in values) > 1
-            if of_numbers and found:
+            if of_numbers and chosen:
                 others.append(sheet.title)
                 continue
             text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows(
+            csv.writer(text, delimiter=";", lineterminator="\n").writerows(
                 [*row, *[""] * width][:width] for row in rows if any(row))
             first = first or (text.getvalue().encode(), sheet.title)
-            found = found or ((text.getvalue().encode(), sheet.title) if of_numbers else None)
+            chosen = chosen or ((text.getvalue().encode(), sheet.title) if of_numbers else None)
     if first is None:
         raise ValueError("it has no sheet with cells")
-    return *(found or first), others
+    return *(chosen or first), others
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

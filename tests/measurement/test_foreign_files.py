@@ -92,6 +92,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("3DMagnetoStatic XYZ\n-1 1 2\n-1 1 2\n-2 2 4\n" + "0 0.1 0\n" * 45, "OPAL.*skip-lines 4"),
     ("2 0.02\n2 -0.01 0.01\n2 -0.01 0.01\n1\n" + "0.1\n" * 27, "TraceWin.*x changes fastest"),
     ("x[m] y[m] z[m] mf.Bx[T]\n" + "0 0 1 0.1+0i\n" * 2, r"real\(mf.Bx\)"),
+    ("# ID kick map\n# Horizontal kick angles (T2m2)\nSTART\n-1 0 1\n-1 1 2 3\n", "map of kicks"),
     (HEADER + "10,0,0,0.1+0.0i,0+0i,0.2+0i\n" * 2, "Write real parts alone"),
     ("x[mm],y[mm],z[mm],dB [ppm]\n0,0,0,12\n", r"\(1 \+ ppm / 1e6\) times"),
     (HEADER.replace("mm", "ft") + "1,0,0,1,0,0\n" * 2, r"the unit of x, y, z, .*x\[N m\], with"),
@@ -111,6 +112,7 @@ def test_what_people_have(tmp_path, case: Foreign):
     ("".join(f"run {n}\n1 2\n3 4\n5 6 7\n" for n in range(4)), "tables are below each other"),
     (HEADER + "1,2,3,0,0,1\n,,,0,0,2\n", "If the row is no reading, remove it"),
     ('[{"x": 0, "y": 0, "z": 0, "Bx": 0.1}]', "x, y, z, Bx, By, Bz of numbers for each point"),
+    ('{\n "x": [1, 2,\n 3],\n "B": [\n 1, 2,\n 3]\n}', "JSON.*to_csv"),
 ], ids=str)
 def test_what_is_no_table_says_what_to_do(tmp_path, text, asked):
     path = tmp_path / "file.txt"
@@ -355,6 +357,15 @@ def test_a_line_of_counts_that_does_not_count(tmp_path):
     with pytest.raises(MeasurementError, match="--skip-lines 1"):
         import_map(path, DeclaredFormat(columns=("x", "y", "z", "Bx", "By", "Bz"),
                                         length_unit="mm", field_unit="T"))
+
+
+@pytest.mark.parametrize("mark", ",;\t")
+def test_whole_numbers_above_a_row_with_an_empty_cell_are_no_counts(tmp_path, mark):
+    """They were read as counts of points, so that a reading was lost."""
+    path = tmp_path / "file.txt"
+    path.write_text("x[mm],y[mm],z[mm],Bx[mT]\n1,2,3,100\n1,2,4,\n1,2,5,101\n".replace(",", mark))
+    found = import_map(path, DeclaredFormat()).data
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.1, 0.101])
 
 
 def test_a_centre_in_a_comment_says_how_to_use_it(tmp_path):

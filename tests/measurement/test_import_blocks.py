@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -186,6 +189,18 @@ def test_how_a_block_lies_is_not_guessed(tmp_path, asked):
         assert found.rotation_z_deg == (50.0,)
 
 
+def test_lengths_of_J_with_a_direction_and_diameters(tmp_path):
+    """J was taken along x beside its direction. Negative controls: without one, and by radius."""
+    text = ("x [mm];y [mm];z [mm];Diameter [mm];Height [mm];Br [T];{}\n0;0;0;30;10;1.3;0;1\n")
+    shape = {"fixed": {"shape": "cylinder"}}
+    with pytest.raises(MeasurementError, match="polarization_x.* 'Dir_x' and 'Dir_y'; the radius, "
+                                               r"half of 'Diameter .mm.' \(radius.0.5 mm"):
+        imported(tmp_path, text.format("Dir_x;Dir_y"), **shape)
+    found = imported(tmp_path, text.format("n;m"), columns=(
+        "at_x", "at_y", "at_z", "radius[0.5 mm]", "size_z", "polarization", "-", "-"), **shape)
+    assert (found.radius_m, found.remanence_T) == ((0.015,), (1.3,))
+
+
 @pytest.mark.parametrize(("header", "turn"), [
     ("Rot x (deg);Rot y (deg);Rot z (deg)", "0;0;50"),
     ("rotvec x (deg);rotvec y (deg);rotvec z (deg)", "30;40;50"),
@@ -332,3 +347,39 @@ def test_the_sheet_with_the_numbers_is_read(tmp_path):
     book.save(path)
     with pytest.warns(HalbachWarning, match="sheet 'Data' is read; 'Other' would have to be saved"):
         assert import_map(path, DeclaredFormat()).data.equals(found)
+
+
+def test_workbooks_whose_numbers_are_texts_with_decimal_commas(tmp_path):
+    """The option that the refusal advises had made it no table; numbers among them stay numbers."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, path = openpyxl.Workbook(), tmp_path / "map.xlsx"
+    for row in (["x", "y", "z", "Bx"], ["mm", "mm", "mm", "mT"], [1.5, 2, 3, "100,5"],
+                [1.5, 2, 4, "101,0"]):
+        book.active.append(row)
+    book.save(path)
+    with pytest.raises(MeasurementError, match="add --decimal-comma"):
+        import_map(path, DeclaredFormat())
+    found = import_map(path, DeclaredFormat(decimal_comma=True)).data
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.1005, 0.101])
+    np.testing.assert_allclose(found["x_m"], 0.0015)
+
+
+@pytest.mark.parametrize(("saved", "text"), [("", False), ("101", False), ("", True)])
+def test_a_formula_without_its_value_is_not_left_out(tmp_path, saved, text):
+    """Negative controls: one that was saved with its value, and an empty text."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, whole, path = openpyxl.Workbook(), tmp_path / "whole.xlsx", tmp_path / "map.xlsx"
+    for row in (["x [mm]", "y [mm]", "z [mm]", "Bx [mT]"], [1, 2, 3, 100], [1, 2, 4, "=D2+1"]):
+        book.active.append(row)
+    book.save(whole)
+    with zipfile.ZipFile(whole) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            content = re.sub(rb"</f><v\s*(?:/>|></v>)", b"</f><v>%s</v>" % saved.encode(),
+                             old.read(name))
+            new.writestr(name, content.replace(b'r="D3"', b'r="D3" t="str"') if text else content)
+    if saved or text:
+        found = import_map(path, DeclaredFormat()).data
+        assert found.sizes["point"] == (2 if saved else 1)
+        return
+    with pytest.raises(MeasurementError, match=r"the formula in D3 has no value.*as CSV"):
+        import_map(path, DeclaredFormat())

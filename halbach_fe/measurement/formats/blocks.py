@@ -70,6 +70,8 @@ WORDS = {word: name for name, words in _WORDS.items() for word in words.split()}
 """Quantities by the names of columns, without spaces and marks, in lower case."""
 WITHOUT_AXIS = ("length", "width")
 """Names of edges that do not say their axis; height and thickness are along z."""
+DIRECTION = re.compile(r"(?:mag(?:neti[sz]ation)?|easy|j|m)?(?:direction|dir|axis|u|n|e)[xyz]")
+"""Names, without spaces and marks, of columns of a direction beside a length of J."""
 TURN = re.compile(r"(?i)\W*(?:rot|turn|angle|phi|theta|euler|roll|pitch|yaw|tilt|azimuth|orient)")
 """Beginnings of names of columns that say how a block lies."""
 LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
@@ -160,7 +162,7 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
         table with positions makes no free blocks.
     """
     where = f"table of blocks {path}"
-    raw = text_of_table(file_bytes(path, where, workbooks=True), where)
+    raw = text_of_table(file_bytes(path, where, workbooks=True), where, declared.decimal_comma)
     table = _table(lines_of(raw, declared, where), declared, where)
     free = any(f"at_{axis}" in table for axis in COMPONENTS)
     missing = _missing(table, free)
@@ -352,7 +354,7 @@ def _missing(table: _Table, free: bool) -> list[str]:
          f"{strength}_y, {strength}_z along the axes of the block)"),
         *((free, f"{name[-1]} of each block (a column {name})") for name in places),
         (free and polar, "x and y of its angle (x = r cos(phi), y = r sin(phi))"),
-        *((free, text) for text in _unclear(table)),
+        *((True, text) for text in (_unclear(table) if free else [])),
         (free and "shape" not in table,
          f"the shape (--fixed shape=cuboid, or one of {', '.join(SIZES)})"),
         (not free and "sigma" not in table,
@@ -386,6 +388,17 @@ def _unclear(table: _Table) -> list[str]:
             "angles, degrees=True).as_rotvec(degrees=True))")
     if sizes:
         found.append(f"along which axes {_quoted(sizes)} lie (size_x, size_y, size_z in --columns)")
+    bases = {text: names.split_unit(text)[0].lower() for text in table.unknown}
+    along = [text for text, base in bases.items() if _strength(table) in table.cells
+             and DIRECTION.fullmatch(re.sub(r"[\W_]", "", base))]
+    if along:
+        strength = _strength(table)
+        found.append(f"{strength}_x, {strength}_y, {strength}_z: the products of its {strength}, "
+                     f"which alone is along x of the block, and {_quoted(along)}")
+    across = [text for text, base in bases.items() if base.strip().startswith("diam")]
+    if across and "radius" not in table:
+        found.append(f"the radius, half of {_quoted(across)} (radius[0.5 mm], if that is in mm, in "
+                     "--columns)")
     if other:
         found.append(f"how a block is turned by {_quoted(other)} (rotation_z in --columns, if that "
                      "is about z; - if it is not)")

@@ -67,6 +67,9 @@ CENTRE = re.compile(r"(?i)\b(?:cent(?:er|re)|origin)\b.*?\bx[\s=:]{0,3}([-+\d.e]
 COORDINATE = re.compile(
     r"(?i)([xyz])\s*[=:]\s*([-+\d.e]{1,30})\s*[\[(]?\s*([^\W\d]{1,12})?\W?")
 """A comment that is a coordinate of the rows below it."""
+JSON = re.compile(rb'\s*(?:\[\s*)?\{\s*"')
+KICKS = re.compile(r"(?i)\bkick[ _-]?(?:map|angles?)\b|\b(?:horizontal|vertical) kicks?\b")
+"""Words of the comments of a map of kicks, as tracking programs read it."""
 MAX_COUNTS = 4
 MAX_HEADER = 20_000
 """Number of characters of a line that are read as names of columns."""
@@ -83,6 +86,15 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         If there are no numbers, or lines of different length.
     """
     lines = [(number, undecorated(line)) for number, line in lines_of(raw, declared, where)]
+    if JSON.match(raw[:MAX_LINE]):
+        raise MeasurementError(must_be(
+            "content", where, "a table with lines of numbers", "JSON", "Write it with a row x, y, "
+            "z, Bx, By, Bz of numbers for each point, as CSV; in Python by pandas.DataFrame(...)"
+            ".to_csv('map.csv', index=False)."))
+    if any(KICKS.search(line[:MAX_LINE]) for _, line in lines[:20] if is_comment(line)):
+        raise MeasurementError(must_be(
+            "content", where, "readings of a field", "a map of kicks, which are integrals along "
+            "lines", "Import the map of the field from which it was made."))
     _refuse_limits_above(lines, where)
     if not declared.columns:
         _refuse_grid_above(lines[:4], where)
@@ -253,10 +265,11 @@ def _below_counts(
 ) -> int:
     """Return the index of the first row of readings: below a line of one to four counts."""
     rows = [index for index in range(start, len(lines)) if not is_comment(lines[index][1])][:2]
-    cells = [[cell for cell in cells_of(lines[index][1], delimiter_of(lines[index][1], declared))
-              if cell] for index in rows]
-    if len(rows) < 2 or len(cells[0]) == len(cells[1]) or len(cells[0]) > MAX_COUNTS or not all(
-            re.fullmatch(r"[1-9]\d{0,8}", cell) for cell in cells[0]):
+    whole = [cells_of(lines[index][1], delimiter_of(lines[index][1], declared)) for index in rows]
+    cells = [[cell for cell in row if cell] for row in whole]
+    if len(rows) < 2 or len(whole[0]) == len(whole[1]) or len(cells[0]) == len(cells[1]) or (
+            len(cells[0]) > MAX_COUNTS) or not all(
+                re.fullmatch(r"[1-9]\d{0,8}", cell) for cell in cells[0]):
         return start
     return rows[1]
 

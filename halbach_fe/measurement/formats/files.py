@@ -84,7 +84,7 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
         or which options to add.
     """
     where = f"map {path}"
-    raw = text_of_table(file_bytes(path, where, workbooks=True), where)
+    raw = text_of_table(file_bytes(path, where, workbooks=True), where, declared.decimal_comma)
     if not name and (own := _own(path, raw, declared)) is not None:
         return _with_doubt(own, declared)
     name = name or format_of(raw, declared, where)

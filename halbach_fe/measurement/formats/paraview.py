@@ -34,8 +34,8 @@ OF_B = re.compile(r"(?i)(?:magnetic[ _]?)?(?:b|b?[ _]?field|flux[ _]?density)(?:
 """Names of a vector that is B: B, B_field, magnetic flux density (e of Elmer's elements)."""
 SIZES = re.compile(
     rb"(?i)\b(?:DIMENSIONS|POINTS|[XYZ]_COORDINATES|CELLS|CELL_TYPES|(?:POINT|CELL)_DATA|"
-    rb"\S{1,80}[ \t]+\d{1,4}(?=[ \t]+\d+[ \t]+(?:double|float|unsigned|int|long|short|char|vtk)))"
-    rb"[ \t]+((?:\d{1,18}[ \t]*){1,3})")
+    rb"\S{1,80}[ \t]{1,8}\d{1,4}(?=[ \t]{1,8}\d{1,30}[ \t]{1,8}[a-z]))"
+    rb"[ \t]{1,8}((?:\d{1,18}[ \t]{0,8}){1,3})")
 """Counts that a legacy file states of what it holds, of a grid along its axes; the last are arrays
 of its FIELD."""
 
@@ -53,11 +53,9 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
     MeasurementError
         If the file cannot be read, or neither it nor the user says which vector is B.
     """
-    claimed = max((prod(map(int, found[1].split())) if found[0][:1] in b"Dd" else max(
-        map(int, found[1].split())) for found in SIZES.finditer(raw)), default=0)
     try:
-        if raw.startswith(LEGACY) and claimed > len(raw):  # meshio makes room for what is claimed
-            raise ValueError(claimed)
+        if raw.startswith(LEGACY) and _claimed(raw) > len(raw):  # meshio makes room for all of it
+            raise ValueError(len(raw))
         with tempfile.NamedTemporaryFile(suffix=".vtk" if raw.startswith(LEGACY) else ".vtu") as at:
             at.write(raw)
             at.flush()
@@ -84,3 +82,11 @@ def read(raw: bytes, declared: DeclaredFormat, where: str) -> ForeignTable:
         columns += [ColumnName(f"{printable(name, 40)} {axis}", quantity, split_unit(name)[1])
                     for axis, quantity in zip(COMPONENTS, of, strict=True)]
     return ForeignTable(tuple(columns), np.hstack([points, *vectors.values()]), where)
+
+
+def _claimed(raw: bytes) -> int:
+    """Return the largest number of points or cells that a legacy file says to hold."""
+    stated = ((found[0], [int(count) for count in found[1].split()])
+              for found in SIZES.finditer(raw))
+    return max((prod(counts) if text[:1] in b"Dd" else max(counts) for text, counts in stated),
+               default=0)

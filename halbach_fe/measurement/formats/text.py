@@ -118,7 +118,7 @@ def _without_end(line: str) -> str:
     return row if len(re.split(r"[ \t,]+", row.lstrip())) > 2 else line
 
 
-def text_of_table(raw: bytes, where: str) -> bytes:
+def text_of_table(raw: bytes, where: str, decimal_comma: bool) -> bytes:
     """Return the content of a file, of a workbook its first sheet with rows of numbers as CSV.
 
     If others have such rows too, a warning says which was read.
@@ -131,7 +131,7 @@ def text_of_table(raw: bytes, where: str) -> bytes:
     if workbook_in(raw) is None:
         return raw
     try:
-        text, sheet, others = untrusted.sheet_text(raw)
+        text, sheet, others = untrusted.sheet_text(raw, decimal_comma)
     except ValueError as error:
         raise MeasurementError(must_be(
             "content", where, "an Excel workbook that is whole", f"'{error}'",
