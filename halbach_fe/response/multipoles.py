@@ -402,9 +402,10 @@ def circle_models(
 
     They include all orders that the readings resolve, the main order too, in units of the main
     multipole on the circle of the same radius that is nearest to z = 0. The list is empty if the
-    study reads no full circles, if that main multipole is no larger than its error bar, as between
-    the poles of an undulator, or if its instrument changes or moves the readings: these are then
-    not on circles about the magnet's axis, or at other z than the map states.
+    study reads no full circles; if that main multipole is no larger than its error bar or than 3 %
+    of the largest at other z, as between the poles of an undulator; or if its instrument changes or
+    moves the readings: these are then not on circles about the magnet's axis, or at other z than
+    the map states.
 
     The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
     also contains (aliases with) order m - n, which the blocks' field in vacuum tells: it is
@@ -426,7 +427,10 @@ def circle_models(
         reference = by_z[min(by_z, key=abs)][main - 1:main]
         fixed = _complexes(_seen(middle, model.offset))[main - 1:main]
         try:
-            turn = _turn(magnet, reference[0], model, _circle_error(middle, model.error)[main - 1])
+            # between the poles of an undulator 0.5 % of the largest were left of mesh and columns
+            least = 0.03 * max(abs(row[main - 1] @ model.nominal) for row in by_z.values())
+            turn = _turn(magnet, reference[0], model, max(
+                least, _circle_error(middle, model.error)[main - 1]))
         except StudyError:
             continue
         order = np.array([main, *orders])
@@ -519,7 +523,7 @@ def _complexes(values: Floats) -> Complexes:
     return values[half:] + 1j * values[:half]
 
 
-def _turn(magnet: Magnet, row: Complexes, model: Response, error_T: float = 0.0) -> float:
+def _turn(magnet: Magnet, row: Complexes, model: Response, least_T: float = 0.0) -> float:
     """Return the angle in rad of the nominal main multipole about z.
 
     ``row`` (parameters,) is the row of the main multipole in the matrix from magnetizations to C.
@@ -527,11 +531,11 @@ def _turn(magnet: Magnet, row: Complexes, model: Response, error_T: float = 0.0)
     Raises
     ------
     StudyError
-        If the main multipole of the nominal magnet vanishes, or is no larger than its error bar.
+        If the main multipole of the nominal magnet vanishes, or is no larger than ``least_T``.
     """
     own = row @ model.nominal
     scale = np.abs(row).sum() * np.abs(model.nominal).max()
-    if not abs(own) > max(NOTHING_THERE * scale, error_T):
+    if not abs(own) > max(NOTHING_THERE * scale, least_T):
         raise StudyError(must_be(
             "`array`", f"study {magnet.name}",
             f"that of a magnet with a multipole of order {magnet.array.multipole_order}",

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
@@ -80,17 +81,19 @@ def reaction_field(magnet: TrueMagnet, points: Floats, elements: Elements | None
     with import_extra("ngsolve").TaskManager():
         mesh = mesh_of(magnet, points, elements)
         potential = solve_potential(magnet, mesh, elements.order or {2: 5, 3: 3}[size])
-        places, moments = _response(magnet, mesh, potential)
+        places, moments = _response(magnet, mesh, potential, points[:, :size])
     field = np.zeros((len(points), 3))
     field[:, :size] = moment_field(places, moments, points[:, :size])
     return field
 
 
-def _response(magnet: TrueMagnet, mesh: Any, potential: Any) -> tuple[Floats, Floats]:
-    """Return the dipoles that represent the materials' response.
+def _response(magnet: TrueMagnet, mesh: Any, potential: Any, points: Floats
+              ) -> tuple[Floats, Floats]:
+    """Return the dipoles that represent the materials' response at points (m, d) in m.
 
     These are their positions (n, d) in m, which are the quadrature points of the elements, and mu_0
-    times their moments (n, d) in T m^d.
+    times their moments (n, d) in T m^d. Near points, relative to the elements, take a rule of three
+    times the order: 2 mm off plates, elements of 7 mm made 5.9 mT of 67 mT wrong without it.
     """
     ngs, size = import_extra("ngsolve"), magnet.dimension
     field = -ngs.grad(potential)
@@ -101,15 +104,26 @@ def _response(magnet: TrueMagnet, mesh: Any, potential: Any) -> tuple[Floats, Fl
         polarization = polarization + mesh.MaterialCF({region: 1.0}, default=0.0) * (
             permeability(law, field * field) - 1) * field
     kind = ngs.TRIG if size == 2 else ngs.TET
-    rule = ngs.IntegrationRule(kind, 2 * (potential.space.globalorder - 1))
     responding = mesh.Materials("|".join([*laws, *(
         f"block{number}" for number, body in enumerate(magnet.all_bodies)
         if not body.is_vacuum)]))
-    where = mesh.MapToAllElements({kind: rule}, responding)
-    places = np.array(ngs.CF((ngs.x, ngs.y, ngs.z)[:size])(where))
-    jacobian = np.array(ngs.specialcf.JacobianMatrix(size, size)(where)).reshape(-1, size, size)
-    weights = np.resize(rule.weights, len(places)) * np.abs(np.linalg.det(jacobian))
-    return places, np.array(polarization(where)) * weights[:, None]
+
+    def dipoles(order: int) -> tuple[Floats, Floats, Floats]:
+        """Return positions, moments, and the edges of the elements in m."""
+        rule = ngs.IntegrationRule(kind, order)
+        where = mesh.MapToAllElements({kind: rule}, responding)
+        places = np.array(ngs.CF((ngs.x, ngs.y, ngs.z)[:size])(where))
+        jacobian = np.array(ngs.specialcf.JacobianMatrix(size, size)(where)).reshape(
+            -1, size, size)
+        volume = np.abs(np.linalg.det(jacobian))
+        weights = np.resize(rule.weights, len(places)) * volume
+        return places, np.array(polarization(where)) * weights[:, None], volume**(1 / size)
+
+    order, near = 2 * (potential.space.globalorder - 1), 1.5
+    places, moments, sizes = dipoles(order)
+    if (KDTree(points).query(places)[0] < near * sizes).any():
+        places, moments, _ = dipoles(3 * order)
+    return places, moments
 
 
 def moment_field(places: Floats, moments: Floats, points: Floats) -> Floats:

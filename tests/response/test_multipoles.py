@@ -367,6 +367,10 @@ def test_a_main_multipole_that_is_lost_in_the_error_is_no_unit():
     for error, found in ((0.1, 4), (2.0, 0)):  # each of a component of B
         assert len(solved_circles(magnet, points, field, np.full(field.size, error * main))
                    ) == found
+    middle = np.abs(points[:, 2]) < 1e-9
+    for factor, found in ((0.1, 4), (0.01, 0)):  # of the field in the middle alone
+        weak = np.where(middle[:, None], factor, 1.0) * field
+        assert len(solved_circles(magnet, points, weak, np.zeros(field.size))) == found
 
 
 @pytest.mark.parametrize("quantity", ["flux_density", "fourier_coefficients"])
