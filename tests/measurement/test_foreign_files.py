@@ -368,6 +368,31 @@ def test_whole_numbers_above_a_row_with_an_empty_cell_are_no_counts(tmp_path, ma
     np.testing.assert_allclose(found["B_T"][:, 0], [0.1, 0.101])
 
 
+@pytest.mark.parametrize(("again", "refused"), [
+    (HEADER, False), (HEADER.replace("T", "mT"), True), ("x,y,z,Bx,By,Bz\n", False),
+    ("z[mm],y[mm],x[mm],Bx[T],By[T],Bz[T]\n", True), ("second scan, from z = 0\n", False)])
+def test_a_header_that_comes_again_is_the_same(tmp_path, again, refused):
+    """Rows below another one were read in the units of the first."""
+    path, rows = tmp_path / "file.txt", table(",").splitlines(True)
+    path.write_text("".join(["#", HEADER, *rows[:20], "#", again, *rows[20:]]))
+    if not refused:
+        assert same(import_map(path, DeclaredFormat()).data)
+        return
+    with pytest.raises(MeasurementError, match=r"line 22 .* a header as that above the table"):
+        import_map(path, DeclaredFormat())
+
+
+@pytest.mark.parametrize("counts", ["45", "3 3 5"])
+def test_counts_above_a_header(tmp_path, counts):
+    """The header was counted as a row. Negative control: a count of other rows."""
+    path = tmp_path / "file.txt"
+    path.write_text(f"{counts}\n" + HEADER.replace(",", " ") + table(" "))
+    assert same(import_map(path, DeclaredFormat()).data)
+    path.write_text(f"{counts}\n" + HEADER.replace(",", " ") + table(" ") + "9 9 9 0 0 0\n")
+    with pytest.raises(MeasurementError, match="counts of the 46 rows"):
+        import_map(path, DeclaredFormat())
+
+
 def test_a_centre_in_a_comment_says_how_to_use_it(tmp_path):
     path = tmp_path / "file.txt"
     lab = mm_T()

@@ -121,6 +121,7 @@ def read_lines(lines: Sequence[Line], declared: DeclaredFormat, where: str) -> F
             "--columns", where, f"of {count} columns, as the file has", len(declared.columns),
             joining(each, body[0][0], delimiter) + " Else name each column; - ignores a column."))
     columns = _header(preface, count, delimiter, "" if declared.columns else where)
+    _refuse_other_header(body, columns, delimiter, where)
     own = {column.text for column in columns} <= OWN_COLUMNS
     stated = [names.parse(text, stated=True) for text in declared.columns] or columns
     known = {column.quantity for column in stated}
@@ -264,7 +265,10 @@ def _below_counts(
     lines: Sequence[Line], start: int, declared: DeclaredFormat, where: str
 ) -> int:
     """Return the index of the first row of readings: below a line of one to four counts."""
-    rows = [index for index in range(start, len(lines)) if not is_comment(lines[index][1])][:2]
+    rows = [index for index in range(start, len(lines)) if not is_comment(lines[index][1])][:3]
+    if len(rows) > 2 and not numbers_among(cells_of(  # a header between counts and rows
+            lines[rows[1]][1], delimiter_of(lines[rows[1]][1], declared))):
+        del rows[1]
     whole = [cells_of(lines[index][1], delimiter_of(lines[index][1], declared)) for index in rows]
     cells = [[cell for cell in row if cell] for row in whole]
     if len(rows) < 2 or len(whole[0]) == len(whole[1]) or len(cells[0]) == len(cells[1]) or (
@@ -396,6 +400,24 @@ def _header(
             if where:
                 _refuse_other_length(line, number, count, delimiter, where)
     return plain or (ColumnName(""),) * count
+
+
+def _refuse_other_header(
+    body: Sequence[Line], columns: Sequence[ColumnName], delimiter: str | None, where: str
+) -> None:
+    """Raise MeasurementError if a comment among the rows names other columns or units than the
+    header, which holds for rows above the comment alone.
+    """
+    for number, line in body if any(column.quantity for column in columns) else ():
+        other = _header([(number, line)], len(columns), delimiter, "") if is_comment(line) else ()
+        if any(one.quantity for one in other) and any(
+                one.quantity != column.quantity or (
+                    one.unit and unit_symbol(one.unit) != unit_symbol(column.unit))
+                for one, column in zip(other, columns, strict=True)):
+            raise MeasurementError(must_be(
+                f"line {number}", where, "a header as that above the table, if one comes again",
+                f"'{printable(line.strip(), 80)}'", "Write the rows below it as a file of their "
+                "own; several maps are several files."))
 
 
 def _splits(line: str, delimiter: str | None) -> list[list[str]]:
