@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise, product
 from math import factorial
 from typing import Literal
@@ -627,16 +628,16 @@ def extremes(
                 own = np.flatnonzero(best == start)
                 value[own] = np.maximum(value[own], _climbed(
                     region, unit, int(start), steps[start], fields[..., own],
-                    lambda field, sign=sign: sign * _size(field, told)))
+                    partial(_size, told=told, sign=sign)))
                 near = np.linalg.norm((unit - unit[start]) / steps[start], axis=1) <= 2
                 left[np.ix_(near, own)] = -np.inf
         found.append(sign * value)
     return found[0], found[1]
 
 
-def _size(fields: Floats, told: Floats | None) -> Floats:
-    """Return |B| (n, d) of fields (n, 3, d), or the size of the part that a projector tells."""
-    return np.asarray(np.linalg.norm(fields if told is None else told @ fields, axis=1))
+def _size(fields: Floats, told: Floats | None, sign: float = 1.0) -> Floats:
+    """Return ``sign`` |B| (n, d) of fields (n, 3, d), or of the part that a projector tells."""
+    return sign * np.asarray(np.linalg.norm(fields if told is None else told @ fields, axis=1))
 
 
 def _climbed(
