@@ -249,7 +249,7 @@ def columns(note: Note) -> None:
     solved, field, _, seconds = solved_with_bars(magnet, points)
     began = spent()
     column = separate_columns(magnet, points, solved.iron)
-    total = sum(column(number, slice(None))[..., 1] * 1.2 for number in range(100))
+    total = np.sum([column(number, slice(None))[..., 1] * 1.2 for number in range(100)], axis=0)
     note("iron_any.columns_time_over_field", (spent() - began) / seconds, "ratio",
          "all columns of 100 blocks, over one field with bars, processor time")
     common.say(f"the columns add up to {rms(total) / rms(field):.3f} of the field that iron and "
