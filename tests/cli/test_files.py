@@ -160,6 +160,8 @@ def test_pages_name_the_maps_that_they_are_of(study, measured, tmp_path):
         assert main([verb, *with_map, "-o", str(tmp_path / verb), "--json"]) == 0
         found = provenance_of(tmp_path / verb)
         assert (found["study file"], found["measurements"]) == (said(study), said(measured))
+    shown = (tmp_path / "infer" / "report.html").read_text()
+    assert f'<p class="small">study file {study.name}</p>' in shown  # it has no description
     posterior = tmp_path / "infer" / "posterior.h5"
     copied = tmp_path / "copy.h5"
     copied.write_bytes(posterior.read_bytes())
