@@ -21,9 +21,9 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.axisymmetric_iron import solve_iron
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.formulation_choice import finite_element_part
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.iron_modes import Resolution
+from halbach_fe.solver.routes import finite_element_part
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 

@@ -18,10 +18,10 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.nonlinear import newton_readings, nonlinear_model
 from halbach_fe.solver import getdp as runner
-from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, vacuum_part
 from halbach_fe.solver.getdp import find_getdp
 from halbach_fe.solver.magnetostatics import CROSS_SECTION, RunRequest, fill_run_folder
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
+from halbach_fe.solver.routes import choose_route, finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.study.model import Study

@@ -20,8 +20,8 @@ from halbach_fe.response.discretization_error import reading_errors, refined, ve
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.azimuthal_modes import solve_modes
-from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.study.model import Study

@@ -33,8 +33,8 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.resource_estimate import estimate_infer
 from halbach_fe.solver.azimuthal_modes import solve_modes
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import nominal_prior
 from halbach_fe.study.model import Study

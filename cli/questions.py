@@ -56,7 +56,7 @@ def solve(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
     """
     from halbach_fe.core.pace import duration
     from halbach_fe.response.solution import study_observation
-    from halbach_fe.solver.formulation_choice import choose_route
+    from halbach_fe.solver.routes import choose_route
     from halbach_fe.solver.session import newton_history
 
     started = time.monotonic()

@@ -166,8 +166,8 @@ def solve_error(getdp: GetDP, method: str) -> float:
     """Return the error of a 2D solve of a dipole with an iron ring, relative to its bore field."""
     import numpy as np
 
-    from halbach_fe.solver.formulation_choice import solve_nominal
     from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
+    from halbach_fe.solver.routes import solve_nominal
     from halbach_fe.study.reader import parse_study
 
     inner, outer, mu, iron = 0.1, 0.18, 1.05, (0.19, 0.21, 500.0)

@@ -34,7 +34,7 @@ from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import study_prior
 from halbach_fe.response.homogeneity import Region, default_region, homogeneity_model, region_points
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.formulation_choice import check_points
+from halbach_fe.solver.routes import check_points
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import posterior

@@ -35,7 +35,7 @@ from halbach_fe.response.homogeneity import (
     slices_of,
 )
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
+from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.grades import grade
 from halbach_fe.study.model import Study

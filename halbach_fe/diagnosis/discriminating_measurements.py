@@ -42,7 +42,7 @@ from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
 from halbach_fe.measurement.campaign import Data
 from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.inference import PROBE_KEYS

@@ -20,8 +20,8 @@ from halbach_fe.diagnosis.result import IdentifiedEffect
 from halbach_fe.diagnosis.scene import Campaign, FieldAt, Scene
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.result import InferenceResult
-from halbach_fe.solver.formulation_choice import iron_change, solve_nominal
 from halbach_fe.solver.mesh import with_rough_mesh
+from halbach_fe.solver.routes import iron_change, solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import FIELD_KEYS, Study

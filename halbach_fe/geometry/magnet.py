@@ -38,7 +38,7 @@ from halbach_fe.study.materials import Curve
 from halbach_fe.study.model import MAGNET_KEYS, Study, curve_of, is_nonlinear
 from halbach_fe.study.types import COMPONENTS, look_like_mm
 
-SOLVED_BY = "halbach_fe.solver.formulation_choice"
+SOLVED_BY = "halbach_fe.solver.routes"
 """The module that solves for the field of a magnet."""
 
 SQUEEZED = 0.1

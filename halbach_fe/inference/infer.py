@@ -59,7 +59,7 @@ from halbach_fe.response.block_variation import (
 )
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.response.nonlinear import newton_readings
-from halbach_fe.solver.formulation_choice import choose_route, field_function, solve_nominal
+from halbach_fe.solver.routes import choose_route, field_function, solve_nominal
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.stats import linear_gaussian
 from halbach_fe.stats.gaussian import Gaussian

@@ -73,7 +73,7 @@ from halbach_fe.measurement.observation import (
 )
 from halbach_fe.measurement.reading_noise import reading_noise
 from halbach_fe.response.block_variation import Deviations, study_prior
-from halbach_fe.solver.formulation_choice import field_function
+from halbach_fe.solver.routes import field_function
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, largest_directions, root_matrix
 from halbach_fe.study.measurement import Instrument

@@ -36,7 +36,7 @@ from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.inference_answer import distances
 from halbach_fe.report.words import bayes_factor, decimals, in_a_row
-from halbach_fe.solver.formulation_choice import Route, choose_route, finer_in_words
+from halbach_fe.solver.routes import Route, choose_route, finer_in_words
 
 COORDINATES = {
     "z": "z", "angle": "the azimuth", "radius": "the radius", "time": "the time",

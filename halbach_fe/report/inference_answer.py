@@ -20,7 +20,7 @@ from halbach_fe.report.words import (
     rms,
     with_error,
 )
-from halbach_fe.solver.formulation_choice import finer_in_words
+from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.types import COMPONENTS
 
 LOOK = ("Look for what the study lacks. (Before that, halbach-fe check tests the map by itself, "

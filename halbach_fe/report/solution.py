@@ -49,7 +49,7 @@ from halbach_fe.report.words import (
 )
 from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution, write_solution
-from halbach_fe.solver.formulation_choice import finer_in_words
+from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.types import COMPONENTS
 
 COLOURS = (POSTERIOR, PRIOR, SECOND)

@@ -53,7 +53,7 @@ from halbach_fe.response.discretization_error import (
     STEPS,
     Verification,
 )
-from halbach_fe.solver.formulation_choice import finer_in_words
+from halbach_fe.solver.routes import finer_in_words
 
 COLOURS = (THIRD, PRIOR, POSTERIOR, PUBLISHED, SECOND, MEASURED)
 MARKERS = ("v", "^", "o", ".", "s", "x")

@@ -36,7 +36,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import Observation
 from halbach_fe.solver.exact_block_field import field_of, unit_fields
-from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
+from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior, root_matrix, stacked_root
 from halbach_fe.study.materials import MU_0

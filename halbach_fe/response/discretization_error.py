@@ -21,14 +21,14 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.reading_noise import noise_regions
 from halbach_fe.solver.azimuthal_modes import modes_needed, solve_modes
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.formulation_choice import (
+from halbach_fe.solver.mesh import meridian_size
+from halbach_fe.solver.routes import (
     ElementFields,
     Route,
     choose_route,
     finite_element_part,
     solve_nominal,
 )
-from halbach_fe.solver.mesh import meridian_size
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 from halbach_fe.study.measurement import FourierCoefficients
 from halbach_fe.study.model import CELLS_PER_SIDE
@@ -80,7 +80,7 @@ def _cells(cells: int, factor: float) -> int:
 def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
     """Return the magnet with the boundary farther away by a factor.
 
-    ``mesh`` is the kind of mesh, see `halbach_fe.solver.formulation_choice.Route.mesh`.
+    ``mesh`` is the kind of mesh, see `halbach_fe.solver.routes.Route.mesh`.
     """
     end = magnet.half_length
     update = {"radius_m": factor * boundary_radius(magnet, mesh)}
@@ -211,7 +211,7 @@ class Verification(ShownInNotebook):
     magnet : Magnet
     route : str
         Formulation by which the field is solved, see
-        `halbach_fe.solver.formulation_choice.choose_route`.
+        `halbach_fe.solver.routes.choose_route`.
     differences : tuple of Difference
         Between the much coarser and the coarser mesh, the coarser and the study's, the study's and
         the finer mesh, and the nearer and the farther boundary; then to the dual formulation if the

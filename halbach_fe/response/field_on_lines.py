@@ -38,7 +38,7 @@ from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.axisymmetric_iron import excess_of
 from halbach_fe.solver.exact_block_field import external_field, field_of, unit_fields
-from halbach_fe.solver.formulation_choice import check_plane, check_points, finite_element_part
+from halbach_fe.solver.routes import check_plane, check_points, finite_element_part
 from halbach_fe.solver.separate_blocks import (
     SeparateReaction,
     applies,

@@ -35,7 +35,7 @@ from halbach_fe.measurement.observation import flux_density_at
 from halbach_fe.response.block_variation import Deviations, distribution_of, with_magnetizations
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.multipoles import NOTHING_THERE, Complexes
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session, alone
 from halbach_fe.stats.gaussian import Gaussian
 

@@ -39,7 +39,7 @@ from halbach_fe.response.block_variation import (
 )
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
-from halbach_fe.solver.formulation_choice import (
+from halbach_fe.solver.routes import (
     SUPERPOSITION_TOLERANCE,
     ElementFields,
     check_points,
@@ -218,7 +218,7 @@ def response_matrix(
 def _serves(similar: Magnet, magnet: Magnet, points: Floats, session: Session) -> bool:
     """Tell whether the cache has what a similar magnet's blocks add to the field at any points.
 
-    See `halbach_fe.solver.formulation_choice.runs_serve_other_points`.
+    See `halbach_fe.solver.routes.runs_serve_other_points`.
     """
     alike = [[(block.ring, block.slot, block.angle_deg) for block in each.blocks]
              for each in (similar, magnet)]

@@ -42,15 +42,15 @@ from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.matrix import Response, response_matrix
 from halbach_fe.solver.dofs import check_difference, factorize
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
-from halbach_fe.solver.formulation_choice import (
+from halbach_fe.solver.interpolation import locate, quadrature
+from halbach_fe.solver.magnetostatics import assemble, solve_samples
+from halbach_fe.solver.routes import (
     Route,
     check_points,
     choose_route,
     finite_element_part,
     vacuum_part,
 )
-from halbach_fe.solver.interpolation import locate, quadrature
-from halbach_fe.solver.magnetostatics import assemble, solve_samples
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.gaussian import Gaussian, nominal_prior
 from halbach_fe.study.materials import MU_0, ConstitutiveLaw

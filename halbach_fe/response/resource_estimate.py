@@ -35,14 +35,9 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors, variants_to_compare
 from halbach_fe.response.matrix import LOADED_BYTES
 from halbach_fe.solver.azimuthal_modes import is_axisymmetric, meridian_points, mode_decay
-from halbach_fe.solver.formulation_choice import (
-    Route,
-    check_points,
-    choose_route,
-    finite_element_part,
-)
 from halbach_fe.solver.magnetostatics import check_inside
 from halbach_fe.solver.moments.cells import cells_of
+from halbach_fe.solver.routes import Route, check_points, choose_route, finite_element_part
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.stats.linear_gaussian import NUMBERS_AT_ONCE, READINGS_AT_ONCE
 from halbach_fe.study.model import CELLS_PER_SIDE
@@ -126,7 +121,7 @@ class Problem:
     what : str
         Purpose of the mesh; all runs on the same mesh may go side by side.
     route : str
-        Formulation, see `halbach_fe.solver.formulation_choice.choose_route`.
+        Formulation, see `halbach_fe.solver.routes.choose_route`.
     elements, unknowns : int
         Numbers of elements and unknowns of each run.
     processes : int

@@ -19,7 +19,7 @@ from halbach_fe.measurement.observation import Observation, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.discretization_error import reading_errors
 from halbach_fe.response.stray_field import StrayField, stray_field
-from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
+from halbach_fe.solver.routes import check_points, finite_element_part, vacuum_part
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 
 

@@ -102,7 +102,7 @@ class Formulation:
     law : str
         Law of the iron's curve that enters the weak form: ``reluctivity`` or ``permeability``.
     route : str
-        Name of the route, see `halbach_fe.solver.formulation_choice.choose_route`.
+        Name of the route, see `halbach_fe.solver.routes.choose_route`.
     """
 
     problem: str

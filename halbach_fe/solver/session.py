@@ -49,7 +49,7 @@ class RunSize:
     Attributes
     ----------
     route : str
-        Route of the solve, see `halbach_fe.solver.formulation_choice.choose_route`.
+        Route of the solve, see `halbach_fe.solver.routes.choose_route`.
     elements, unknowns : int
     solves : int
         Number of linear solves, without those of Newton's steps, whose number is not known in

@@ -26,7 +26,7 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.page import write_files
 from halbach_fe.report.plan import page, plan_summary
 from halbach_fe.response.matrix import Response, response_matrix
-from halbach_fe.solver.formulation_choice import gateaux_derivative
+from halbach_fe.solver.routes import gateaux_derivative
 from halbach_fe.solver.session import Session
 from halbach_fe.study.model import Study, curve_of
 from halbach_fe.study.reader import read_study

@@ -12,7 +12,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, points_of
 from halbach_fe.measurement.instrument import in_si_and_magnet_axes, nonlinear_part, sensor_model
 from halbach_fe.solver.exact_block_field import external_field, field_of
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle

@@ -29,7 +29,7 @@ from halbach_fe.diagnosis.result import FoundPose
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, read_map, write_map
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.measurement import Instrument

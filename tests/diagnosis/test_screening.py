@@ -23,9 +23,9 @@ from halbach_fe.diagnosis.model_selection import (
 from halbach_fe.diagnosis.nominal_fields import NominalFields
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import unit_fields
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.mesh import with_rough_mesh
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed, circle

@@ -50,10 +50,10 @@ from halbach_fe.response.matrix import Response, StoredMatrix, _beside
 from halbach_fe.response.matrix import _read as read_response
 from halbach_fe.response.matrix import _write as write_response
 from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
-from halbach_fe.solver.formulation_choice import finite_element_part
 from halbach_fe.solver.getdp import GetDP, Job, _check_log, find_getdp, read_vectors
 from halbach_fe.solver.getdp_cache import MANIFEST, Cache, Kept, Manifest
 from halbach_fe.solver.mesh import MeshFiles, build_mesh, verify_mesh
+from halbach_fe.solver.routes import finite_element_part
 from halbach_fe.solver.session import Session, newton_residuals
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, nominal_prior
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS

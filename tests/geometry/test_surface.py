@@ -20,7 +20,7 @@ from halbach_fe.report.solution import answer
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.solution import solve, study_observation
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
-from halbach_fe.solver.formulation_choice import check_points
+from halbach_fe.solver.routes import check_points
 from halbach_fe.study.materials import MU_0
 from halbach_fe.study.reader import parse_study
 from tests.conftest import DIPOLE, changed

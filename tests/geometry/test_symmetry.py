@@ -9,7 +9,7 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import SymmetryImage, no_symmetry, symmetry_of, unique_points
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
-from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
+from halbach_fe.solver.routes import choose_route, finite_element_part
 from tests.conftest import circle
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

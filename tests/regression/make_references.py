@@ -10,8 +10,8 @@ from pathlib import Path
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import field_map, write_map
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import find_getdp
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from tests.regression.cases import CASES, FOLDER, points_of_case
 

@@ -7,7 +7,7 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.field_map import read_map
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.study.reader import parse_study
 from tests.conftest import changed
 from tests.regression.cases import CASES, FOLDER, difference, points_of_case, tolerance

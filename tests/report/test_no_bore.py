@@ -19,7 +19,7 @@ from halbach_fe.report.page import write_files
 from halbach_fe.report.words import in_one_line, magnet_rows
 from halbach_fe.response.multipoles import MultipoleReference, multipole_model
 from halbach_fe.response.solution import solve
-from halbach_fe.solver.formulation_choice import finer_in_words
+from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.reader import parse_study
 
 

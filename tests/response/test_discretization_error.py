@@ -15,8 +15,8 @@ from halbach_fe.response import discretization_error
 from halbach_fe.response.discretization_error import farther, reading_errors, refined
 from halbach_fe.solver import azimuthal_modes
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.formulation_choice import check_points, finite_element_part, vacuum_part
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
+from halbach_fe.solver.routes import check_points, finite_element_part, vacuum_part
 from halbach_fe.study.reader import parse_study
 from tests.conftest import changed, circle
 

@@ -15,8 +15,8 @@ from halbach_fe.report.page import write_report
 from halbach_fe.report.verification import answer
 from halbach_fe.report.words import decimals, flux_density, ppm, relative
 from halbach_fe.response.discretization_error import observed_order, refined, verify
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
+from halbach_fe.solver.routes import solve_nominal
 from tests.support.pages import page
 
 IRON = {"inner_radius_m": 0.19, "outer_radius_m": 0.2, "relative_permeability": 1000.0}

@@ -30,7 +30,6 @@ from halbach_fe.response.nonlinear import (
     compare_with_newton,
     nonlinear_model,
 )
-from halbach_fe.solver.formulation_choice import finite_element_part, vacuum_part
 from halbach_fe.solver.magnetostatics import (
     CROSS_SECTION,
     nominal_samples,
@@ -39,6 +38,7 @@ from halbach_fe.solver.magnetostatics import (
 )
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
+from halbach_fe.solver.routes import finite_element_part, vacuum_part
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import ConstitutiveLaw
 from halbach_fe.study.model import Study

@@ -18,8 +18,8 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.response import resource_estimate
 from halbach_fe.response.discretization_error import reading_errors, refined
 from halbach_fe.solver import mesh
-from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
 from halbach_fe.solver.getdp import run
+from halbach_fe.solver.routes import choose_route, finite_element_part
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import ROOT

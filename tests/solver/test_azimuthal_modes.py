@@ -14,11 +14,11 @@ from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver import azimuthal_modes
 from halbach_fe.solver.exact_block_field import field_of, unit_field
-from halbach_fe.solver.formulation_choice import choose_route, finite_element_part, solve_nominal
 from halbach_fe.solver.getdp import run
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.mesh import build_meridian, verify_mesh
 from halbach_fe.solver.ring_harmonics_2d import ideal_sectors, layered_bore_field
+from halbach_fe.solver.routes import choose_route, finite_element_part, solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.materials import MU_0
 from tests.conftest import circle

@@ -23,8 +23,8 @@ from halbach_fe.core.errors import ExtraMissingError, GetDPError, SchedulerError
 from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.dask_cluster import Cluster, connected
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import ENVIRONMENT_VARIABLE
+from halbach_fe.solver.routes import solve_nominal
 from tests.conftest import ROOT, circle
 
 POINTS = circle(0.07, 8)

@@ -13,10 +13,10 @@ from halbach_fe.core.errors import GetDPError, PointsOutsideError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import magnetostatics
 from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
-from halbach_fe.solver.formulation_choice import finite_element_part
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.interpolation import coordinates, locate, probes_of, shape_functions
 from halbach_fe.solver.mesh import build_meridian, build_mesh, verify_mesh
+from halbach_fe.solver.routes import finite_element_part
 from halbach_fe.solver.session import Session
 from tests.conftest import circle
 

@@ -15,7 +15,6 @@ import pytest
 
 from halbach_fe.core.errors import GetDPError, GetDPNotFoundError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import (
     ENVIRONMENT_VARIABLE,
     GetDP,
@@ -36,6 +35,7 @@ from halbach_fe.solver.magnetostatics import (
     fill_run_folder,
 )
 from halbach_fe.solver.mesh import build_mesh, verify_mesh
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from tests.conftest import circle
 

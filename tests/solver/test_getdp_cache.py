@@ -21,7 +21,6 @@ from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
 from halbach_fe.core.files import remove_orphans, temporary_name
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import getdp_cache as module
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import run
 from halbach_fe.solver.getdp_cache import (
     FOLDER_VARIABLE,
@@ -31,6 +30,7 @@ from halbach_fe.solver.getdp_cache import (
     Cache,
     default_cache,
 )
+from halbach_fe.solver.routes import solve_nominal
 from tests.conftest import DIPOLE, changed, circle
 
 POINTS = circle(0.07, 5)
@@ -281,7 +281,7 @@ import numpy as np
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.getdp import find_getdp
-from halbach_fe.solver.formulation_choice import solve_nominal
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.study.reader import parse_study
 folder, cache, studies, points = sys.argv[1:]

@@ -23,7 +23,8 @@ from halbach_fe.measurement.field_map import field_map
 from halbach_fe.response.resource_estimate import estimate_solve
 from halbach_fe.response.solution import study_observation
 from halbach_fe.solver import iron_bodies
-from halbach_fe.solver.formulation_choice import (
+from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
+from halbach_fe.solver.routes import (
     Route,
     check_points,
     choose_route,
@@ -31,7 +32,6 @@ from halbach_fe.solver.formulation_choice import (
     finite_element_part,
     solve_nominal,
 )
-from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.separate_blocks import solve_separate
 from halbach_fe.solver.session import RunSize
 from halbach_fe.study.model import MeshSettings

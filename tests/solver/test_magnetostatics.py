@@ -10,9 +10,9 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import check_superposition, response_matrix, superposition_error
 from halbach_fe.solver.exact_block_field import field_of, unit_field
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.magnetostatics import edge_elements, solve_sources
 from halbach_fe.solver.ring_harmonics_2d import bore_field, ideal_sectors, layered_bore_field
+from halbach_fe.solver.routes import solve_nominal
 from tests.conftest import circle
 
 SECTORS = ideal_sectors(1, 16, 1.06, np.pi / 2, np.pi)

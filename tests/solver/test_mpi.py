@@ -9,8 +9,8 @@ import pytest
 
 from halbach_fe.core.errors import GetDPError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.solver.formulation_choice import solve_nominal
 from halbach_fe.solver.getdp import CONJUGATE_GRADIENTS, run
+from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 

@@ -10,7 +10,7 @@ import pytest
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.solver.formulation_choice import choose_route, finite_element_part
+from halbach_fe.solver.routes import choose_route, finite_element_part
 from halbach_fe.study.model import Study
 from halbach_fe.study.reader import parse_study, read_study
 from tests.conftest import DIPOLE, ROOT, changed, circle

@@ -13,7 +13,7 @@ from halbach_fe.geometry.symmetry import unique_points
 from halbach_fe.measurement.observation import observe
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.response.resource_estimate import decisive_points
-from halbach_fe.solver import formulation_choice, reciprocal_columns
+from halbach_fe.solver import reciprocal_columns, routes
 from halbach_fe.solver.azimuthal_modes import meridian_points, solve_modes
 from halbach_fe.solver.getdp_cache import Cache
 from halbach_fe.solver.reciprocal_columns import angle_integrals, reciprocal_gradients, saves_solves
@@ -74,13 +74,13 @@ def test_the_response_takes_them(magnet_of, session, monkeypatch, tmp_path):
         found = reciprocal_gradients(case, session)
         return {m: found[max(0, m - shift)] for m in found}
 
-    monkeypatch.setattr(formulation_choice, "reciprocal_gradients", gradients)
+    monkeypatch.setattr(routes, "reciprocal_gradients", gradients)
     found = response_matrix(magnet, observation, session.within("reciprocal"))
     assert taken == [7]  # four (r, z), mirrored in z, of which that of z = 0 is its own image
     assert found.superposition_error < 1e-9
     assert np.abs(found.matrix - forward.matrix).max() < 1e-10 * np.abs(forward.matrix).max()
     np.testing.assert_allclose(found.error, forward.error, rtol=1e-6)
-    monkeypatch.setattr(formulation_choice, "reciprocal_gradients",
+    monkeypatch.setattr(routes, "reciprocal_gradients",
                         lambda case, session: gradients(case, session, shift=1))
     with pytest.raises(GetDPError, match="do not add up"):
         response_matrix(magnet, observation, session.within("wrong"))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver.exact_block_field import field_of
-from halbach_fe.solver.formulation_choice import finite_element_part, solve_nominal
+from halbach_fe.solver.routes import finite_element_part, solve_nominal
 from halbach_fe.synthetic import magpylib_field
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
