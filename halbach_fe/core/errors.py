@@ -129,6 +129,10 @@ class GetDPError(HalbachError):
         return type(self), (self.sentence, self.log)
 
 
+class ColumnsError(GetDPError):
+    """The fields of single blocks do not add up to that of the whole array."""
+
+
 class NotConvergedError(GetDPError):
     """Newton's method did not converge.
 

@@ -36,7 +36,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import HalbachWarning
+from halbach_fe.core.errors import ColumnsError, HalbachWarning, NotConvergedError
 from halbach_fe.core.pace import Pace
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
@@ -238,6 +238,8 @@ class _Diagnosing:
         The study corrected for gross errors and outliers, without any effects.
     identified : tuple of IdentifiedEffect
         The effects that are in the model, or come into it in the next round.
+    in_model : tuple of IdentifiedEffect
+        Those that are in the model of the last update.
     closing : bool
         Whether the time is up, so that no further signatures are computed.
     update, search, judgement
@@ -292,7 +294,7 @@ class _Diagnosing:
         if len(starts) > 1:
             self.say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
         self.start, self.positions = possible_positions(starts, self._updated, self.campaign)
-        self.identified = self.start
+        self.identified = self.in_model = self.start
 
     def diagnosis(self) -> Diagnosis:
         """Go from round to round, and return the one that predicts held-out readings best."""
@@ -307,10 +309,19 @@ class _Diagnosing:
     def _is_last(self, number: int) -> bool:
         """Solve the model with what was found, and compare all effects at that point.
 
-        The iteration ends if nothing has changed, if the time is up, or if the solver's own error
-        explains the misfit.
+        The iteration ends if nothing has changed, if the time is up, if the solver's own error
+        explains the misfit, or if the model with what was found has no solution, as with steps
+        that drive a permeability up because none of the effects is what the model lacks.
         """
-        self._solve(number)
+        try:
+            self._solve(number)
+        except (ColumnsError, NotConvergedError) as error:
+            if number == 1:
+                raise
+            self.say(f"round {number}: the model with these effects has no solution: {error}")
+            self.converged, self.identified = False, self.in_model
+            return True
+        self.in_model = self.identified
         self._compare(number)
         if self.solver_error:
             self.say("the solver's own error explains the misfit")

@@ -26,7 +26,7 @@ import xarray as xr
 from halbach_fe.core import untrusted
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.code_digest import code_digest, version
-from halbach_fe.core.errors import GetDPError, HalbachWarning, OutputError
+from halbach_fe.core.errors import ColumnsError, HalbachWarning, OutputError
 from halbach_fe.core.files import atomic
 from halbach_fe.core.untrusted import read_hdf5, with_checksum, write_hdf5
 from halbach_fe.geometry.magnet import Magnet
@@ -192,7 +192,7 @@ def response_matrix(
     PointsOutsideError
         If a point lies outside the meshed region.
     GetDPError
-        If GetDP fails, or the columns do not add up to the field of the whole array.
+        If GetDP fails; a ColumnsError if the columns do not add up to the field of the whole array.
     """
     observation = replace(observation, points=check_points(magnet, observation.points))
     key = _key(magnet, observation, session, similar)
@@ -359,9 +359,9 @@ def superposition_error(total: Floats, magnitude: Floats, direct: Floats) -> flo
 
 
 def check_superposition(error: float, tolerance: float = SUPERPOSITION_TOLERANCE) -> None:
-    """Raise GetDPError if a `superposition_error` is larger than the tolerance."""
+    """Raise ColumnsError if a `superposition_error` is larger than the tolerance."""
     if not error <= tolerance:
-        raise GetDPError(
+        raise ColumnsError(
             f"The columns of the response do not add up to the directly solved field: the largest "
             f"difference is {error:.1e} of the blocks' contributions, where {tolerance:.0e} is "
             "allowed. A column is wrong; please report this with the study.")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import halbach_fe as hf
-from halbach_fe.core.errors import HalbachWarning, MeasurementError
+from halbach_fe.core.errors import ColumnsError, HalbachWarning, MeasurementError
 from halbach_fe.diagnosis import diagnose as module
 from halbach_fe.diagnosis.cost import estimate_diagnosis
 from halbach_fe.diagnosis.diagnose import diagnose, dropped_with_rivals, only_equals_took_turns
@@ -111,6 +111,31 @@ def test_a_search_among_pairs_of_blocks(name, session, generator):
         scale = found.identified[0]
         assert scale.values == pytest.approx([0.005], abs=4 * scale.sd[0])
     assert np.isfinite(found.loo_residuals_after).all()
+
+
+@pytest.mark.parametrize("solved", [0, 1])
+def test_a_step_to_a_model_without_a_solution_ends_the_search(
+        solved, session, generator, monkeypatch):
+    """The answer is that of the rounds before, and not sound; without any there is none."""
+    rounds = iter(range(10))
+
+    def infer(*arguments, **options):
+        if next(rounds) >= solved:
+            raise ColumnsError("The columns do not add up.")
+        return inferred(*arguments, **options)
+
+    inferred = module.infer
+    monkeypatch.setattr(module, "infer", infer)
+    data = uniform(measured(STUDY, generator))
+    some = [effect for effect in catalogue() if effect.name in ("background", "offset_x")]
+    if not solved:
+        with pytest.raises(ColumnsError):
+            diagnose(STUDY, data, session, effects=some)
+        return
+    found = diagnose(STUDY, data, session, effects=some)
+    assert not found.converged
+    assert not found.identified
+    assert not answer(found).sound
 
 
 @pytest.mark.parametrize("fraction", [0.03, -1.0, -2.0])
