@@ -277,19 +277,20 @@ def candidate_measurements(
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
     heights = np.unique(np.round(places[:, 2], 9))
     heights = heights[np.linspace(0, len(heights) - 1, min(len(heights), 40)).astype(int)]
-    found.append(CandidateMeasurement(
-        "second_radius", f"circles of radius {1e3 * radius:.0f} mm",
-        _point_scan(np.vstack([_circle(radius, z) for z in heights]), sigma, name)))
+    others = [("second_radius", f"circles of radius {1e3 * radius:.0f} mm",
+               np.vstack([_circle(radius, z) for z in heights]))]
     if study.dimension == 3:
         half, reach = magnet.array_half_length, magnet.array_outer_radius
         farthest = min(4 * reach, 0.4 * (boundary_half_length(magnet, "extruded") - half))
         beyond = [side * (half + farthest * step) for side in (-1, 1)
                   for step in np.linspace(0.2, 1, 5)]
-        found.append(CandidateMeasurement(
-            "far_field", f"points up to {1e3 * farthest:.0f} mm beyond the ends",
-            _point_scan(np.vstack([_circle(0.5 * reach, z, 4) for z in beyond]), sigma, name)))
+        others.append(("far_field", f"points up to {1e3 * farthest:.0f} mm beyond the ends",
+                       np.vstack([_circle(0.5 * reach, z, 4) for z in beyond])))
+    in_air = [(*one, points[~magnet.contains(points)]) for *one, points in others]
     return [
         *found,
+        *(CandidateMeasurement(*one, _point_scan(points, sigma, name))
+          for *one, points in in_air if len(points)),
         CandidateMeasurement(
             "magnet_turned", f"{same} with the magnet turned by 90° about its axis",
             replace(present, magnet_rotation=rotation_about_z(np.pi / 2))),

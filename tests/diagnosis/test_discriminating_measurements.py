@@ -202,6 +202,21 @@ def test_options_fit_the_study(case):
     assert set(found) - names == {"nmr_point"}  # too weak for it
 
 
+def test_no_reading_is_proposed_in_iron(case):
+    """A box in the bore, where the circles of the control pass."""
+    diagnosis, data = case("offset_y", [2e-4], "background")
+    magnet = build_magnet(diagnosis.before.study.with_(iron={
+        "relative_permeability": 100.0, "bodies": [
+            {"kind": "box", "size_m": [0.02, 0.02, 0.3], "centre_m": [0.083, 0.0, 0.0]}]}))
+    counts = []
+    for before in (diagnosis.before, replace(diagnosis.before, magnet=magnet)):
+        points = {one.name: one.scan.points for one in candidate_measurements(
+            replace(diagnosis, before=before), data)}["second_radius"]
+        counts.append(len(points))
+        assert magnet.contains(points).any() == (before is diagnosis.before)
+    assert 0 < counts[1] < counts[0]
+
+
 OWNERS = {"offset_x": "sensors", "sensor_position_y": "sensors", "drift": "sensors",
           "mapper_translation": "mapper", "z_scale": "mapper", "arm_sag": "mapper",
           "background": "surroundings", "neighbour_magnet": "surroundings",
