@@ -295,12 +295,13 @@ def demagnetization_map(
     cells = cut(blocks, magnetized, across)
     easy = np.array([np.array(block.easy_axis) * np.sign(block.remanence) for block in blocks])
     field = _vacuum_field(blocks, cells.middles, progress)
+    from_outside = external_field(warm, cells.middles)
     strength = np.array([abs(block.remanence) for block in blocks])[cells.block]
-    opposed = np.einsum("nc,nc->n", field, easy[cells.block]) < OPPOSED * strength
+    opposed = np.einsum("nc,nc->n", field + from_outside, easy[cells.block]) < OPPOSED * strength
     cell, points = _anywhere(cells, np.flatnonzero(opposed))
     number = np.append(cells.block, cells.block[cell])
     field = _field_strength(
-        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, progress)]),
+        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, None)]),
         np.vstack([cells.middles, points]), number, session)
     along, other = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
     cell = np.append(np.flatnonzero(~opposed), cell)

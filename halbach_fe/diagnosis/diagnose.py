@@ -238,8 +238,10 @@ class _Diagnosing:
         The study corrected for gross errors and outliers, without any effects.
     identified : tuple of IdentifiedEffect
         The effects that are in the model, or come into it in the next round.
-    in_model : tuple of IdentifiedEffect
-        Those that are in the model of the last update.
+    in_model : tuple
+        Those, and the noise of positions, that are in the model of the last update.
+    unsolved : bool
+        Whether the model of the last round had no solution.
     closing : bool
         Whether the time is up, so that no further signatures are computed.
     update, search, judgement
@@ -294,12 +296,12 @@ class _Diagnosing:
         if len(starts) > 1:
             self.say(f"comparing {len(starts)} positions of the map that may be equal by symmetry")
         self.start, self.positions = possible_positions(starts, self._updated, self.campaign)
-        self.identified = self.in_model = self.start
+        self.identified, self.unsolved = self.start, False
 
     def diagnosis(self) -> Diagnosis:
         """Go from round to round, and return the one that predicts held-out readings best."""
         rounds = next((number for number in range(1, MAX_ROUNDS + 1) if self._is_last(number)),
-                      MAX_ROUNDS)
+                      MAX_ROUNDS) - self.unsolved
         answer = self._choose_answer(rounds)
         if self._has_other_outliers():
             return _Diagnosing(replace(
@@ -319,9 +321,10 @@ class _Diagnosing:
             if number == 1:
                 raise
             self.say(f"round {number}: the model with these effects has no solution: {error}")
-            self.converged, self.identified = False, self.in_model
+            self.converged, self.unsolved = False, True
+            self.identified, self.position_noise = self.in_model
             return True
-        self.in_model = self.identified
+        self.in_model = self.identified, self.position_noise
         self._compare(number)
         if self.solver_error:
             self.say("the solver's own error explains the misfit")
@@ -497,7 +500,8 @@ class _Diagnosing:
             loo_residuals_after=loo_residuals(search.marginal, search.training), rounds=rounds,
             answer=answer, gross_errors=self.gross_errors, poses=self.poses,
             outliers=self.outliers, position_noise=self.position_noise,
-            solver_error=self.solver_error, imitated=imitation, converged=self.converged,
+            solver_error=self.solver_error, imitated=imitation,
+            converged=self.converged, unsolved=self.unsolved,
             positions=self.positions,
             limits=detection_limits(update, self.campaign, search.columns[:, in_model]),
             floor_T=self.task.floor_T, suspected=suspected,

@@ -264,14 +264,14 @@ def candidate_measurements(
         CandidateMeasurement(
             "probe_reversed", f"{same} with the probe turned by 180° about x",
             replace(present, probe_rotation=present.probe_rotation @ np.diag([1.0, -1.0, -1.0])))]
-    if size > nmr_min_field_t:
+    magnet = build_magnet(study)
+    if size > nmr_min_field_t and not magnet.contains(np.zeros((1, 3))).any():
         found.append(CandidateMeasurement(
             "nmr_point", "one NMR reading in the middle of the bore", ProposedScan(
                 np.zeros((1, 3)), np.zeros(1), sparse.csr_array(centre[None] / size),
                 independent_noise(np.array([nmr_relative_sd * size])), np.eye(3), np.eye(3),
                 mapped=False)))
     radii = np.unique(np.round(np.hypot(places[:, 0], places[:, 1]), 6))
-    magnet = build_magnet(study)
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)

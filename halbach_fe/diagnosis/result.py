@@ -399,6 +399,8 @@ class Diagnosis(ShownInNotebook):
         The solver's own error, if it explains the misfit. The search for effects is then skipped.
     converged : bool
         Whether the last round changed neither the effects nor their amplitudes.
+    unsolved : bool
+        Whether a further round was left out, as its model had no solution.
     positions : tuple of PossiblePosition
         Displacements of the map that the magnet's symmetry hardly distinguishes, if there are
         several; the effects are those of the first.
@@ -445,6 +447,7 @@ class Diagnosis(ShownInNotebook):
     solver_error: SolverErrorExplanation | None = None
     imitated: Imitation | None = None
     converged: bool = True
+    unsolved: bool = False
     positions: tuple[PossiblePosition, ...] = ()
     limits: DetectionLimits | None = None
     floor_T: Floor | None = None

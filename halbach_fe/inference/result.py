@@ -14,12 +14,14 @@ from typing import Any, Literal
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.errors import StudyError
 from halbach_fe.core.notebook import ShownInNotebook
-from halbach_fe.core.numbers import decimals
+from halbach_fe.core.numbers import decimals, in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.campaign import ONLY_MAP
 from halbach_fe.measurement.doubted_terms import (
     ALL_BLOCKS,
@@ -378,12 +380,16 @@ class RegionScore:
     chi2_posterior: float | None
 
 
+FAR_BARS = 10.0
+"""Error bars from which an amplitude moved far: the blocks' chi² was 9 where a gap had moved by 70,
+and 1 after a second update."""
+
+
 def far_in_words(names: Sequence[str]) -> str:
     """Say that the update is linear in amplitudes that moved far, if there are any."""
     return "" if not names else (
         "The update is linear in the amplitudes of [[uncertain]], and moved "
-        f"{' and '.join(names)} by more than 10 error bars: bars may be too small. The study as "
-        "found is to be updated again.")
+        f"{in_a_row(names)} by more than {FAR_BARS:.0f} error bars: bars may be too small.")
 
 
 class Reservation(str):
@@ -678,9 +684,7 @@ class InferenceResult(ShownInNotebook):
 
         Fields are linear in currents, moments and uniform fields, however far these move.
         """
-        # Moves in error bars: the blocks' chi² was 9 where a gap had moved by 70, and 1 after a
-        # second update.
-        many, linear = 10.0, ("current_A", "background_T", "moment_A_m2", "offset_T", "drift_T")
+        linear = ("current_A", "background_T", "moment_A_m2", "offset_T", "drift_T")
         found = self.amplitudes
         if found is None:
             return ()
@@ -688,24 +692,26 @@ class InferenceResult(ShownInNotebook):
                 if {name.split(".")[-1].partition("[")[0] for name in one.change} - set(linear)}
         return tuple(name for name, change, sd in zip(
             found.names, found.change, found.sd, strict=True)
-            if name in bent and abs(change) > many * sd)
+            if name in bent and abs(change) > FAR_BARS * sd)
 
-    @property
+    @cached_property
     def study_as_found(self) -> Study:
         """The study with the amplitudes that were found, as which they are to be updated again.
 
-        Raises
-        ------
-        StudyError
-            If there is no such magnet.
+        It is the study itself if none of them moved far, or if there is no such magnet.
         """
         study, found = self.study, self.amplitudes
         if found is None or not self.far_amplitudes:
             return study
         change = dict(zip(found.names, found.change.tolist(), strict=True))
-        for one in self.study.uncertain:
-            study = shifted(study, one, change[one.name])
-        return study.with_(uncertain=self.study.uncertain)
+        try:
+            for one in self.study.uncertain:
+                study = shifted(study, one, change[one.name])
+            study = study.with_(uncertain=self.study.uncertain)
+            build_magnet(study)
+        except (StudyError, ValidationError):
+            return self.study
+        return study
 
     @property
     def reservation(self) -> Reservation:

@@ -1063,21 +1063,22 @@ def _stated(
                                other for _, other in asked[:number] + asked[number + 1:]),
                                strict=True)]) for number, (_, terms) in enumerate(asked)]
     best = int(np.argmax([each.sum() for each in supported]))  # the largest that shows as much
-    terms = tuple(_with_other_regions(term, others) for term, *others in zip(
-        asked[best][1], *(told for _, told in asked[:best] + asked[best + 1:]), strict=True))
-    (whole, _), (inner, _) = asked[0], asked[best]
+    (whole, _), (inner, terms) = asked[0], asked[best]
+    terms = tuple(_with_other_regions(
+        replace(term, predictive=term.predictive and (not term.found or bool(stated))), others)
+        for term, stated, *others in zip(terms, supported[best], *(
+            told for _, told in asked[:best] + asked[best + 1:]), strict=True))
     if best == 0:
         return whole, terms
     model = whole.model.with_terms(inner.model.prior_sd > 0).settled()
     settled = replace(whole, model=model, at=replace(inner.at, amplitudes=whole.at.amplitudes))
-    return settled.weighted(rows), tuple(
-        replace(term, predictive=term.predictive and (not term.found or bool(stated)))
-        for term, stated in zip(terms, supported[best], strict=True))
+    return settled.weighted(rows), terms
 
 
 def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
-    """Return the fit without the parameters of which the map does not tell which is off, but for
-    those, such as parts of a change, that one which was found has as well.
+    """Return the fit without the parameters of which the map does not tell which is off, and those
+    whose bar other regions made too long, but for those, such as parts of a change, that one which
+    was found has as well.
     """
     model = fitted.model
     open_ones = stated = np.zeros(len(fitted.at.instrument), bool)
@@ -1085,10 +1086,10 @@ def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
                                strict=True):
         waves = (parameter.row != 0) if parameter.beside else np.isin(
             np.arange(len(open_ones)), parameter.own)
-        if term.rivals:
-            open_ones = open_ones | waves
-        elif term.found:
+        if term.found and not term.rivals:
             stated = stated | waves
+        else:
+            open_ones = open_ones | waves
     return replace(fitted.at, instrument=np.where(open_ones & ~stated, 0.0, fitted.at.instrument))
 
 
@@ -1100,7 +1101,7 @@ def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
 
 
 def _with_other_regions(term: InstrumentTerm, others: list[InstrumentTerm]) -> InstrumentTerm:
-    """Return a term that was found with the rms difference of other regions from it in its bar.
+    """Return a term; if it was found, with a bar that contains how other regions differ from it.
 
     Of two regions of which one contains the other, estimates differ by the root of the difference
     of their variances. A measured dipole's probe was turned by 49.4 +- 1.2 mrad by all of a map

@@ -44,8 +44,9 @@ PAST = "#D55E00"
 ROOM_C = 20.0
 """Temperature in °C at which a magnet is kept at least."""
 
-VERY_EDGES = 1e-3
-"""Share of the volume that counts as the very edges of blocks, where H has no bound."""
+VERY_EDGES, OF_A_BLOCK = 1e-3, 1e-2
+"""Shares of the magnet's volume, and of each single block's, that count as the very edges of
+blocks, where H has no bound. A magnet of many blocks may lose a large part of one of them."""
 
 AT_ROOM = "It loses magnetization at room temperature already."
 """Sentence about a magnet that does not keep its magnetization there."""
@@ -110,7 +111,7 @@ class _Losses:
     def of(cls, found: DemagnetizationMap) -> _Losses:
         """Return those of a map of margins."""
         limit, now = (found.limit_temperature(SHARES[-1]),
-                      found.share_beyond_now > VERY_EDGES)
+                      not _at_edges_alone(found))
         at_room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
         low, high = LINEAR
         on_the_way = now and math.isfinite(limit) and (
@@ -125,13 +126,19 @@ class _Losses:
         return "No" if self.now or self.at_room else "Yes"
 
 
+def _at_edges_alone(found: DemagnetizationMap) -> bool:
+    """Tell whether no more than the very edges of blocks is past the knee."""
+    return found.share_beyond_now <= VERY_EDGES and max(
+        row["share_beyond_knee"] for row in found.by_block()) <= OF_A_BLOCK
+
+
 def _past_the_knee(found: DemagnetizationMap) -> str:
     """Say which share of the volume loses magnetization."""
     lost = found.share_beyond_now
     if not lost:
         return "no cell is past the knee of the demagnetization curve"
-    if lost <= VERY_EDGES:
-        return (f"no more than {100 * lost:.1g} % of the magnet's volume, at the very edges of "
+    if _at_edges_alone(found):
+        return (f"about {100 * lost:.1g} % of the magnet's volume, at the very edges of "
                 "blocks, is past the knee of its demagnetization curve")
     error = f" ± {_percent(found.share_error)}" if found.share_error else ""
     return (f"{100 * lost:.3g}{error} % of the magnet's volume is past the knee of its "
@@ -145,7 +152,7 @@ def _percent(share: float) -> str:
 
 def _worst_block(found: DemagnetizationMap) -> str:
     """Say which block loses most, if any does."""
-    if found.share_beyond_now <= VERY_EDGES:
+    if _at_edges_alone(found):
         return ""
     most = max(found.by_block(), key=lambda row: row["share_beyond_knee"])
     by_name = {each.name: each for each in found.blocks}
@@ -174,7 +181,7 @@ def _trust(found: DemagnetizationMap, state: _Losses) -> str:
                  "state them within some per cent.")
     sentences = [first, "The very edges of blocks are worse than any cell (the option --across "
                  "makes them smaller)." + (
-                     "" if found.share_beyond_now <= VERY_EDGES else
+                     "" if _at_edges_alone(found) else
                      f" ± {_percent(found.share_error)} % is what the share of the volume depends "
                      "on the places in the cells that were computed.")]
     if is_nonlinear(found.study):

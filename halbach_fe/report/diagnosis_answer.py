@@ -555,6 +555,8 @@ def _doubts(diagnosis: Diagnosis) -> list[str]:
             "their amplitudes still changed." if diagnosis.answer in (0, diagnosis.rounds) else
             f"The search ended after {diagnosis.rounds} rounds, of which round {diagnosis.answer} "
             "predicts held-out readings best; what later rounds added made the prediction worse.")
+    if diagnosis.unsolved:
+        sentences.append("A further step led to a model without a solution, which is left out.")
     if len(diagnosis.identified) == MAX_EFFECTS:
         sentences.append(
             f"These are {MAX_EFFECTS} effects, the largest number that is searched for. So "

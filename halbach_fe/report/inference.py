@@ -369,7 +369,7 @@ def page(result: InferenceResult) -> Page:
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
         remarks=order,
-        new_study=None if result.terms is None and not result.far_amplitudes else (
+        new_study=None if result.terms is None and result.study_as_found is result.study else (
             STUDY_FILE, lambda: [(result.study_as_found, NOTE)]))
 
 
@@ -462,7 +462,9 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
                   "They have not come to rest: their error bars may be too small."]
     if result.amplitudes:
         found.append("What the study has in tables [[uncertain]] is given as the change from what "
-                     "it says." + bool(result.far_amplitudes) * f" {STUDY_FILE} has them as found.")
+                     "it says." + (
+                         "" if result.study_as_found is result.study else
+                         f" {STUDY_FILE} has them as found."))
     return [
         Section([] if not overlaps else [
             "Where two maps overlap, the readings of one are compared with what an update by the "

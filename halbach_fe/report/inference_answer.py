@@ -51,14 +51,14 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
     said = f"{_prediction(result)} {_blocks(result)}"
     numbers = distances(result, result)
     question = "What is the measured magnet like?"
-    solver = _of_the_solver(result)
+    solver, far = _of_the_solver(result), far_in_words(result.far_amplitudes)
     if result.disagreement:
         wrong = ("Model and measurement agree better than the stated noise allows"
                  if result.disagreement == result.too_near else "Model and measurement disagree")
         return Answer(question, f"{wrong}, so that these numbers and their "
                       f"error bars are not to be used as they stand. {said}",
                       f"No. {result.disagreement}{solver}"
-                      f"{' ' * bool(far := far_in_words(result.far_amplitudes))}{far}",
+                      f"{' ' * bool(far)}{far}",
                       *_after_a_conflict(result), sound=False, numbers=numbers,
                       gist=f"{wrong}: these numbers are not to be used.")
     tested = "" if result.held_out.any() else (
@@ -66,6 +66,7 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         "[inference.held_out] or --held-out.")
     at_rest = ("" if result.terms is None or result.terms.at_rest else
                " The instruments have not come to rest: their error bars may be too small.")
+    far = "" if far in result.reservation else far
     single, shared = result.held_back, result.shared_doubts
     verdict = (f"{result.reservation} {'But model' if shared else 'Model'}"
                if result.reservation else "Yes. Model")
@@ -76,10 +77,12 @@ def answer(result: InferenceResult, tables: Sequence[MultipoleTable] = ()) -> An
         f"{verdict} and readings agree: chi² per reading before the update is "
         f"{decimals(result.prior_conflict)}, where 1 is expected and more than "
         f"{result.conflict_limit:.2g} is rare.{unseen}{tested}{at_rest}"
-        f"{_of_the_probe(result)}{_of_the_sign(result)}{solver}",
+        f"{_of_the_probe(result)}{_of_the_sign(result)}{solver}"
+        f"{' ' * bool(far)}{far}",
         *(LOOK if single or (shared and "update again" not in result.reservation) else
           AGAIN if shared else OF_THE_TABLE if result.table_doubts else
-          AS_FOUND if result.far_amplitudes else _after_agreement(result)),
+          AS_FOUND if result.study_as_found is not result.study else
+          LOOK if result.far_amplitudes else _after_agreement(result)),
         sound=not result.reservation,
         gist=_blocks(result, "The blocks deviate"), numbers=numbers)
 
@@ -139,7 +142,7 @@ def _after_a_conflict(result: InferenceResult) -> tuple[str, str]:
         return ("First lower the solver's error, as is said above, and update again: as it is, it "
                 "hides what the study may lack. This command shows how it falls.",
                 "halbach-fe verify STUDY -o DIR")
-    return AS_FOUND if result.far_amplitudes else LOOK
+    return AS_FOUND if result.study_as_found is not result.study else LOOK
 
 
 def _of_the_sign(result: InferenceResult) -> str:

@@ -11,7 +11,6 @@ from halbach_fe.core.errors import HalbachWarning
 from halbach_fe.study import sentences
 from halbach_fe.study.free_blocks import FreeBlocks
 from halbach_fe.study.grades import (
-    STRENGTHS,
     Material,
     doubted_strength,
     grade_of,
@@ -176,7 +175,9 @@ class _OfGrade(StudyModel):
     def with_(self, **changes: Any) -> Self:
         """Return a copy with other values of some keys; see `StudyModel.with_`."""
         changed = super().with_(**without_old_grade(self, changes))
-        if changes.keys() & {"material", *STRENGTHS} and (doubt := changed.doubt):
+        doubt, of_grade = changed.doubt, doubted_strength(changed)
+        # a strength beside its grade is also what the program makes of one that is uncertain
+        if doubt not in ("", self.doubt) and ("material" in changes or doubt != of_grade):
             warnings.warn(doubt, HalbachWarning, stacklevel=4)
         return changed
 

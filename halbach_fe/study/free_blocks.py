@@ -193,8 +193,11 @@ class FreeBlocks(StudyModel):
         """Return a copy with other values; rows of another grade have what that says."""
         filled = columns_with_grades({"material": self.material}) if "material" in changes else {}
         for key in filled.keys() - changes.keys():
-            changes[key] = tuple(None if value == old else value for value, old in zip(
-                getattr(self, key), filled[key], strict=True))
+            own = getattr(self, key)
+            if len(changes["material"] or ()) == len(own):  # else the table itself is refused
+                changes[key] = tuple(
+                    None if new and value == old else value for value, old, new in zip(
+                        own, filled[key], changes["material"], strict=True))
         return super().with_(**changes)
 
     def _check_sizes(self) -> None:

@@ -133,9 +133,10 @@ def test_a_step_to_a_model_without_a_solution_ends_the_search(
             diagnose(STUDY, data, session, effects=some)
         return
     found = diagnose(STUDY, data, session, effects=some)
-    assert not found.converged
+    assert (found.converged, found.unsolved, found.rounds) == (False, True, 1)
     assert not found.identified
     assert not answer(found).sound
+    assert "led to a model without a solution" in answer(found).trust
 
 
 @pytest.mark.parametrize("fraction", [0.03, -1.0, -2.0])

@@ -225,7 +225,7 @@ class Far:
         self.points = points
 
     def query(self, places):
-        return np.full(len(places), np.inf), None
+        return np.full(places.shape[:-1], np.inf), None
 
 
 @pytest.mark.parametrize(("near", "fails"), [(KDTree, False), (Far, True)])

@@ -409,7 +409,9 @@ def _refuse_other_header(
     header, which holds for rows above the comment alone.
     """
     for number, line in body if any(column.quantity for column in columns) else ():
-        other = _header([(number, line)], len(columns), delimiter, "") if is_comment(line) else ()
+        if not is_comment(line) or numbers_among(_spaced(uncommented(line))):
+            continue  # a comment with numbers is one on the rows below, such as # z = 5 mm
+        other = _header([(number, line)], len(columns), delimiter, "")
         if any(one.quantity for one in other) and any(
                 one.quantity != column.quantity or (
                     one.unit and unit_symbol(one.unit) != unit_symbol(column.unit))
