@@ -370,7 +370,8 @@ def test_whole_numbers_above_a_row_with_an_empty_cell_are_no_counts(tmp_path, ma
 
 @pytest.mark.parametrize(("again", "refused"), [
     (HEADER, False), (HEADER.replace("T", "mT"), True), ("x,y,z,Bx,By,Bz\n", False),
-    ("z[mm],y[mm],x[mm],Bx[T],By[T],Bz[T]\n", True), ("second scan, from z = 0\n", False)])
+    ("z[mm],y[mm],x[mm],Bx[T],By[T],Bz[T]\n", True), ("second scan, from z = 0\n", False),
+    ("x, = 0,y, = 5,z, = 1\n", False)])
 def test_a_header_that_comes_again_is_the_same(tmp_path, again, refused):
     """Rows below another one were read in the units of the first."""
     path, rows = tmp_path / "file.txt", table(",").splitlines(True)
