@@ -257,6 +257,7 @@ class _Diagnosing:
     update: InferenceResult
     search: Search
     judgement: Judgement
+    in_model: tuple[tuple[IdentifiedEffect, ...], tuple[PositionNoise, ...]]
 
     def __init__(self, task: _Task, left: tuple[Outlier, ...] | None = None) -> None:
         """Correct gross errors. The outliers are those that an earlier run has ``left``, if any."""

@@ -286,11 +286,11 @@ def candidate_measurements(
                   for step in np.linspace(0.2, 1, 5)]
         others.append(("far_field", f"points up to {1e3 * farthest:.0f} mm beyond the ends",
                        np.vstack([_circle(0.5 * reach, z, 4) for z in beyond])))
-    in_air = [(*one, points[~magnet.contains(points)]) for *one, points in others]
+    in_air = [(which, title, points[~magnet.contains(points)]) for which, title, points in others]
     return [
         *found,
-        *(CandidateMeasurement(*one, _point_scan(points, sigma, name))
-          for *one, points in in_air if len(points)),
+        *(CandidateMeasurement(which, title, _point_scan(points, sigma, name))
+          for which, title, points in in_air if len(points)),
         CandidateMeasurement(
             "magnet_turned", f"{same} with the magnet turned by 90° about its axis",
             replace(present, magnet_rotation=rotation_about_z(np.pi / 2))),
