@@ -44,9 +44,10 @@ PAST = "#D55E00"
 ROOM_C = 20.0
 """Temperature in °C at which a magnet is kept at least."""
 
-VERY_EDGES, OF_A_BLOCK = 1e-3, 1e-2
-"""Shares of the magnet's volume, and of each single block's, that count as the very edges of
-blocks, where H has no bound. A magnet of many blocks may lose a large part of one of them."""
+VERY_EDGES = 1e-3
+"""Share of the volume that counts as the very edges of blocks, where H has no bound. A magnet of
+many blocks may lose as little in a large part of one: of no block is it more than the last of
+`SHARES`, whose temperature is stated as a limit."""
 
 AT_ROOM = "It loses magnetization at room temperature already."
 """Sentence about a magnet that does not keep its magnetization there."""
@@ -110,8 +111,7 @@ class _Losses:
     @classmethod
     def of(cls, found: DemagnetizationMap) -> _Losses:
         """Return those of a map of margins."""
-        limit, now = (found.limit_temperature(SHARES[-1]),
-                      not _at_edges_alone(found))
+        limit, now = found.limit_temperature(SHARES[-1]), not _at_edges_alone(found)
         at_room = limit > ROOM_C if found.worst_when_cold else limit < ROOM_C
         low, high = LINEAR
         on_the_way = now and math.isfinite(limit) and (
@@ -129,7 +129,7 @@ class _Losses:
 def _at_edges_alone(found: DemagnetizationMap) -> bool:
     """Tell whether no more than the very edges of blocks is past the knee."""
     return found.share_beyond_now <= VERY_EDGES and max(
-        row["share_beyond_knee"] for row in found.by_block()) <= OF_A_BLOCK
+        row["share_beyond_knee"] for row in found.by_block()) <= SHARES[-1]
 
 
 def _past_the_knee(found: DemagnetizationMap) -> str:

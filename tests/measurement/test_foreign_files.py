@@ -213,6 +213,20 @@ def test_a_vtk_file_that_claims_more_than_it_holds(tmp_path, says, claims):
         import_map(path, declared)
 
 
+@pytest.mark.parametrize(("name", "is_b"), [
+    ("magnetic_flux_density", True), ("B_field", True), ("magnetic_field", False), ("H", False)])
+def test_a_vector_of_a_vtk_file_that_may_be_h_is_not_read_as_b(tmp_path, name, is_b):
+    path = tmp_path / "file.vtk"
+    path.write_text(VTK + "STRUCTURED_POINTS\nDIMENSIONS 2 2 1\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+                    f"POINT_DATA 4\nVECTORS {name} double\n" + "0.1 0 0.2\n" * 4)
+    declared = DeclaredFormat(length_unit="mm", field_unit="T")
+    if is_b:
+        assert import_map(path, declared).data.sizes["point"] == 4
+        return
+    with pytest.raises(MeasurementError, match="one vector B"):
+        import_map(path, declared)
+
+
 def test_the_noise_of_x_in_a_unit_of_the_field_is_that_of_Bx(tmp_path):
     path = tmp_path / "file.txt"
     path.write_text("x[mm],y[mm],z[mm],Bx[mT],By[mT],Bz[mT],sd x (mT),sd y (mT),sd z (mT)\n"

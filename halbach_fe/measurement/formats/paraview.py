@@ -30,8 +30,9 @@ from halbach_fe.study.types import COMPONENTS
 
 LEGACY = b"# vtk DataFile"
 XML = re.compile(rb"\s*(?:<\?xml[^>]{0,200}\?>\s*)?<VTKFile\b")
-OF_B = re.compile(r"(?i)(?:magnetic[ _]?)?(?:b|b?[ _]?field|flux[ _]?density)(?:[ _]e)?")
-"""Names of a vector that is B: B, B_field, magnetic flux density (e of Elmer's elements)."""
+OF_B = re.compile(r"(?i)(?:b|b[ _]?field|(?:magnetic[ _]?)?flux[ _]?density)(?:[ _]e)?")
+"""Names of a vector that is B: B, B_field, magnetic flux density (e of Elmer's elements). What is
+called magnetic field may be H."""
 SIZES = re.compile(
     rb"(?i)\b(?:DIMENSIONS|POINTS|[XYZ]_COORDINATES|CELLS|CELL_TYPES|(?:POINT|CELL)_DATA|"
     rb"\S{1,80}[ \t]{1,8}\d{1,4}(?=[ \t]{1,8}\d{1,30}[ \t]{1,8}[a-z]))"
