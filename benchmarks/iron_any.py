@@ -162,12 +162,12 @@ def spent() -> float:
 
 def solved_with_bars(magnet: Magnet, points: Floats
                      ) -> tuple[SeparateReaction, Floats, Floats, float]:
-    """Return the solution, what it adds and its bars, both (n, 3) in T, and the seconds spent."""
+    """Return the solution, what it adds (n, 3) and its bars (n, 1) in T, and the seconds spent."""
     began = spent()
     with tempfile.TemporaryDirectory() as folder:
         solved = solve_separate(magnet, Session(find_getdp(), Path(folder)))
-        field, bars = solved.field_with_errors(points)
-    return solved, field, bars, spent() - began
+        field, change = solved.field_with_errors(points)
+    return solved, field, np.linalg.norm(change, axis=1, keepdims=True), spent() - began
 
 
 def rms(field: Floats) -> float:

@@ -52,6 +52,14 @@ def plain(values: ArrayLike, axes: Sequence[str] = ("x", "y", "z")) -> Floats:
     return np.array(np.ma.filled(given.astype(float), np.nan))
 
 
+def of_length(vectors: Floats, length: Floats) -> Floats:
+    """Return vectors (n, 3) along others, of given lengths (n,); along x where those are 0."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    along = np.divide(vectors, size, out=np.tile([1.0, 0.0, 0.0], (len(vectors), 1)),
+                      where=size > 0)
+    return np.asarray(along * length[:, None])
+
+
 def _labelled(values: Any) -> Any:
     """Return a table or series (of pandas, polars) as a DataArray; anything else as it is."""
     if isinstance(values, xr.DataArray) or not hasattr(values, "to_numpy"):

@@ -62,7 +62,7 @@ def explain_by_solver_error(update: InferenceResult) -> SolverErrorExplanation |
     training = ~update.held_out
     noise = update.noise.subset(training)
     marginal = Marginal.of(with_fewer_columns(noise.whiten(
-        update.prediction_prior.root(np.flatnonzero(training)))))
+        update.prediction_exact.root(np.flatnonzero(training)))))
     residual = noise.whiten((update.readings - update.prediction_prior.mean)[training])
     chi2 = float(residual @ marginal.remove(residual[:, None])[:, 0]) / len(residual)
     if chi2 <= update.conflict_limit:

@@ -186,6 +186,8 @@ class _Update:
         The responses of `Readings.vectors` and of the readings to the parameters of the blocks.
     matrix : Rows
         Derivatives (readings, parameters) by all parameters.
+    exact : Rows
+        The same without what the solver is wrong by, see `_Search._beside`.
     prior : Gaussian
     residual : ndarray, shape (readings,), in T
         Readings less what the model reads of the nominal magnet.
@@ -200,6 +202,7 @@ class _Update:
     vectors: Response
     model: Response
     matrix: Rows
+    exact: Rows
     prior: Gaussian
     residual: Floats
     errors: NoiseCovariance
@@ -211,11 +214,15 @@ class _Update:
         """The posterior of all parameters."""
         return self.update.distribution
 
-    def predicted(self, parameters: Gaussian) -> Prediction:
-        """Return the prediction of all readings from a distribution of all parameters."""
-        mean, sd = predict(self.matrix, parameters)
+    def predicted(self, parameters: Gaussian, exact: bool = False) -> Prediction:
+        """Return the prediction of all readings from a distribution of all parameters.
+
+        With ``exact`` the solver makes no error that readings share.
+        """
+        matrix = self.exact if exact else self.matrix
+        mean, sd = predict(matrix, parameters)
         offset = self.model.offset + bent(self.readings, self.vectors, self.model, parameters)
-        return Prediction(offset + mean, sd, lambda rows: self.matrix[rows] @ parameters.root,
+        return Prediction(offset + mean, sd, lambda rows: matrix[rows] @ parameters.root,
                           parameters.root.shape[1])
 
 
@@ -253,8 +260,8 @@ class _Search:
         In whose gradient uncertain positions make the noise; None for the nominal ones.
     solved : _Solved or None
         The last response that was solved for.
-    error : ndarray or None, in T
-        Of the solver in each reading.
+    error, shared_error : ndarray or None, in T
+        Of the solver in each reading, and in all together, see `Response`.
     place : _Place or None
         What the last update that was not worse has found.
     share : float
@@ -278,6 +285,7 @@ class _Search:
     noise_blocks: tuple[MagnetBlock, ...] | None = None
     solved: _Solved | None = None
     error: Floats | None = None
+    shared_error: Floats | None = None
     place: _Place | None = None
     share: float = 1.0
     last: _Update = field(init=False)
@@ -309,7 +317,7 @@ class _Search:
         """Take the noise that uncertain positions make in the gradient of the estimated magnet."""
         values = self.last.whole.mean[:len(self.magnet.parameter_names)]
         self.noise_blocks = with_magnetizations(self.magnet, values)
-        self.noises, self.error, self.place = {}, None, None
+        self.noises, self.error, self.shared_error, self.place = {}, None, None, None
 
     def _update(self, number: int, say: Callable[[str], None]) -> bool:
         """Make an update, move to what it found, and tell whether that changed next to nothing."""
@@ -356,17 +364,18 @@ class _Search:
     def _update_of(self, readings: Readings, vectors: Response) -> _Update:
         """Return the update of all parameters by the readings for training."""
         model = readings.projected(vectors, self.session.folder)
+        if self.error is None:  # one for all updates: they are compared by their probabilities
+            self.error, self.shared_error = model.error, _seen(model.shared_error.T, readings)
         matrix: Rows = model.matrix
-        prior = self._prior_of_blocks(len(model.parameters))
+        exact, prior = matrix, self._prior_of_blocks(len(model.parameters))
         for columns, mean, sd in self._beside(readings):
             matrix, prior = Beside(matrix, columns), joined(prior, mean, sd)
-        # one noise for all updates: what they find is compared by its probability
-        self.error = model.error if self.error is None else self.error
+            exact = Beside(exact, 0 * columns if columns is self.shared_error else columns)
         magnitudes = self.magnitudes.about(readings, vectors, model, prior)
         errors = magnitudes.with_bend(readings.noise).with_independent_errors(self.error)
         residual, training = readings.values - model.offset, readings.training
         return _Update(
-            readings, vectors, model, matrix, prior, residual, errors, magnitudes,
+            readings, vectors, model, matrix, exact, prior, residual, errors, magnitudes,
             linear_gaussian.update(matrix, residual[training], errors.subset(training), prior,
                                    np.flatnonzero(training)))
 
@@ -379,15 +388,20 @@ class _Search:
             self.of_blocks.gaussian, self.magnet, others)
 
     def _beside(self, readings: Readings) -> Iterator[tuple[Floats, Floats, Floats]]:
-        """Yield derivatives, prior mean and prior standard deviations of what is beside blocks."""
+        """Yield derivatives, prior mean and prior standard deviations of what is beside blocks.
+
+        The solver's error is shared by all readings: it may be any multiple of the change that
+        another discretization makes, normally distributed about 0. As noise that is independent
+        from reading to reading it would average out, and the blocks would take its place.
+        """
         if self.nominal_field is not None:
             columns = amplitude_columns(
                 with_instruments(self.magnet.study, self.maps),
                 self.nominal_field if self.at is None else self.at.field, self.maps, readings)
             yield columns, np.zeros(len(self.amplitudes)), np.ones(len(self.amplitudes))
-        nearby = _neighbour_columns(self.magnet, self.maps, readings)
-        if nearby.size:
-            yield nearby, np.zeros(nearby.shape[1]), np.ones(nearby.shape[1])
+        for each in (_neighbour_columns(self.magnet, self.maps, readings), self.shared_error):
+            if each is not None and each.size:
+                yield each, np.zeros(each.shape[1]), np.ones(each.shape[1])
         if self.at is not None:
             yield (self.terms.columns(self.at.field, self.maps, readings), -self.total,
                    self.terms.sd)
@@ -426,6 +440,7 @@ class _Search:
             regions=readings.regions, maps=readings.maps, response=last.model,
             prior=prior, posterior=posterior, prediction_prior=last.predicted(last.prior),
             prediction_posterior=last.predicted(whole),
+            prediction_exact=last.predicted(last.prior, exact=True),
             prior_conflict=last.update.prior_conflict,
             parameters_learnt=last.update.parameters_learnt,
             log_evidence=last.update.log_evidence,
@@ -446,8 +461,6 @@ class _Search:
 
 def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
     """Return the readings (n, k) in T of what neighbours' blocks deviate, per standard deviation.
-
-    Modes that no reading shows are left out.
     """
     if not magnet.study.external.neighbours:
         return np.zeros((len(readings.values), 0))
@@ -456,10 +469,13 @@ def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) 
         instrument = one.study.instrument
         points = probe_points(instrument, points_of(in_si_and_magnet_axes(instrument, one.data)))
         found.append(neighbour_deviations(magnet, points) @ sensor_matrix(instrument).T)
-    columns = readings.observation.read(np.concatenate(found, axis=1)).T
-    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    # size in noises, over all readings together, below which a mode of neighbours is left out
-    least_size = 0.1
+    return _seen(readings.observation.read(np.concatenate(found, axis=1)).T, readings)
+
+
+def _seen(columns: Floats, readings: Readings) -> Floats:
+    """Return the modes (n, k) in T of columns (n, m) in T, but those that no reading shows."""
+    left, sizes, _ = np.linalg.svd(columns.reshape(len(readings.values), -1), full_matrices=False)
+    least_size = 0.1  # in noises, over all readings together
     seen = sizes > least_size * float(np.median(readings.noise.sd))
     return np.asarray(left[:, seen] * sizes[seen])
 

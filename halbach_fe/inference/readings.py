@@ -129,7 +129,8 @@ class Readings:
             map(part, row_slices(*shape)), shape, folder / "response-of-magnitude.npy")
         # error bars of a component are already those of the vector at its point
         return replace(model, matrix=matrix, offset=self.projection @ model.offset,
-                       error=model.error[self.first])
+                       error=model.error[self.first],
+                       shared_error=(self.projection @ model.shared_error.T).T)
 
     @property
     def training(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -428,6 +428,8 @@ class InferenceResult(ShownInNotebook):
         Distributions of the magnetizations (parameters,) in A/m.
     prediction_prior, prediction_posterior : Prediction
         Their predictions of all readings.
+    prediction_exact : Prediction
+        That of the prior by a solver whose error no readings share.
     prior_conflict : float
         Chi-squared per training reading of the prior's prediction. It is about 1 if prior, model
         and noise are right; see `conflict_limit`.
@@ -488,6 +490,7 @@ class InferenceResult(ShownInNotebook):
     posterior: Gaussian
     prediction_prior: Prediction
     prediction_posterior: Prediction
+    prediction_exact: Prediction
     prior_conflict: float
     parameters_learnt: float
     log_evidence: float

@@ -12,7 +12,7 @@ from math import ceil
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, of_length
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
@@ -92,55 +92,69 @@ def farther(magnet: Magnet, mesh: str, factor: float) -> Magnet:
 def reading_errors(
     magnet: Magnet, observation: Observation, parts: ElementFields, session: Session
 ) -> Floats:
-    """Return the error bar of every reading: its change with another discretization.
+    """Return the error bar (readings,) in T of every reading, see `discretization_changes`."""
+    return error_bars(observation, parts, discretization_changes(
+        magnet, observation.points, parts, session))
 
-    On a 3D mesh the other discretization is the dual formulation on the same mesh: the energies of
-    the two formulations bracket the exact energy, and the two err in opposite directions at the
-    boundary. For the other routes a second mesh is cheap. Their error bar is the sum of the changes
-    made by a coarser mesh and by a farther boundary, which is extrapolated (`BOUNDARY_SERIES`). For
-    azimuthal modes the coarser mesh also has more modes, so that its change contains the modes that
-    were left out, and is extrapolated too (`IRON_SERIES`).
+
+def error_bars(observation: Observation, parts: ElementFields, changes: Floats) -> Floats:
+    """Return the error bars (readings,) in T: the sums of the magnitudes of changes (k, n, 3)."""
+    if parts.error is not None:
+        return observation.largest(np.linalg.norm(changes, axis=2).sum(axis=0))
+    return sum((observation.magnitude(change) for change in changes), np.zeros(len(observation)))
+
+
+def discretization_changes(
+    magnet: Magnet, points: Floats, parts: ElementFields, session: Session
+) -> Floats:
+    """Return the changes of the field that other discretizations make, with their signs.
+
+    Each is as large as the error that it stands for, at all points together. On a 3D mesh the other
+    discretization is the dual formulation on the same mesh: the energies of the two formulations
+    bracket the exact energy, and the two err in opposite directions at the boundary. For the other
+    routes a second mesh is cheap. Their changes are those by a coarser mesh and by a farther
+    boundary, which is extrapolated (`BOUNDARY_SERIES`). For azimuthal modes the coarser mesh also
+    has more modes, so that its change contains the modes that were left out, and is extrapolated
+    too (`IRON_SERIES`).
 
     Parameters
     ----------
     magnet : Magnet
-    observation : Observation
+    points : ndarray, shape (n, 3), in m
     parts : ElementFields
-        The finite-element part of the field at the observation's points.
+        The finite-element part of the field at the points.
     session : Session
         The additional solves have a subfolder of its folder.
 
     Returns
     -------
-    ndarray, shape (readings,), in T
+    ndarray, shape (k, n, 3), in T
     """
     nominal, known = parts.nominal, parts.error
     if known is not None:
         unknown = np.isnan(known).any(axis=1)
         if unknown.any():  # these points were solved for by another route, see `ElementFields`
+            by_modes = _changes_of_modes(magnet, points[unknown], nominal[unknown], session)
             known = known.copy()
-            known[unknown] = np.linalg.norm(np.abs(_changes_of_modes(
-                magnet, observation.points[unknown], nominal[unknown], session)).sum(axis=0),
-                axis=1, keepdims=True)
-        return observation.largest(known.max(axis=1))
+            known[unknown] = of_length(
+                np.sum(by_modes, axis=0), np.linalg.norm(np.abs(by_modes).sum(axis=0), axis=1))
+        return known[None]
     if magnet.study.solver.method == "reaction" and magnet.is_vacuum:
-        return np.zeros(len(observation))  # the field is exact: finite elements add nothing
-    route = choose_route(magnet, observation.points)
+        return np.zeros((0, *points.shape))  # the field is exact: finite elements add nothing
+    route = choose_route(magnet, points)
     if route is Route.AZIMUTHAL_MODES:
-        return sum((observation.magnitude(change) for change in _changes_of_modes(
-            magnet, observation.points, nominal, session)), np.zeros(len(observation)))
+        return np.array(_changes_of_modes(magnet, points, nominal, session))
 
     def change(variant: Magnet, purpose: str) -> Floats:
-        other = finite_element_part(
-            variant, observation.points, _error_bars(session, purpose), columns=False,
-            anywhere=parts.anywhere).nominal
-        return observation.magnitude(other - nominal)
+        return finite_element_part(variant, points, _error_bars(session, purpose), columns=False,
+                                   anywhere=parts.anywhere).nominal - nominal
 
     if route.dual is not None:
-        return change(magnet.with_(solver__route=route.dual.value), "dual route")
+        return change(magnet.with_(solver__route=route.dual.value), "dual route")[None]
     coarser = change(refined(magnet, 1 / REFINEMENT), "coarser mesh")
-    return coarser if route.mesh is None else coarser + BOUNDARY_SERIES[magnet.dimension] * change(
-        farther(magnet, route.mesh, REFINEMENT), "farther boundary")
+    return coarser[None] if route.mesh is None else np.array([
+        coarser, BOUNDARY_SERIES[magnet.dimension] * change(
+            farther(magnet, route.mesh, REFINEMENT), "farther boundary")])
 
 
 def _error_bars(session: Session, purpose: str) -> Session:

@@ -676,7 +676,8 @@ def _reaction(
 
     field, error = np.zeros_like(points), np.zeros_like(points)
     free = place < 0 if solved.blocks else np.ones(len(points), bool)
-    field[free], error[free] = solved.field_with_errors(points[free])
+    field[free], change = solved.field_with_errors(points[free])
+    error[free] = np.linalg.norm(change, axis=1, keepdims=True)
     for block in set(place[~free]):
         here = place == block
         strength, bar = field_within(solved.blocks[0], block, present[block], points[here], sources)

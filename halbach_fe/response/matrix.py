@@ -16,7 +16,7 @@ import io
 import json
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from halbach_fe.response.block_variation import (
     field_changes,
     shared_deviations,
 )
-from halbach_fe.response.discretization_error import reading_errors
+from halbach_fe.response.discretization_error import discretization_changes, error_bars
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.routes import (
     SUPERPOSITION_TOLERANCE,
@@ -144,6 +144,9 @@ class Response:
     error : ndarray, shape (readings,), in T
         Error bar of the finite elements, for the nominal array; see
         `halbach_fe.response.discretization_error.reading_errors`.
+    shared_error : ndarray, shape (k, readings), in T
+        The changes of all readings together that `error` is made of, with their signs; see
+        `halbach_fe.response.discretization_error.discretization_changes`.
     superposition_error : float
         Relative difference between the sum of the blocks' finite-element parts and that of the
         whole array, see `superposition_error`.
@@ -162,6 +165,7 @@ class Response:
     superposition_error: float
     of_similar: bool = False
     reused: bool = False
+    shared_error: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def whole(self) -> Floats:
@@ -208,7 +212,7 @@ def response_matrix(
             magnet, similar, observation, session, _beside(path, key), changes)
     if built is None:
         parts = finite_element_part(magnet, observation.points, session)
-        error = reading_errors(magnet, observation, parts, session)
+        error = discretization_changes(magnet, observation.points, parts, session)
         built = _assemble(magnet, observation, parts, error, _beside(path, key), changes)
         check_superposition(built.superposition_error, parts.superposition_tolerance)
     _write(path, key, built)
@@ -237,7 +241,7 @@ def _similar_response(
     """
     own = session.within("similar")
     parts = finite_element_part(similar, observation.points, own)
-    error = reading_errors(similar, observation, parts, own)
+    error = discretization_changes(similar, observation.points, parts, own)
     nominal = finite_element_part(magnet, observation.points, session, columns=False).nominal
     built = _assemble(magnet, observation, replace(
         parts, nominal=nominal, along_nominal=nominal, sources=magnet.blocks, for_deviations=True),
@@ -256,8 +260,9 @@ def _assemble(
 ) -> Response:
     """Return the response from its finite-element part.
 
-    ``error`` (readings,) in T is the error bar of the finite elements. A large matrix is stored at
-    ``path``. ``changes`` (amplitudes, readings) in T are those of uncertain amplitudes.
+    ``error`` (k, n, 3) in T are the changes of the field by other discretizations. A large matrix
+    is stored at ``path``. ``changes`` (amplitudes, readings) in T are those of uncertain
+    amplitudes.
     """
     blocks, dimension = magnet.blocks, magnet.dimension
     total, magnitude = np.zeros(len(observation)), np.zeros(len(observation))
@@ -295,8 +300,10 @@ def _assemble(
         unequal *= deviation
         field = vacuum_part(magnet, observation.points) + parts.nominal
         offset = observation.apply(field) - matrix @ nominal
-    return Response(matrix, names, nominal, offset, np.hypot(error, unequal),
-                    superposition_error(total, magnitude, direct))
+    return Response(matrix, names, nominal, offset,
+                    np.hypot(error_bars(observation, parts, error), unequal),
+                    superposition_error(total, magnitude, direct),
+                    shared_error=observation.apply(error))
 
 
 def _rows(
@@ -398,7 +405,8 @@ def _write(path: Path, key: str, built: Response) -> None:
     data = xr.Dataset(
         {"nominal": ("parameter", built.nominal, {"units": "A/m"}),
          "offset": ("reading", built.offset, {"units": "T"}),
-         "error": ("reading", built.error, {"units": "T"})},
+         "error": ("reading", built.error, {"units": "T"}),
+         "shared_error": (("change", "reading"), built.shared_error, {"units": "T"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error,
                "of_similar": int(built.of_similar)})
@@ -436,7 +444,9 @@ def _read(path: Path, key: str) -> Response | None:
                         untrusted.finite_array(data["offset"], readings),
                         untrusted.finite_array(data["error"], readings),
                         float(data.attrs["superposition_error"]),
-                        of_similar=bool(data.attrs["of_similar"]), reused=True)
+                        of_similar=bool(data.attrs["of_similar"]), reused=True,
+                        shared_error=untrusted.finite_array(
+                            data["shared_error"], (data.sizes["change"], *readings)))
     except FileNotFoundError:
         return None
     except (OSError, EOFError, KeyError, ValueError, TypeError) as error:

@@ -85,8 +85,8 @@ class WithBar:
     """A reaction of iron that is solved on two meshes: with ``coarse``, the other solution."""
 
     def error(self: Any, points: Floats) -> Floats:
-        """Return the error bar (n, 3) in T of `field`, nan without a coarser solution."""
-        return np.asarray(self.field_with_errors(points)[1])
+        """Return the error bar (n, 1) in T of `field`, nan without a coarser solution."""
+        return np.asarray(np.linalg.norm(self.field_with_errors(points)[1], axis=1, keepdims=True))
 
     def inside(self: Any, points: Floats) -> tuple[Floats, Floats]:
         """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron, and its bar."""
@@ -139,12 +139,14 @@ class IronReaction(WithBar):
             number: self._continued[number] for number in numbers[needed].tolist()}, points)[0]
 
     def field_with_errors(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return `field` and its error bar, the change from the coarser solution, or nan."""
+        """Return `field` and its change from the coarser solution, both (n, 3) in T, or nan.
+
+        The length of the change is the error bar in any direction.
+        """
         found = self.field(points)
         if self.coarse is None:
             return found, np.full_like(found, np.nan)
-        change = np.linalg.norm(found - self.coarse.field(points), axis=1)
-        return found, np.repeat(change[:, None], 3, axis=1)
+        return found, found - self.coarse.field(points)
 
     def strength(self, points: Floats) -> Floats:
         """Return mu_0 H (n, 3) in T of all sources at points (n, 3) in m in iron."""

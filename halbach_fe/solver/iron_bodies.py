@@ -295,15 +295,18 @@ class BodiesReaction(WithBar):
         return _field_of(part, self.polarization[mine], points)
 
     def field_with_errors(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return `field` and `error`, both (n, 3) in T, extrapolated by the coarser solution."""
+        """Return `field` and its change by finer elements, both (n, 3) in T.
+
+        The field is extrapolated by the coarser solution. The length of the change is the error
+        bar in any direction.
+        """
         found = _field_of(self.problem, self.polarization, points)
         if self.coarse is None:
             return found, np.full_like(found, np.nan)
         change = found - self.coarse.field(points)
         away = self._distances(points)
         more, share = (np.interp(away, NEAR_AND_FAR, each)[:, None] for each in (TO_COME, BAR))
-        bar = share * np.linalg.norm(change, axis=1)[:, None]
-        return found + more * change, np.repeat(bar, 3, axis=1)
+        return found + more * change, share * change
 
     def _distances(self, points: Floats) -> Floats:
         """Return distances (n,) of points (n, 3) from the nearest elements, in radii of these."""

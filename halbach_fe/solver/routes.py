@@ -157,8 +157,8 @@ class ElementFields:
         finite-element part (k, 3, D) of the block's B there in T per T of remanence along each of
         the D axes. By symmetry several blocks share one solve.
     error : ndarray, shape (n, 3), in T, or None
-        Error bar of ``nominal``, of any direction and the same for every component, where the
-        solve already yields it, NaN elsewhere; None if it is known nowhere.
+        How far finer elements would change ``nominal``, where the solve already yields it, NaN
+        elsewhere; None if it is known nowhere. Its length is the error bar in any direction.
     for_deviations : bool
         Whether the blocks' parts only serve for deviations from ``nominal``, which is more exact
         than their sum. Derivatives at the nominal array do so too.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, of_length
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks
@@ -78,20 +78,26 @@ class SeparateReaction:
         return field
 
     def field_with_errors(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the reaction and its error bar, both (n, 3) in T, at points (n, 3) in m."""
-        field, error = np.zeros((len(points), 3)), np.zeros((len(points), 3))
+        """Return the reaction and its error, both (n, 3) in T, at points (n, 3) in m.
+
+        The length of the error is the error bar in any direction: the sum of those of the parts.
+        """
+        field, errors = np.zeros((len(points), 3)), [np.zeros((len(points), 3))]
         if self.blocks:
             from halbach_fe.solver.moments.solve import field_with_errors
 
             fine, coarse = self.without_losses or self.blocks
             field, error = field_with_errors(fine, coarse, points)
+            errors.append(error)
         if self.without_losses:
             field = self.blocks[0].reaction(points)
-            error = error + np.linalg.norm(self.error_of_losses(points), axis=1)[:, None]
+            errors.append(self.error_of_losses(points))
         if self.iron is not None:
-            of_iron, bar = self.iron.field_with_errors(points)
-            field, error = field + of_iron, error + bar
-        return field, error
+            of_iron, error = self.iron.field_with_errors(points)
+            field = field + of_iron
+            errors.append(error)
+        return field, of_length(
+            np.sum(errors, axis=0), np.linalg.norm(errors, axis=2).sum(axis=0))
 
     def error_of_losses(self, points: Floats) -> Floats:
         """Return a field (n, 3) in T at points (n, 3) in m as large as the error of the losses."""

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csc_array
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, of_length
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -248,10 +248,11 @@ def refinement(blocks: Sequence[MagnetBlock],
 
 
 def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[Floats, Floats]:
-    """Return the reaction and its error bar, both (n, 3) in T, at points (n, 3) in m.
+    """Return the reaction and its error, both (n, 3) in T, at points (n, 3) in m.
 
-    ``fine`` and ``coarse`` are the solutions of both systems of `refinement`. The bar is
-    share of the length of their difference, see `ERROR_SHARE`, for every component.
+    ``fine`` and ``coarse`` are the solutions of both systems of `refinement`. The error is along
+    their difference. Its length, a share of that of the difference (`ERROR_SHARE`), is the error
+    bar in any direction.
     """
     field, other = fine.reaction(points), coarse.reaction(points)
     change, size = (np.linalg.norm(value, axis=1) for value in (field - other, field))
@@ -265,7 +266,7 @@ def field_with_errors(fine: Moments, coarse: Moments, points: Floats) -> tuple[F
     slower = 1 + fine.susceptibility**2
     less_sure = 10 * fine.susceptibility**2
     bar = slower * share * change + (1 + less_sure) * floor * size
-    return field, np.repeat(bar[:, None], 3, axis=1)
+    return field, of_length(field - other, bar)
 
 
 def field_within(
@@ -339,13 +340,14 @@ def reaction_with_errors(
     blocks: Sequence[MagnetBlock], points: Floats, applied: Applied | None = None,
     cells_per_side: int | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the reaction (n, 3) in T of the blocks at points (n, 3) in m, and its error bars.
+    """Return the reaction (n, 3) in T of the blocks at points (n, 3) in m, and its bars (n, 1).
 
     See `solve_moments` for the other arguments; fewer than two cells a side are not possible, since
     half as many give the bars.
     """
     fine, coarse = (system.solve(applied) for system in refinement(blocks, cells_per_side))
-    return field_with_errors(fine, coarse, points)
+    field, error = field_with_errors(fine, coarse, points)
+    return field, np.linalg.norm(error, axis=1, keepdims=True)
 
 
 ENTRIES_AT_ONCE = 40_000_000
