@@ -460,8 +460,7 @@ class _Search:
 
 
 def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
-    """Return the readings (n, k) in T of what neighbours' blocks deviate, per standard deviation.
-    """
+    """Return readings (n, k) in T of neighbours' blocks that deviate by a standard deviation."""
     if not magnet.study.external.neighbours:
         return np.zeros((len(readings.values), 0))
     found = []

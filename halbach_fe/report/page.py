@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.legend import Legend
 from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.path import Path as Outline
 from matplotlib.ticker import FuncFormatter, LogFormatter
 from scipy.spatial import ConvexHull
 from tomlkit.items import Array, Trivia, Whitespace
@@ -38,6 +39,7 @@ from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
 from halbach_fe.core.result_folder import result_folder
+from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.measurement.positions import points_from
@@ -591,6 +593,23 @@ def _inner_radii(magnet: Magnet) -> list[float]:
     return list(found.values())
 
 
+def _side_of(body: IronSolid) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the limits in m of a body along z, and of its distances from the z axis.
+
+    Of a body that is no tube they are those of the hull of its shadow along z.
+    """
+    x, y, z = (part.ravel() for part in body.surface)
+    reach, ends = float(np.hypot(x, y).max()), (float(z.min()), float(z.max()))
+    if body.is_coaxial:
+        return ends, (body.inner_radius, reach)
+    shadow = np.column_stack([x, y])
+    corners = shadow[ConvexHull(shadow).vertices]
+    t = np.linspace(0, 1, 33)[:, None, None]
+    sides = (1 - t) * corners + t * np.roll(corners, -1, axis=0)
+    inside = Outline(corners).contains_point((0, 0))
+    return ends, (0.0 if inside else float(np.linalg.norm(sides, axis=2).min()), reach)
+
+
 def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
     """Draw the positions of readings in the cross-section of the magnet.
 
@@ -616,6 +635,10 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
             axis.add_patch(Rectangle(
                 (1e3 * z_limits[0], 1e3 * inner), 1e3 * (z_limits[1] - z_limits[0]),
                 1e3 * (outer - inner), fill=False, color="#777777", lw=0.6))
+        for body in magnet.iron:
+            (start, end), (inner, outer) = _side_of(body)
+            axis.add_patch(Rectangle((1e3 * start, 1e3 * inner), 1e3 * (end - start),
+                                     1e3 * (outer - inner), fill=False, color=IRON, lw=0.8))
     for positions, marker, colour, name in ((points, ".", POSTERIOR, "positions"),
                                             (others, "x", PRIOR, "held out")):
         if positions is None:
