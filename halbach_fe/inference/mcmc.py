@@ -33,6 +33,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import InferenceResult, Prediction
 from halbach_fe.response.nonlinear import NonlinearModel, compare_with_newton, nonlinear_model
 from halbach_fe.solver.session import Session
+from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.pcn import (
     Chain,
     ConvergenceDiagnostics,
@@ -155,26 +156,28 @@ def sample_posterior(
         raise SamplingError(f"Input draws must be at least {min_draws} of each chain; instead "
                             f"received {draws}. About 1500 are usual.")
     check_sampling(update.magnet)
+    root = np.asarray(update.prior.root)
+    # without the coordinates of what is no parameter of the blocks, such as the solver's error
+    prior = Gaussian(update.prior.mean, root[:, root.any(axis=0)])
     model = nonlinear_model(update.magnet, update.observation, session,
-                            np.random.default_rng(seed), update.prior)
+                            np.random.default_rng(seed), prior)
     train = ~update.held_out
     errors = update.noise.with_independent_errors(model.error).subset(train)
     tolerance = max(smallest_tolerance_t,
                     likelihood_error * errors.uniform_error_scale / len(errors))
-    target = Posterior(_Readings(model, tolerance, train), update.readings[train], errors,
-                       update.prior)
+    target = Posterior(_Readings(model, tolerance, train), update.readings[train], errors, prior)
     reference, _ = laplace(target, lambda p: model.jacobian(p)[train])
     generators = [np.random.default_rng(part)
                   for part in np.random.SeedSequence(seed).spawn(chains)]
     moves = [Proposal(reference, step) for step in LAPLACE_STEPS] + [
-        Proposal(prior_reference(update.prior), PRIOR_STEP)]
+        Proposal(prior_reference(prior), PRIOR_STEP)]
     say(f"mode found; {chains} chains of {draws} draws")
     path = session.folder / "chains.nc"
     runs = [_Run(generator, reference.to_z(
         overdispersed * generator.standard_normal(len(reference.centre))))
         for generator in generators]
     key = _key(update, model, chains, seed)
-    target.solves += _resume(path, key, runs)
+    target.solves += _resume(path, key, runs, len(model.parameters))
     while len(runs[0].samples) < draws:
         steps = [(target, moves, min(chunk, draws - len(run.samples)), run.generator, run.last,
                   len(run.samples)) for run in runs]
@@ -332,7 +335,7 @@ def _store(
         temporary.write_bytes(content.getvalue())
 
 
-def _resume(path: Path, key: str, runs: list[_Run]) -> int:
+def _resume(path: Path, key: str, runs: list[_Run], parameters: int) -> int:
     """Continue the stored chains of an interrupted run; return the number of its solves.
 
     The stored chains are ignored, and 0 is returned, if they belong to other inputs or the file is
@@ -347,7 +350,7 @@ def _resume(path: Path, key: str, runs: list[_Run]) -> int:
         last = untrusted.finite_array(state["last"], (count, len(runs[0].last)))
         accepted = untrusted.finite_array(state["accepted"], (count,))
         stored = read_hdf5(path, "posterior")["magnetization"]
-        samples = untrusted.finite_array(stored, (count, stored.shape[1], len(runs[0].last)))
+        samples = untrusted.finite_array(stored, (count, stored.shape[1], parameters))
         generators = [np.random.default_rng() for _ in runs]
         states = json.loads(state.attrs["generators"])
         for generator, generator_state in zip(generators, states, strict=True):

@@ -256,7 +256,7 @@ def resumed(path: Path) -> tuple[int, list[_Run], list[dict]]:
     """What of an interrupted run goes on, with the states that nothing had gone on from."""
     runs = [_Run(np.random.default_rng(n + 10), np.full(2, 9.0)) for n in range(2)]
     before = [run.generator.bit_generator.state for run in runs]
-    return mcmc._resume(path, "the key", runs), runs, before
+    return mcmc._resume(path, "the key", runs, 2), runs, before
 
 
 def check_resumed(found: tuple[int, list[_Run], list[dict]]) -> None:

@@ -139,9 +139,9 @@ def test_changed_chains(tmp_path, group, name):
                 for n in range(2)]
 
     mcmc._store(path, "key", runs(), ("a", "b"), 7)
-    assert mcmc._resume(path, "key", runs()) == 7
-    assert mcmc._resume(path, "other key", runs()) == 0
+    assert mcmc._resume(path, "key", runs(), 2) == 7
+    assert mcmc._resume(path, "other key", runs(), 2) == 0
     with h5py.File(path, "r+") as file:
         file[group][name][(0,) * file[group][name].ndim] += 1e-9
     with pytest.warns(HalbachWarning, match="starts anew"):
-        assert mcmc._resume(path, "key", runs()) == 0
+        assert mcmc._resume(path, "key", runs(), 2) == 0
