@@ -406,7 +406,8 @@ def _write(path: Path, key: str, built: Response) -> None:
         {"nominal": ("parameter", built.nominal, {"units": "A/m"}),
          "offset": ("reading", built.offset, {"units": "T"}),
          "error": ("reading", built.error, {"units": "T"}),
-         "shared_error": (("change", "reading"), built.shared_error, {"units": "T"})},
+         "shared_error": (("change", "reading"), built.shared_error.reshape(
+             -1, len(built.offset)), {"units": "T"})},
         coords={"parameter": list(built.parameters)},
         attrs={"key": key, "superposition_error": built.superposition_error,
                "of_similar": int(built.of_similar)})
