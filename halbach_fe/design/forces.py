@@ -50,6 +50,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, rotation_matrix, vector
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.solver.coil_field import current_elements
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.iron_bodies import BodiesReaction
@@ -414,10 +415,7 @@ def _middle(block: MagnetBlock) -> Floats:
 
 def _reach(block: MagnetBlock) -> float:
     """Return the radius in m of a sphere about the middle that contains the block."""
-    t = np.linspace(0.0, 1.0, 5)
-    outline = np.vstack([edge.at(t)[0] for edge in block.outline])
-    points = block.from_frame(np.vstack([
-        np.column_stack([outline, np.full(len(outline), z)]) for z in (block.z_min, block.z_max)]))
+    points = block.from_frame(at_heights(along_edges(block.outline, 5), block.z_min, block.z_max))
     return float(np.linalg.norm(points - _middle(block), axis=1).max())
 
 
@@ -517,8 +515,7 @@ def _ends(block: MagnetBlock, flat: Floats, area: Floats) -> Iterator[tuple[Floa
     """Yield points and area vectors of both ends of a block, see `_faces`."""
     zero = np.zeros(len(flat))
     for z, sign in ((block.z_min, -1), (block.z_max, 1)):
-        yield (np.column_stack([flat, np.full(len(flat), z)]),
-               np.column_stack([zero, zero, sign * area]))
+        yield at_heights(flat, z), np.column_stack([zero, zero, sign * area])
 
 
 def _graded(order: int) -> tuple[Floats, Floats]:

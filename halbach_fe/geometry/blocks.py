@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outline_part, ring_radii
+from halbach_fe.geometry.outline import (
+    Outline,
+    along_edges,
+    at_heights,
+    mean_corner,
+    outline_area,
+    outline_part,
+    ring_radii,
+)
 from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
 from halbach_fe.study.materials import MU_0
 
@@ -285,16 +293,13 @@ def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
     free, by points on their outlines, at least 1e-4 m. If a block covers the axis, it is how far
     the block's outline is from it.
     """
-    t = np.linspace(0.0, 1.0, 17)
     smallest = np.inf
     for block in blocks:
-        outline = np.vstack([edge.at(t)[0] for edge in block.outline])
+        outline = along_edges(block.outline, 17)
         if any(block.orientation_rad) or any(block.origin_m):
             heights = [0.0] if np.isinf(block.z_max) else np.linspace(block.z_min, block.z_max, 9)
             nominal = rotation_matrix(block.orientation_rad)
-            outline = np.vstack([
-                (np.column_stack([outline, np.full(len(outline), z)]) @ nominal.T
-                 + block.origin_m)[:, :2] for z in heights])
+            outline = (at_heights(outline, *heights) @ nominal.T + block.origin_m)[:, :2]
         smallest = min(smallest, float(np.hypot(*outline.T).min()))
     return max(smallest, 1e-4)
 

@@ -15,7 +15,7 @@ from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.convex_pieces import triangles_of_polygon
 from halbach_fe.geometry.free_blocks import counter_clockwise
-from halbach_fe.geometry.outline import Outline, closed_outline
+from halbach_fe.geometry.outline import Outline, along_edges, closed_outline
 from halbach_fe.geometry.surface import (
     Contact,
     contact_of_prism,
@@ -239,8 +239,7 @@ def _prism(corners: Floats, ends: tuple[float, float], holes: tuple[IronHole, ..
     """Return a prism on a polygon (n, 2) in m with holes, which are yet to be turned (2, 2)."""
     axes = np.eye(2) if turn is None else turn
     outline = closed_outline(corners @ axes.T)
-    t = np.linspace(0.0, 1.0, 17)
-    radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
+    radii = np.hypot(*along_edges(outline, 17).T)
     solid = IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
     if not holes or np.isinf(ends).any():  # in 2D the study is refused
         return replace(solid, holes=tuple(hole.corners for hole in holes))

@@ -23,7 +23,7 @@ from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ri
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
 from halbach_fe.geometry.coils import in_winding, points_in_winding
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
-from halbach_fe.geometry.outline import points_on
+from halbach_fe.geometry.outline import at_heights, points_on
 from halbach_fe.geometry.overlaps import (
     block_in_iron,
     block_in_others,
@@ -197,10 +197,8 @@ class Magnet(ShownInNotebook):
         """
         found = []
         for block in self.blocks:
-            outline = points_on(block.outline)
-            ends = [0.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
-            points = np.vstack([np.column_stack([outline, np.full(len(outline), z)])
-                                for z in ends])
+            ends = (0.0,) if np.isinf(block.z_max) else (block.z_min, block.z_max)
+            points = at_heights(points_on(block.outline), *ends)
             found.append(points @ rotation_matrix(block.orientation_rad).T + block.origin_m)
         return tuple(found)
 

@@ -81,6 +81,16 @@ def points_on(outline: Outline) -> Floats:
     return points
 
 
+def along_edges(outline: Outline, per_edge: int) -> Floats:
+    """Return points (n, 2) in m along an outline, evenly spread over each edge, ends and all."""
+    return np.vstack([edge.at(np.linspace(0.0, 1.0, per_edge))[0] for edge in outline])
+
+
+def at_heights(flat: Floats, *heights: float) -> Floats:
+    """Return points (n, 2) at each of some heights, (heights n, 3), in m."""
+    return np.vstack([np.column_stack([flat, np.full(len(flat), z)]) for z in heights])
+
+
 @lru_cache(maxsize=4096)
 def mean_corner(outline: Outline) -> tuple[float, float]:
     """Return the mean of the corners of an outline, in m."""

@@ -20,7 +20,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_matrix
 from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.outline import Outline, along_edges, at_heights
 from halbach_fe.geometry.surface import distance_from_prism
 
 ALLOWED_PENETRATION = 1e-6
@@ -160,9 +160,8 @@ def points_of_block(block: MagnetBlock, depth: float = 0.0) -> Floats:
     """Return points (n, 3) in m along the edges of a finite block, ``depth`` m deep, and in its
     middle.
     """
-    edges = np.vstack([edge.at(np.linspace(0, 1, 5))[0] for edge in block.outline])
-    points = np.vstack([np.column_stack([edges, np.full(len(edges), z)]) for z in (
-        block.z_min, (block.z_min + block.z_max) / 2, block.z_max)])
+    points = at_heights(along_edges(block.outline, 5), block.z_min, (block.z_min + block.z_max) / 2,
+                        block.z_max)
     middle = (points.max(axis=0) + points.min(axis=0)) / 2
     shrunk = 1 - 2 * depth / np.ptp(points, axis=0).min()
     return block.from_frame(np.vstack([middle + shrunk * (points - middle), middle]))

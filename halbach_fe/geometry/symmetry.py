@@ -26,7 +26,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Outline, outline_contains, points_on
+from halbach_fe.geometry.outline import Outline, at_heights, outline_contains, points_on
 from halbach_fe.study.array import Array
 from halbach_fe.study.magnet import External
 
@@ -477,10 +477,8 @@ def _fits(block: MagnetBlock, shrunk: Floats) -> bool:
 @lru_cache(maxsize=4096)
 def _corners(block: MagnetBlock) -> Floats:
     """Return points (n, 3) in m on the edges of a block; of an infinite one, at |z| of 1 m."""
-    ends = [-1.0, 1.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
-    outline = points_on(block.outline)
-    corners = block.from_frame(np.vstack([
-        np.column_stack([outline, np.full(len(outline), z)]) for z in ends]))
+    ends = (-1.0, 1.0) if np.isinf(block.z_max) else (block.z_min, block.z_max)
+    corners = block.from_frame(at_heights(points_on(block.outline), *ends))
     corners.flags.writeable = False
     return corners
 

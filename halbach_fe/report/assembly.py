@@ -19,7 +19,7 @@ from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import LEVEL_M, Plate
 from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_text
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import circle
+from halbach_fe.geometry.outline import at_heights, circle
 from halbach_fe.geometry.prism import Prism, upright
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -317,8 +317,8 @@ def _outline_mm(one: AssembledBlock) -> Floats:
     prism = upright(one.block)
     if prism is not None:
         return 1e3 * prism.polygon
-    corners = np.array([[*edge.start, one.block.z_min] for edge in one.block.outline])
-    return np.asarray(1e3 * one.block.from_frame(corners)[:, :2])
+    corners = np.array([edge.start for edge in one.block.outline])
+    return np.asarray(1e3 * one.block.from_frame(at_heights(corners, one.block.z_min))[:, :2])
 
 
 def common_beginning(serials: Sequence[str]) -> str:

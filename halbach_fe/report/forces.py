@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.design.forces import Forces, Loads
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -288,14 +289,9 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
     """Draw the blocks of the ring with the largest force, coloured, with arrows of their forces."""
     size = found.in_place.magnitude
     chosen = _drawn_ring(found)
-    t = np.linspace(0, 1, 9)
-    corners = []
-    for number in chosen:
-        block = found.blocks[number]
-        outline = np.vstack([edge.at(t)[0] for edge in block.outline])
-        height = (block.z_min + block.z_max) / 2
-        corners.append(1e3 * block.from_frame(
-            np.column_stack([outline, np.full(len(outline), height)]))[:, :2])
+    corners = [1e3 * block.from_frame(at_heights(
+        along_edges(block.outline, 9), (block.z_min + block.z_max) / 2))[:, :2]
+        for block in (found.blocks[number] for number in chosen)]
     colours = Normalize(0, float(size[chosen].max()) or 1.0)
     if _is_numbered(found):
         outside = 1.1 * max(float(np.hypot(*corner.T).max()) for corner in corners)

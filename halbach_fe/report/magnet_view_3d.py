@@ -17,7 +17,7 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Edge, outline_contains
+from halbach_fe.geometry.outline import Edge, at_heights, outline_contains
 from halbach_fe.inference.result import InferenceResult
 from halbach_fe.report.page import IRON, MEASURED, SECOND, Plain
 from halbach_fe.report.words import flux_density, place_of
@@ -511,8 +511,7 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     ahead = (ring + 1) % count
     sides = np.vstack([np.column_stack([ring, ahead, ahead + count]),
                        np.column_stack([ring, ahead + count, ring + count])])
-    corners = np.vstack([np.column_stack([flat, np.full(count, z)]) for z in (low, high)])
-    return block.from_frame(corners), np.vstack([face, face + count, sides])
+    return block.from_frame(at_heights(flat, low, high)), np.vstack([face, face + count, sides])
 
 
 def _triangles(outline: tuple[Edge, ...], flat: Floats) -> Ints:

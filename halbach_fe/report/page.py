@@ -39,6 +39,7 @@ from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.tables import write_csv
@@ -529,16 +530,13 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
     # numbered: those of an inner layer have the same slots.
     outermost = 0.9
     most_numbered = 40  # largest number of blocks in a cross-section whose slots are numbered
-    t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
         block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
     reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
     numbered = reach > 0 and len(shown) <= most_numbered
-    outlines = []
-    for block in shown:
-        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
-        outlines.append(1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2])
+    outlines = [1e3 * block.from_frame(at_heights(along_edges(block.outline, 9), 0.0))[:, :2]
+                for block in shown]
     if len(shown) > MOST_POINTING:
         axis.plot(*np.vstack([part for outline in outlines for part in (
             outline, [[np.nan, np.nan]])]).T, color=colour, lw=0.3)
@@ -583,10 +581,9 @@ def _inner_radii(magnet: Magnet) -> list[float]:
     """
     if len(magnet.blocks) > MOST_MEASURED:
         return [inner for _, (inner, _) in magnet.ring_sections]
-    t, found = np.linspace(0, 1, 33), dict[int, float]()
+    found = dict[int, float]()
     for block in magnet.blocks:
-        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
-        x, y, _ = block.from_frame(np.column_stack([edges, 0 * edges[:, 0]])).T
+        x, y, _ = block.from_frame(at_heights(along_edges(block.outline, 33), 0.0)).T
         found[block.ring] = min(float(np.hypot(x, y).min()), found.get(block.ring, np.inf))
     return list(found.values())
 

@@ -36,6 +36,7 @@ from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.coils import points_in_winding
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
+from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import Deviations
@@ -736,7 +737,7 @@ def _integrals_of_coils(
     wave = np.exp(-1j * np.outer(np.arange(highest), angle)) / len(angle)
 
     def harmonics(z: float) -> Floats:
-        field = external_field(alone, np.column_stack([circle[:, :2], np.full(len(circle), z)]))
+        field = external_field(alone, at_heights(circle[:, :2], z))
         found = wave @ (field[:, 1] + 1j * field[:, 0])
         return np.concatenate([found.real, found.imag])
 

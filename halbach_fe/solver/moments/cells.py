@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of
-from halbach_fe.geometry.outline import Edge, Outline
+from halbach_fe.geometry.outline import Edge, Outline, at_heights
 
 CHORD = np.pi / 6
 """Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
@@ -195,7 +195,7 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     turn[:, 1, 0], turn[:, 0, 1] = np.sin(angle), -np.sin(angle)
     turn[:, 2, 2] = 1.0
     local = np.einsum("nci,nij->ncj", local, turn[:, :2, :2])
-    places = np.concatenate([np.column_stack([middle, np.full(len(middle), z)]) for z in levels])
+    places = at_heights(middle, *levels)
     return (places, np.tile(turn, (layers, 1, 1)), np.tile(local, (layers, 1, 1)),
             np.full(len(places), height / layers / 2), np.tile(cuboid, layers))
 
