@@ -46,6 +46,7 @@ from halbach_fe.report.page import Drawn, Page, Rows, Section, Table, View
 from halbach_fe.report.words import (
     BAYES_FACTOR_IN_WORDS,
     bayes_factor,
+    capital,
     decimals,
     flux_density,
     fraction,
@@ -321,7 +322,7 @@ def _further_measurements(
     """Return what the page shows on measurements that distinguish an effect from its rivals."""
     candidates = {candidate.name: candidate.title for pair in own for candidate in pair.candidates}
     what = title_of(identified.hypothesis.effect.name, titles)
-    return [*(f"{what[0].upper()}{what[1:]}, or {title_of(pair.rival.effect.name, titles)}? " + (
+    return [*(f"{capital(what)}, or {title_of(pair.rival.effect.name, titles)}? " + (
         f"**Measure next: {pair.recommended.title}.**" if pair.recommended else
         "None of the measurements below would distinguish them.") for pair in own), Table([
             {"measurement": title} | {

@@ -31,7 +31,7 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
 )
-from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_error
+from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_unit
 from halbach_fe.study.types import COMPONENTS
 
 LISTED = 12
@@ -176,7 +176,7 @@ def _rows(found: Forces) -> Rows:
         block, size = found.blocks[number], found.in_place.magnitude[number]
         rows.append({
             "block": place_of(block),
-            "force": with_error(size, float(found.in_place.error_N[number])) + "\u00a0N",
+            "force": with_unit(size, float(found.in_place.error_N[number]), "N"),
             "direction": (direction_in_words(block, found.in_place.force_N[number])
                           if size > NEGLIGIBLE else "none"),
             "torque": decimals(float(np.linalg.norm(found.in_place.torque_Nm[number])))
@@ -191,7 +191,7 @@ def _iron_rows(found: Forces) -> Rows:
     if found.iron is None:
         return []
     sizes = np.linalg.norm(found.iron.force_N, axis=1)
-    return [{"iron": name, "force": with_error(size, error) + "\u00a0N",
+    return [{"iron": name, "force": with_unit(size, error, "N"),
              "direction (x, y, z)": _numbers(force / size) if size > error else "none that is sure"}
             for name, force, size, error in zip(
                 found.iron.names, found.iron.force_N, sizes.tolist(),

@@ -39,7 +39,7 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
 )
-from halbach_fe.report.words import decimals, flux_density, ppm, with_error
+from halbach_fe.report.words import decimals, flux_density, ppm, with_error, with_unit
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 from halbach_fe.response.stray_field import NEAREST, StrayField
 from halbach_fe.study.model import Study
@@ -169,7 +169,7 @@ def _known_as(name: str) -> str:
 
 def _field(known: Homogeneity) -> str:
     """Return mean field and standard deviation as text, in mT."""
-    return f"{with_error(1e3 * known.mean_T, 1e3 * known.mean_sd_T)}\u00a0mT"
+    return with_unit(known.mean_T, known.mean_sd_T, "mT")
 
 
 def direction_in_words(unit: Floats, sd_rad: float) -> str:
@@ -181,7 +181,7 @@ def direction_in_words(unit: Floats, sd_rad: float) -> str:
     axis = f"along {'-' if unit[main] < 0 else '+'}{'xyz'[main]}"
     if off <= LEAST_OF_SD * sd_rad:
         return f"{axis} ± {decimals(1e3 * sd_rad, 2)}\u00a0mrad"
-    return f"{axis}, {with_error(1e3 * off, 1e3 * sd_rad)}\u00a0mrad off it"
+    return f"{axis}, {with_unit(off, sd_rad, 'mrad')} off it"
 
 
 def _cancels(known: Homogeneity) -> bool:

@@ -49,6 +49,7 @@ from halbach_fe.report.point_maps import (
     whitened_quantiles_figure,
 )
 from halbach_fe.report.words import (
+    capital,
     decimals,
     flux_density,
     listed,
@@ -58,6 +59,7 @@ from halbach_fe.report.words import (
     relative,
     rms,
     with_error,
+    with_unit,
 )
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.magnetic_axis import MagneticAxis
@@ -195,7 +197,7 @@ def axis_rows(axis: MagneticAxis | None) -> Rows:
             ("magnetic axis, d{}/dz", "mrad", "xy", axis.slope_rad, axis.slope_sd_rad),
             (f"roll about z{where}", "mrad", "z", [axis.roll_rad], [axis.roll_sd_rad])):
         if values is not None and bars is not None:
-            found |= {what.format(name): f"{with_error(1e3 * value, 1e3 * sd)}\u00a0{unit}"
+            found |= {what.format(name): with_unit(value, sd, unit)
                       for name, value, sd in zip(names, values, bars, strict=False)}
     return [{"of the updated magnet": what, "value": value} for what, value in found.items()]
 
@@ -224,7 +226,7 @@ ALONE = "by the readings alone"
 
 SHRUNK = (
     "± along the easy axis counts on what was known of the block before: one that is farther off "
-    f"than that is shown too near to the nominal one. “{ALONE[0].upper()}{ALONE[1:]}” leaves out "
+    f"than that is shown too near to the nominal one. “{capital(ALONE)}” leaves out "
     "what was known before of that block.")
 """What the columns of the table of blocks mean."""
 

@@ -19,6 +19,7 @@ from halbach_fe.report.words import (
     place_of,
     rms,
     with_error,
+    with_unit,
 )
 from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.types import COMPONENTS
@@ -273,9 +274,9 @@ def _blocks(result: InferenceResult, start: str = (
                 f"{start} by {sign}{decimals(100 * mean[worst], 2)}\u00a0%.")
     if mean[worst] < -1:
         return (f"{start}, which is reversed: magnetized the other way round, with "
-                f"{with_error(-100 * (1 + mean[worst]), 100 * sd)}\u00a0% of its strength.")
+                f"{with_unit(-(1 + mean[worst]), sd, '%')} of its strength.")
     return (f"{start} by {'+' if mean[worst] > 0 else ''}"
-            f"{with_error(100 * mean[worst], 100 * sd)}\u00a0%.")
+            f"{with_unit(mean[worst], sd, '%')}.")
 
 
 def _field(size: float) -> str:

@@ -22,7 +22,7 @@ from halbach_fe.report.page import (
     figure_of,
     legend_above,
 )
-from halbach_fe.report.words import decimals, fraction, rms
+from halbach_fe.report.words import capital, decimals, fraction, rms
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
@@ -61,7 +61,7 @@ def answer(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats) -> Answ
     sound = abs(ratio - 1) <= 3 * spread
     return Answer(
         "How near are the inferred magnetizations to the true ones?",
-        f"{name[0].upper()}{name[1:]}: {1e-3 * left:.2g} kA/m rms in each component, "
+        f"{capital(name)}: {1e-3 * left:.2g} kA/m rms in each component, "
         f"{fraction(left / size)} of a block's magnetization. Before the readings it was "
         f"{1e-3 * first:.2g} kA/m.",
         ("Yes: the" if sound else "No: the") + f" errors are {decimals(ratio, 2)} times the stated "

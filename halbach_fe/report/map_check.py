@@ -44,12 +44,14 @@ from halbach_fe.report.page import (
 from halbach_fe.report.point_maps import draw, panels
 from halbach_fe.report.words import (
     by_axis,
+    capital,
     decimals,
     flux_density,
     in_a_row,
     point_mm,
     relative,
     with_error,
+    with_unit,
 )
 from halbach_fe.study.types import COMPONENTS
 
@@ -227,8 +229,7 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
 def _length(size: float, sd: float = 0.0) -> str:
     """Return a length in m, and its standard deviation, in µm, or in mm from 1 mm on."""
     unit, factor = ("mm", 1e3) if size >= 1e-3 else ("µm", 1e6)
-    text = with_error(factor * size, factor * sd) if sd else decimals(factor * size, 2)
-    return f"{text}\u00a0{unit}"
+    return with_unit(size, sd, unit) if sd else f"{decimals(factor * size, 2)}\u00a0{unit}"
 
 
 def _range(low: float, high: float) -> str:
@@ -570,7 +571,7 @@ def joined_answer(joined: JoinedMaps) -> Answer:
     said = "; ".join(
         f"the middle of {pose.name} is {point_mm(pose.shift_m, pose.shift_sd_m)}\u00a0mm from "
         f"where it would be if its stage were that of {first}" for pose in joined.poses)
-    said = (f"{said[0].upper()}{said[1:]}." if joined.agree else
+    said = (f"{capital(said)}." if joined.agree else
             f"If they are of one field, {said}.")
     worst = max(joined.overlaps, key=lambda one: one.chi2)
     turned, undetermined = [pose.name for pose in joined.poses if pose.is_turned], _open(joined)

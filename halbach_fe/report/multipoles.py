@@ -31,7 +31,14 @@ from halbach_fe.report.page import (
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
+from halbach_fe.report.words import (
+    capital,
+    decimals,
+    faults_in_words,
+    probability,
+    with_error,
+    with_unit,
+)
 from halbach_fe.response.multipoles import (
     DEFAULT_ORDERS,
     MultipoleModel,
@@ -344,8 +351,7 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
         spread = _size_sd(others)
         worst = int(np.argmax(np.hypot(others.sizes, spread)))
         size, own = (1e3 * float(each[worst]) for each in (others.sizes, spread))
-        place = place_of(model)
-        return (f"{place[0].upper()}{place[1:]}: there is no main multipole, of order "
+        return (f"{capital(place_of(model))}: there is no main multipole, of order "
                 f"{model.main}, but for errors of the blocks, {main_in_words(model, known)}. "
                 f"The largest other one, of order {known.orders[worst]}, is "
                 f"{with_error(size, own)}\u00a0µ{model.unit} itself.")
@@ -353,7 +359,7 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
         "Of the field integrated along z, " if model.integrated else f"On {place_of(model)}, ")
     start = f"{where}the largest unwanted multipole " + (
         "is that" if known.sizes[worst] > sd else "is not known: it may be that")
-    text = (f"{start[0].upper()}{start[1:]} of order {known.orders[worst]} with "
+    text = (f"{capital(start)} of order {known.orders[worst]} with "
             f"{with_error(float(known.sizes[worst]), sd)} units, which are 1e-4 of the main one, "
             f"{main_in_words(model, known)}.")
     if limit is not None:
@@ -373,7 +379,7 @@ def place_of(model: MultipoleModel) -> str:
 
 def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
     """Return the main multipole and its standard deviation in mT, or mT m if integrated."""
-    return f"{with_error(1e3 * known.main, 1e3 * known.main_sd)}\u00a0m{model.unit}"
+    return with_unit(known.main, known.main_sd, f"m{model.unit}")
 
 
 def page(found: MultipoleTables) -> Page:

@@ -26,7 +26,7 @@ from halbach_fe.report.page import (
     Text,
     figure_of,
 )
-from halbach_fe.report.words import counted, fraction, p_value, rms, with_error
+from halbach_fe.report.words import counted, fraction, p_value, rms, with_unit
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -139,7 +139,7 @@ def answer(prior: MeasuredPrior) -> Answer:
     common = float(prior.gaussian.sd_of(weights[None])[0])
     side = "stronger" if strength > 0 else "weaker"
     said = (f"On average the {counted(prior.count, 'measured block')} are "
-            f"{with_error(100 * abs(strength), 100 * common)}\u00a0% {side} than the study says. "
+            f"{with_unit(abs(strength), common, '%')} {side} than the study says. "
             "In length and direction together they deviate from it by "
             f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
             + (", most of which is the calibration of the coil, which all blocks share"

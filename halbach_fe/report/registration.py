@@ -66,7 +66,8 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     point_mm,
-    with_error,
+    with_unit,
+    within_a_sentence,
 )
 from halbach_fe.report.words import probability as in_per_cent
 from halbach_fe.study.measurement import Instrument
@@ -140,13 +141,13 @@ def answer(
     trust = [*_other_poses(found), *_reversed(best, assumed), _fit(best, before)]
     stated = assumed or Instrument()
     if best.explains and not best.at_rest:
-        said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
+        said = f"That is not found yet. The best answer so far: {within_a_sentence(said)}"
     if best.explains:
         said = _component(found) + said
         trust.insert(0, _verdict(found, name))
     else:
         said = (f"This magnet does not explain the map. The least bad answer{least_bad}: "
-                f"{said[0].lower()}{said[1:]}")
+                f"{within_a_sentence(said)}")
         trust.insert(0, (
             f"No. Even in the best pose and with updated blocks chi² is {decimals(best.chi2)} per "
             "reading, where about 1 is expected: the map is of another magnet, its noise is larger "
@@ -171,8 +172,8 @@ def _apart(best: Registration, name: str) -> str:
     said = []
     for one in best.apart:
         where, axis = one.name.split("_")
-        unit, factor = UNITS[one.unit]
-        said.append(f"{with_error(factor * one.value, factor * one.prior_sd)}\u00a0{unit} {where} "
+        unit, _ = UNITS[one.unit]
+        said.append(f"{with_unit(one.value, one.prior_sd, unit)} {where} "
                     f"{axis} of the stage ({decimals(one.distance, 2)} standard deviations)")
     return (f"No. The magnet's model wants map {name} {in_a_row(said)} from where its overlap with "
             f"the other maps has it. {MOVES_A_SECTION}")
@@ -516,9 +517,7 @@ def probe_table(best: Registration) -> Rows:
     instrument, sd = best.instrument, best.probe
 
     def row(what: str, value: float, bar: float, unit: str) -> dict[str, str]:
-        factor = 100 if unit == "%" else 1e3
-        return {"of the probe": what,
-                "value": f"{with_error(factor * value, factor * bar)}\u00a0{unit}"}
+        return {"of the probe": what, "value": with_unit(value, bar, unit)}
 
     def sensor(name: str, number: int) -> Rows:
         return [row(f"gain of {name}", instrument.gain[number], sd.gain, "%"),

@@ -26,7 +26,7 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
 )
-from halbach_fe.report.words import ppm
+from halbach_fe.report.words import ppm, within_a_sentence
 from halbach_fe.response.homogeneity import Homogeneity
 
 STUDY_FILE = "study.filled.toml"
@@ -83,7 +83,7 @@ def _told(found: FilledTray) -> Answer:
                    "which has the tray's magnets as free blocks."), ""
     command = f"halbach-fe infer DIR/{STUDY_FILE} --measurements NEW_MAP -o DIR"
     if before < FEW * after:
-        text = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
+        text = f"Do not fill this tray: {within_a_sentence(text)} That is hardly less."
         step, command = (
             ("The deviation is that of the design, and too large for a tray: search for a "
              "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")

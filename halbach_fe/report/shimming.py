@@ -43,7 +43,7 @@ from halbach_fe.report.page import (
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
+from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_unit
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")
@@ -410,7 +410,7 @@ def _convention(shim: Shim) -> str:
     when = {name: f" {name}" if shim.steps else "" for name in known}
     main = ", ".join(f"{main_in_words(shim.model, each)}{when[name]}"
                      for name, each in known.items())
-    roll = ", ".join(f"{with_error(1e3 * each.roll, 1e3 * each.roll_sd)} mrad{when[name]}"
+    roll = ", ".join(f"{with_unit(each.roll, each.roll_sd, 'mrad')}{when[name]}"
                      for name, each in known.items())
     return (f"{reference_text(shim.model, shim.study)} ± is the standard deviation, "
             f"including the error of the solver. Main multipole: {main}. It "

@@ -41,7 +41,7 @@ from halbach_fe.report.page import (
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import decimals, ppm, share_in_words, whole
+from halbach_fe.report.words import decimals, ppm, share_in_words, whole, within_a_sentence
 from halbach_fe.response.multipoles import plain
 from halbach_fe.study.inference import Prior
 from halbach_fe.study.model import Study
@@ -113,7 +113,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     ordered = float(found.known.sizes.max())
     if ordered > OF_THE_DESIGN * half:
         made = _made_by_tolerances(found)
-        said = (f"{made}{said[0].lower() if made else said[0]}{said[1:]} That is the magnet as "
+        said = (f"{made}{within_a_sentence(said) if made else said} That is the magnet as "
                 f"designed ({decimals(ordered)} units with blocks as ordered), to which their "
                 "tolerances add little.")
     said += only_of_orders(found.model)

@@ -63,6 +63,14 @@ def with_error(value: float, sd: float) -> str:
     return f"{rounded:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
 
 
+def with_unit(value: float, sd: float, unit: str) -> str:
+    """Return a number in SI and its standard deviation in a unit: per cent, or one of a thousandth
+    (mm, mT m) or a millionth (µT) if it begins with m or µ.
+    """
+    scale = {"%": 100.0, "m": 1e3, "µ": 1e6}.get(unit[0], 1.0)
+    return f"{with_error(scale * value, scale * sd)}\u00a0{unit}"
+
+
 def by_axis(name: str, values: Iterable[float], sd: Iterable[float]) -> dict[str, str]:
     """Return components along x, y and z with their standard deviations, from m in mm or from rad
     in mrad; {} in ``name`` stands for the axis.
@@ -130,7 +138,7 @@ def share_in_words(share: float, sd: float | None) -> str:
     """
     if share in (0.0, 1.0):
         return "All" if share else "None"
-    return f"{with_error(100 * share, 100 * (sd or 0.0))}\u00a0%"
+    return with_unit(share, sd or 0.0, "%")
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
@@ -271,6 +279,11 @@ def iron_description(magnet: Magnet) -> str:
         if iron.curve.kind == "steel":
             material = f"steel {iron.curve.name}"
     return f"{material}; {'; '.join(bodies[:4])}{more}"
+
+
+def capital(text: str) -> str:
+    """Return a text whose first letter is large, as that of a sentence."""
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def within_a_sentence(text: str) -> str:
