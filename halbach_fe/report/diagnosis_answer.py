@@ -418,11 +418,10 @@ def _also_possible(diagnosis: Diagnosis) -> str:
         return ""
     magnet = build_magnet(study)
     images = symmetry_images(magnet)
-    numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
     said = []
     for effect in diagnosis.identified:
         place = effect.place
-        own = sorted(numbers[ring, slot] for ring, slot in (
+        own = sorted(magnet.number_of(ring, slot) for ring, slot in (
             (place.ring, place.slot), place.other) if ring and slot)
         if own:
             others = dict.fromkeys(tuple(sorted(image[each] for each in own)) for image in images)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
@@ -188,9 +189,8 @@ def _sd_of_place(result: InferenceResult, number: int) -> Floats:
                  if one.name == result.maps[number]), None)
     if pose is None:
         return np.zeros(3)
-    x, y, z = result.field.places[number] - pose.middle_m
-    arms = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
-    return np.asarray(np.sqrt(np.square(pose.middle_sd_m) + arms**2 @ np.square(pose.turn_sd_rad)))
+    return np.hypot(pose.middle_sd_m, moved_by_turns(
+        result.field.places[number] - pose.middle_m, np.array(pose.turn_sd_rad)))
 
 
 def _numbers(values: Floats, form: str) -> str:

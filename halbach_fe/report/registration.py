@@ -13,6 +13,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import block_images
+from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
@@ -347,12 +348,10 @@ def magnet_on_stage(best: Registration) -> tuple[Floats, Floats]:
     scale = 1 + np.array([instrument.radius_scale, instrument.radius_scale, instrument.z_scale])
     sensor = np.mean(instrument.sensor_position_m, axis=0)
     centre = (-turn.T @ instrument.translation_m - sensor) / scale
-    x, y, z = best.middle_m
-    arms = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
-    variance = best.translation_sd_m**2 + arms**2 @ best.rotation_sd_rad**2
+    sd = np.hypot(best.translation_sd_m, moved_by_turns(best.middle_m, best.rotation_sd_rad))
     axes = np.array([COMPONENTS.index(axis[-1]) for axis in instrument.position_axes])
     signs = np.array([-1.0 if axis.startswith("-") else 1.0 for axis in instrument.position_axes])
-    return signs * centre[axes], np.sqrt(turn.T**2 @ variance / scale**2)[axes]
+    return signs * centre[axes], np.sqrt(turn.T**2 @ sd**2 / scale**2)[axes]
 
 
 def _other_poses(found: Sequence[Registration]) -> list[str]:
