@@ -26,8 +26,8 @@ from halbach_fe.report.page import (
     Section,
     Table,
     View,
+    chart,
     geometry_figure,
-    stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import counted, flux_density
@@ -148,8 +148,7 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
         (data, *_) = maps.values()
         return maps_figure(points_of(data), {
             name: 1e3 * column for name, column in _columns(study, data).items()}, "mT")
-    figure, (axis,) = stacked_axes(1)
-    figure.set_figheight(4)
+    figure, axis = chart(4)
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
         place, label = curve(points_of(data)) or (np.zeros(0), "")
         for (shown, column), colour in zip(_columns(study, data).items(), COLOURS, strict=False):

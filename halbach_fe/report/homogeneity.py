@@ -36,6 +36,7 @@ from halbach_fe.report.page import (
     Rows,
     Section,
     Table,
+    chart,
     csv_file,
     figure_of,
 )
@@ -310,8 +311,7 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
 
 def harmonics_figure(known: Homogeneity) -> Figure:
     """Draw the largest harmonics by degree, with error bars of two standard deviations."""
-    figure = figure_of(3.4)
-    axis = figure.subplots()
+    figure, axis = chart(3.4, grid=False)
     largest = sorted(sorted(range(len(known.harmonics)),
                             key=lambda number: -abs(known.harmonics[number].ppm))[:DRAWN])
     shown = [known.harmonics[number] for number in largest]

@@ -35,8 +35,8 @@ from halbach_fe.report.page import (
     Table,
     Text,
     View,
+    chart,
     draw_by_slot,
-    figure_of,
     legend_above,
     magnet_panels,
 )
@@ -535,8 +535,7 @@ def _magnetization_change_figure(result: InferenceResult) -> Figure:
     along = np.einsum("ij,ij->i", shift, nominal) / length**2
     picture = 100 * result.magnet.by_ring(along)
     rings, slots = picture.shape
-    figure = figure_of(_figure_height(rings))
-    axis = figure.subplots()
+    figure, axis = chart(_figure_height(rings), grid=False)
     limit = float(np.nanmax(np.abs(picture), initial=0.0)) or 1.0
     image = draw_by_slot(axis, picture, cmap="RdBu_r", vmin=-limit, vmax=limit)
     axis.add_patch(Rectangle((0.5, 0.5), slots, rings, fill=False))
@@ -563,8 +562,7 @@ def _contraction_figure(result: InferenceResult) -> Figure:
         result.contraction)
     rings = len(percent)
     slots = np.arange(1, percent.shape[1] + 1)
-    figure = figure_of(3 if rings == 1 else _figure_height(rings))
-    axis = figure.subplots()
+    figure, axis = chart(3 if rings == 1 else _figure_height(rings), grid=False)
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
     if rings == 1:
         there = ~np.isnan(percent[0])

@@ -19,7 +19,7 @@ from halbach_fe.report.page import (
     Page,
     Section,
     Table,
-    figure_of,
+    charts,
     legend_above,
 )
 from halbach_fe.report.words import capital, decimals, fraction, rms
@@ -115,25 +115,19 @@ def _magnetizations_figure(
     size = magnet.dimension
     first, slots = sum(magnet.blocks_by_ring[:ring - 1]), magnet.blocks_by_ring[ring - 1]
     part = slice(first * size, (first + slots) * size)
-    blocks = magnet.blocks[first:first + slots]
-    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
-    figure = figure_of(1 + 2.4 * size)
-    axes = figure.subplots(size, 1, sharex=True)
+    nominal = magnet.nominal_magnetization[part]
+    figure, axes = charts(1 + 2.4 * size, size, sharex=True)
     places = np.arange(1, slots + 1)
     shifts = 0.3 * np.linspace(-0.5, 0.5, len(known))
-    for axis, component in zip(axes, range(size), strict=True):
-        def in_kiloamperes_per_m(values: Floats, component: int = component) -> Floats:
-            return np.asarray(1e-3 * values[component::size])
-
+    for number, axis in enumerate(axes):
         for (name, distribution), colour, shift in zip(
                 known.items(), (PRIOR, POSTERIOR, SECOND), shifts, strict=False):
-            axis.errorbar(places + shift, in_kiloamperes_per_m(distribution.mean[part] - nominal),
-                          in_kiloamperes_per_m(distribution.sd[part]), color=colour, fmt="o", ms=4,
+            axis.errorbar(places + shift, 1e-3 * (distribution.mean[part] - nominal)[number::size],
+                          1e-3 * distribution.sd[part][number::size], color=colour, fmt="o", ms=4,
                           capsize=2, label=name)
-        axis.plot(places, in_kiloamperes_per_m(truth[part] - nominal), "_", color=MEASURED, ms=14,
+        axis.plot(places, 1e-3 * (truth[part] - nominal)[number::size], "_", color=MEASURED, ms=14,
                   mew=2, label="truth", zorder=3)
-        axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
-        axis.grid(alpha=0.3)
+        axis.set_ylabel(f"ΔM{COMPONENTS[number]} in kA/m")
     legend_above(figure, axes[0], columns=4)
     axes[-1].set_xlabel("slot")
     axes[-1].set_xticks(places)

@@ -27,7 +27,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
-    figure_of,
+    charts,
     legend_above,
     linearized,
 )
@@ -99,8 +99,7 @@ def multipole_figure(
     magnets: Mapping[str, Multipoles], limit: float | None, unit: str = "units of 1e-4",
 ) -> Figure:
     """Draw b_n and a_n of magnets by name, with error bars of two standard deviations."""
-    figure = figure_of(3.8)
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = charts(3.8, 1, 2, sharey=True)
     orders = next(iter(magnets.values())).orders
     place = np.arange(len(orders))
     # horizontal distance between the markers of different magnets at the same order
@@ -116,7 +115,6 @@ def multipole_figure(
             axis.axhline(sign * (limit or 0.0), color=PUBLISHED, lw=0.8, ls="--",
                          label="limit of |c_n|" if sign > 0 else None)
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
-        axis.grid(alpha=0.3)
     axes[0].set_ylabel(unit)
     if limit is not None or len(magnets) > 1 or "" not in magnets:
         legend_above(figure, axes[1], columns=4)

@@ -426,12 +426,28 @@ def figure_of(height_in: float, width_in: float = WIDEST_IN) -> Figure:
     return Figure(figsize=(min(width_in, WIDEST_IN), height_in), layout="constrained")
 
 
-def chart(height_in: float, width_in: float = WIDEST_IN) -> tuple[Figure, Axes]:
-    """Return a figure with a single grid, and its axes."""
+def chart(
+    height_in: float, width_in: float = WIDEST_IN, grid: bool = True
+) -> tuple[Figure, Axes]:
+    """Return a figure and its only axes, with a grid or without."""
     figure = figure_of(height_in, width_in)
     axis = figure.subplots()
-    axis.grid(alpha=0.3)
+    if grid:
+        axis.grid(alpha=0.3)
     return figure, axis
+
+
+def charts(
+    height_in: float, rows: int = 1, columns: int = 1, **layout: Any
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure and its axes with grids, row by row; ``layout`` is that of
+    `Figure.subplots`.
+    """
+    figure = figure_of(height_in)
+    axes = figure.subplots(rows, columns, squeeze=False, **layout).ravel().tolist()
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    return figure, axes
 
 
 def legend_above(
@@ -449,13 +465,10 @@ def legend_above(
 
 def magnet_panels(what: str) -> tuple[Figure, Axes, Axes]:
     """Return a figure, and its axes for points along the magnet, over ``what``, and across it."""
-    figure = figure_of(3.6)
-    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    figure, (along, across) = charts(3.6, 1, 2, width_ratios=(2, 1))
     along.set(xlabel="z in the magnet in mm", ylabel=what)
     across.set(xlabel="x in the magnet in mm", ylabel="y in the magnet in mm")
     across.set_aspect("equal", adjustable="datalim")
-    for axis in (along, across):
-        axis.grid(alpha=0.3)
     return figure, along, across
 
 
@@ -464,21 +477,6 @@ def draw_by_slot(axis: Axes, values: Floats, **colours: Any) -> AxesImage:
     rings, slots = values.shape
     return axis.imshow(values, aspect="auto", origin="lower",
                        extent=(0.5, slots + 0.5, 0.5, rings + 0.5), **colours)
-
-
-def stacked_axes(
-    rows: int, ratios: Sequence[float] | None = None, shared: bool = True
-) -> tuple[Figure, list[Axes]]:
-    """Return a figure, and its axes in rows; ``ratios`` are heights.
-
-    ``shared`` tells whether they share the x axis.
-    """
-    figure = figure_of(2.4 + 1.7 * rows)
-    axes = figure.subplots(rows, 1, sharex=shared, squeeze=False,
-                           gridspec_kw={"height_ratios": ratios or [1] * rows})
-    for axis in axes[:, 0]:
-        axis.grid(alpha=0.3)
-    return figure, list(axes[:, 0])
 
 
 def label_logarithmic(axis: Axis) -> None:

@@ -330,8 +330,7 @@ def _left_figure(plan: MeasurementPlan) -> Figure:
 
 def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     """Draw the ratio of posterior to prior standard deviations, by slot."""
-    figure = figure_of(4)
-    axis = figure.subplots()
+    figure, axis = chart(4, grid=False)
     slots = np.array([block.slot for block in magnet.blocks])
     places = np.arange(1, max(magnet.blocks_by_ring) + 1)
 

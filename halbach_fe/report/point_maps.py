@@ -32,9 +32,9 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     chart,
+    charts,
     figure_of,
     legend_above,
-    stacked_axes,
 )
 
 SAME = 1e-3
@@ -337,7 +337,7 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
     """Draw readings and predictions along the main line, and the residuals of the posterior."""
     line = main_line(result, name)
     index = line.index
-    figure, (top, bottom) = stacked_axes(2, [2, 1])
+    figure, (top, bottom) = charts(5.8, 2, sharex=True, height_ratios=[2, 1])
     measured = result.readings[index]
     top.plot(line.place, 1e3 * result.prediction_prior.mean[index], color=PRIOR,
              label="predicted before the update", lw=1.2)
@@ -409,7 +409,7 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
     """Draw the standardized residuals of all readings for prior and posterior."""
     crowd = 3000  # number of readings from which smaller, transparent markers are used
     place, label = axis_of_readings(result)
-    figure, axes = stacked_axes(2)
+    figure, axes = charts(5.8, 2, sharex=True)
     for axis, (name, prediction, colour) in zip(axes, predictions(result), strict=True):
         scores = result.standardized(prediction)
         for part, mask in parts_of(result, np.arange(len(scores))):

@@ -24,7 +24,7 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
-    figure_of,
+    charts,
 )
 from halbach_fe.report.words import counted, fraction, p_value, rms, with_unit
 
@@ -263,14 +263,13 @@ def _standardized(samples: Floats) -> Floats:
 def _deviations_figure(prior: MeasuredPrior) -> Figure:
     """Draw the deviations of all blocks, in the order of their types."""
     deviations = np.vstack([samples.deviations for samples in prior.types])
-    figure = figure_of(1 + 1.8 * deviations.shape[1])
-    axes = figure.subplots(deviations.shape[1], 1, sharex=True, squeeze=False)[:, 0]
+    count = deviations.shape[1]
+    figure, axes = charts(1 + 1.8 * count, count, sharex=True)
     for axis, name, unit, factor, values in zip(axes, DIRECTIONS, ("%", "°", "°"), UNITS,
                                                 deviations.T, strict=False):
         axis.axhline(0, color=PUBLISHED, lw=0.8)
         axis.plot(np.arange(1, len(values) + 1), factor * values, "o", color=MEASURED, ms=4)
         axis.set_ylabel(f"{name} in {unit}")
-        axis.grid(alpha=0.3)
     axes[-1].set_xlabel("block, by type")
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
     return figure
@@ -284,8 +283,7 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
     # Number of simulated normal samples from which the band of the figure is taken.
     simulations = 1000
     groups = [samples.deviations for samples in prior.types if len(samples.deviations) > 2]
-    figure = figure_of(3.9)
-    axes = figure.subplots(1, prior.types[0].deviations.shape[1], sharey=True, squeeze=False)[0]
+    figure, axes = charts(3.9, 1, prior.types[0].deviations.shape[1], sharey=True)
     count = sum(len(group) for group in groups)
     expected = special.ndtri((np.arange(count) + 0.5) / count)
     generator = np.random.default_rng(1)
@@ -299,6 +297,5 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
         axis.plot(expected, band[[0, 2]].T, color=PUBLISHED, lw=0.8, ls="--")
         axis.plot(expected, values, ".", color=MEASURED, ms=4)
         axis.set(title=name, xlabel="normal quantile")
-        axis.grid(alpha=0.3)
     axes[0].set_ylabel("standardized deviation")
     return figure

@@ -22,9 +22,9 @@ from halbach_fe.report.page import (
     Section,
     Table,
     attributes,
+    chart,
     columns_by_axis,
     csv_file,
-    figure_of,
 )
 from halbach_fe.report.words import ppm, within_a_sentence
 from halbach_fe.response.homogeneity import Homogeneity
@@ -159,8 +159,7 @@ def _tray_figure(found: FilledTray) -> Figure:
     """
     columns, rows = (len(np.unique(values.round(6))) for values in (
         np.arctan2(found.places_m[:, 1], found.places_m[:, 0]), found.places_m[:, 2]))
-    figure = figure_of(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)))
-    axis = figure.subplots()
+    figure, axis = chart(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)), grid=False)
 
     def unrolled(places: Floats) -> tuple[Floats, Floats]:
         return np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360, 1e3 * places[:, 2]

@@ -39,7 +39,6 @@ from halbach_fe.report.page import (
     Text,
     chart,
     draw_cross_section,
-    figure_of,
     legend_above,
     linearized,
 )
@@ -420,8 +419,7 @@ def _convention(shim: Shim) -> str:
 def _moves_figure(shim: Shim) -> Figure:
     """Draw the moves in the cross-section, or for several rings in a grid of rings and slots."""
     flat = len(shim.magnet.blocks_by_ring) == 1
-    figure = figure_of(6, 6) if flat else figure_of(4.6)
-    axis = figure.subplots()
+    figure, axis = chart(6, 6, grid=False) if flat else chart(4.6, grid=False)
     if flat:
         draw_cross_section(axis, shim.magnet)
         where = 1e3 * np.array([block.middle[:2] for block in shim.magnet.blocks])

@@ -31,10 +31,10 @@ from halbach_fe.report.page import (
     Section,
     Table,
     View,
+    charts,
     geometry_figure,
     label_logarithmic,
     legend_above,
-    stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import (
@@ -204,7 +204,8 @@ def field_figure(solution: Solution) -> Figure:
     bars = ((np.array([float(name[1:]) for name in solution.observation.labels]), "harmonic")
             if fourier else curve(solution.observation.positions))
     below = bars if solution.errors.any() else None  # blocks in vacuum have none
-    figure, (top, *others) = stacked_axes(2 if below else 1, [2, 1] if below else [1], not fourier)
+    figure, (top, *others) = charts(5.8, 2, height_ratios=[2, 1], sharex=not fourier) if (
+        below) else charts(4.1)
     order = np.argsort(place, kind="stable")
     for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], COLOURS,
                                          solution.flux_density.T, strict=False):

@@ -34,9 +34,9 @@ from halbach_fe.report.page import (
     Section,
     Table,
     begin_at_zero,
+    chart,
     columns_by_axis,
     csv_file,
-    figure_of,
     legend_above,
 )
 from halbach_fe.report.shimming import aim_of, values_summary, values_table
@@ -263,8 +263,7 @@ def _convention(found: SortedBlocks) -> str:
 
 def _random_orders_figure(found: SortedBlocks) -> Figure:
     """Draw the histogram of the rms of random orders."""
-    figure = figure_of(3.6)
-    axis = figure.subplots()
+    figure, axis = chart(3.6, grid=False)
     axis.hist(found.random, 50, color=PUBLISHED, label="random orders")
     axis.axvline(found.numbered.rms_of_mean, color=PRIOR, lw=2, ls="--", label=found.own_order)
     axis.axvline(found.best.rms_of_mean, color=POSTERIOR, lw=2, label="sorted")

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from functools import partial
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -37,7 +38,7 @@ from halbach_fe.report.page import (
     attributes,
     begin_at_zero,
     chart,
-    figure_of,
+    charts,
     legend_above,
     linearized,
 )
@@ -236,8 +237,7 @@ def _size_quantiles_figure(found: Tolerance) -> Figure:
 def _largest_multipole_figure(found: Tolerance) -> Figure:
     """Draw the distribution function of the largest |c_n|."""
     figure, axis = chart(3.6)
-    largest = np.sort(found.sizes.max(axis=1))
-    axis.plot(largest, np.arange(1, len(largest) + 1) / len(largest), color=POSTERIOR)
+    _draw_shares(axis, found.sizes.max(axis=1))
     if found.limit is not None:
         axis.axvline(found.limit, color=PRIOR, ls="--", label="limit")
         legend_above(figure, axis)
@@ -246,6 +246,11 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     begin_at_zero(axis)
     axis.ticklabel_format(axis="x", useOffset=False)
     return figure
+
+
+def _draw_shares(axis: Axes, values: Floats) -> None:
+    """Draw the share of magnets with at most each of some values (draws,)."""
+    axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
 
 
 def _homogeneity_summary(found: HomogeneityTolerance) -> Plain:
@@ -324,15 +329,13 @@ def tolerances_in_words(prior: Prior) -> str:
 
 def _deviation_figure(found: HomogeneityTolerance) -> Figure:
     """Draw the distribution functions of the rms and of the peak-to-peak deviation."""
-    figure = figure_of(3.6)
-    left, right = figure.subplots(1, 2, sharey=True)
+    figure, (left, right) = charts(3.6, 1, 2, sharey=True)
     for axis, values, ordered, name in (
             (left, found.rms_ppm, found.ordered.rms_ppm, "rms"),
             (right, found.peak_to_peak_ppm, found.ordered.peak_to_peak_ppm, "peak to peak")):
-        axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
+        _draw_shares(axis, values)
         axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
         axis.set(xlabel=f"{name} deviation in ppm", ylim=(0, 1.02))
-        axis.grid(alpha=0.3)
         axis.xaxis.set_major_locator(MaxNLocator(4))  # numbers of five digits side by side
     left.set_ylabel("share of magnets")
     if found.limit is not None:

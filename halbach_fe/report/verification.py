@@ -25,13 +25,12 @@ from halbach_fe.report.page import (
     Text,
     View,
     axis_of_points,
+    chart,
     columns_by_axis,
     csv_file,
-    figure_of,
     geometry_figure,
     label_logarithmic,
     legend_above,
-    stacked_axes,
 )
 from halbach_fe.report.words import (
     ROUNDING,
@@ -232,8 +231,7 @@ def page(found: Verification) -> Page:
 
 def _convergence_figure(found: Verification) -> Figure:
     """Draw the change by the next finer mesh, relative to the largest field, by element size."""
-    figure = figure_of(4.6)
-    axis = figure.subplots()
+    figure, axis = chart(4.6, grid=False)
     size = 1e3 * found.element_size_m
     sizes = (size * np.array([REFINEMENT**2, REFINEMENT, 1.0]))[_coarsest(found):]
     steps = 1e6 * np.array([difference.pointwise
@@ -262,7 +260,7 @@ def _convergence_figure(found: Verification) -> Figure:
 
 def _change_figure(found: Verification) -> Figure:
     """Draw the change of B at every position, for each change of the model."""
-    figure, (axis,) = stacked_axes(1)
+    figure, axis = chart(4.1)
     place, label = axis_of_points(found.points)
     for difference, change, colour, marker in zip(
             found.differences, found.changes, COLOURS, MARKERS, strict=False):
