@@ -81,8 +81,7 @@ def page(campaign: SimulatedCampaign) -> Page:
     magnitude = 1e3 * np.linalg.norm(list(_columns(study, readings).values()), axis=0)
     view = View(lambda: view_of_nominal_magnet(magnet, ViewPoints(
         points, magnitude, "points of the map", "magnitude of the<br>readings in mT",
-        "magnitude of the readings %{customdata:.5g} mT",
-        (float(magnitude.min()), float(magnitude.max())))),
+        "magnitude of the readings %{customdata:.5g} mT")),
         "points of the map by the magnitude of the readings")
     rows = [_map_row(study, name, data) for name, data in maps.items()]
     secret = readings.attrs["truth_sha256"]

@@ -19,7 +19,7 @@ from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
 from halbach_fe.report.inference_answer import answer, easy_axes
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
+from halbach_fe.report.multipoles import MultipoleTable, multipole_csv, sections_of_circles
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -340,7 +340,7 @@ def page(result: InferenceResult) -> Page:
         "summary.json": lambda path: write_inference(result, path.parent),
         **dict.fromkeys(("prediction.csv", "posterior.h5"))}
     if multipoles:
-        files["multipoles.csv"] = partial(write_multipole_csv, result.study, multipoles)
+        files["multipoles.csv"] = multipole_csv(result.study, multipoles)
     return Page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [

@@ -190,8 +190,8 @@ class ViewPoints:
         Title of the colour scale.
     words : str
         Text that appears when the pointer is over a point; %{customdata} stands for its value.
-    limits : tuple of float
-        Ends of the colour scale, which are magnitudes.
+    limits : tuple of float, or None
+        Ends of the colour scale, which are magnitudes; by default those of the values.
     """
 
     positions: Floats
@@ -199,24 +199,28 @@ class ViewPoints:
     name: str
     title: str
     words: str
-    limits: tuple[float, float]
+    limits: tuple[float, float] | None = None
 
 
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
     """Return points (n, 3) in m that are coloured by the magnitude of a field B (n, 3) in T."""
-    magnitude = np.linalg.norm(flux_density, axis=1)
-    magnitude *= 1e3
-    return ViewPoints(positions, magnitude, "points", "|B| in mT", "|B| = %{customdata:.5g} mT",
-                      (float(magnitude.min()), float(magnitude.max())))
+    return ViewPoints(positions, 1e3 * np.linalg.norm(flux_density, axis=1), "points",
+                      "|B| in mT", "|B| = %{customdata:.5g} mT")
 
 
 def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
     """Return the view of a nominal magnet and the points of a map, `MOST_POINTS` at most."""
-    magnetization = np.array([block.magnetization[:magnet.dimension] for block in magnet.blocks])
     count = len(points.positions)
     drawn = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
-    return magnet_view(magnet, BlockValues(magnetization), replace(
-        points, positions=points.positions[drawn], values=points.values[drawn]))
+    return magnet_view(
+        magnet, BlockValues(magnet.nominal_magnetization.reshape(len(magnet.blocks), -1)), replace(
+            points, positions=points.positions[drawn], values=points.values[drawn],
+            limits=_limits(points)))
+
+
+def _limits(points: ViewPoints) -> tuple[float, float]:
+    """Return the ends of the colour scale of points."""
+    return points.limits or (float(points.values.min()), float(points.values.max()))
 
 
 def view_of_inference(
@@ -575,7 +579,7 @@ def _iron_trace(body: IronSolid, height: float) -> go.Surface | go.Mesh3d:
 def _points_trace(points: ViewPoints) -> go.Scatter3d:
     """Return the points of the map as markers."""
     x, y, z = points.positions.T
-    low, high = points.limits
+    low, high = _limits(points)
     return go.Scatter3d(
         x=x, y=y, z=z, mode="markers", name=points.name, customdata=points.values,
         hovertemplate=f"(%{{x:.1f}}, %{{y:.1f}}, %{{z:.1f}}) mm<br>{points.words}<extra></extra>",

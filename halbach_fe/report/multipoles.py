@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.api import MultipoleTables
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic
 from halbach_fe.core.numbers import in_a_row
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
     POSTERIOR,
@@ -28,6 +26,7 @@ from halbach_fe.report.page import (
     Table,
     Text,
     charts,
+    csv_file,
     legend_above,
     linearized,
 )
@@ -121,8 +120,8 @@ def multipole_figure(
     return figure
 
 
-def write_multipole_csv(study: Study, tables: Sequence[MultipoleTable], path: Path) -> None:
-    """Write multipoles.csv, with a row per magnet, reference and order."""
+def multipole_csv(study: Study, tables: Sequence[MultipoleTable]) -> Callable[[Path], None]:
+    """Return how multipoles.csv is written, with a row per magnet, reference and order."""
     rows = [{"magnet": name, "where": _location(model), "radius_m": model.radius,
              "z_m": np.nan if model.z is None else model.z, "n": row["n"], "b_units": row["b"],
              "b_sd_units": row["b_sd"], "a_units": row["a"], "a_sd_units": row["a_sd"],
@@ -130,16 +129,15 @@ def write_multipole_csv(study: Study, tables: Sequence[MultipoleTable], path: Pa
             for model, magnets in tables for name, known in magnets.items()
             for row in known.table()]
     radii = dict.fromkeys(model.radius for model, _ in tables)
-    with atomic(path) as temporary:
-        write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
-            "study": study.name, "convention": CONVENTION
-            + "; local ones are the Fourier coefficients of B_r on the circle, sum A_n cos(n phi) "
-            "+ B_n sin(n phi)" * any(_location(model) == "local" for model, _ in tables),
-            "reference_radius_m": ", ".join(f"{radius:g}" for radius in radii),
-            "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
-            "which the nominal one is normal",
-            "axes_turned_by_rad": ", ".join(dict.fromkeys(
-                f"{model.turn:.9g}" for model, _ in tables))}, temporary)
+    return csv_file({key: [row[key] for row in rows] for key in rows[0]}, {
+        "study": study.name, "convention": CONVENTION
+        + "; local ones are the Fourier coefficients of B_r on the circle, sum A_n cos(n phi) "
+        "+ B_n sin(n phi)" * any(_location(model) == "local" for model, _ in tables),
+        "reference_radius_m": ", ".join(f"{radius:g}" for radius in radii),
+        "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
+        "which the nominal one is normal",
+        "axes_turned_by_rad": ", ".join(dict.fromkeys(
+            f"{model.turn:.9g}" for model, _ in tables))})
 
 
 def _location(model: MultipoleModel) -> str:
@@ -405,4 +403,4 @@ def page(found: MultipoleTables) -> Page:
         _summary(study, found.tables, found.limit),
         [*sections, Section([*found.left_out, *linearized(study)])], tables, figures=figures,
         shown=tuple(figures),
-        files={"multipoles.csv": partial(write_multipole_csv, study, found.tables)})
+        files={"multipoles.csv": multipole_csv(study, found.tables)})

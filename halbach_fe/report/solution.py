@@ -16,8 +16,8 @@ from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magne
 from halbach_fe.report.multipoles import (
     MultipoleTable,
     main_field_in_words,
+    multipole_csv,
     sections_of_circles,
-    write_multipole_csv,
 )
 from halbach_fe.report.page import (
     MEASURED,
@@ -142,7 +142,7 @@ def page(solution: Solution) -> Page:
         "field_map.h5": lambda path: write_solution(solution, path.parent),
         **dict.fromkeys(("field_map.csv", "field_map.vtu", "readings.csv"))}
     if multipoles:
-        files["multipoles.csv"] = partial(write_multipole_csv, study, multipoles)
+        files["multipoles.csv"] = multipole_csv(study, multipoles)
     view = View(lambda: view_of_nominal_magnet(magnet, field_points(
         solution.points, solution.flux_density)), "the study's positions by the magnitude of the "
         "field")

@@ -209,12 +209,10 @@ def page(found: Verification) -> Page:
     model = {"route": found.route.replace("_", " "), "method": magnet.study.solver.method,
              "elements at the magnet": f"{1e3 * found.element_size_m:.3g} mm; finer by a factor of "
              f"{REFINEMENT}, coarser by it and by its square", **magnet_rows(magnet)}
-    size = 1e6 * change
     view = View(lambda: view_of_nominal_magnet(
         magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
-            found.points, size, "positions", "change by a<br>finer mesh in µT",
-            "a finer mesh changes B by %{customdata:.3g} µT",
-            (float(size.min()), float(size.max())))),
+            found.points, 1e6 * change, "positions", "change by a<br>finer mesh in µT",
+            "a finer mesh changes B by %{customdata:.3g} µT")),
         "positions of the study by the change of B that a finer mesh makes" if rows else
         "positions of the study by the magnitude of the field")
     return Page(
