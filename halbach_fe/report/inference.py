@@ -17,7 +17,7 @@ from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.inference_answer import answer, easy_axes
+from halbach_fe.report.inference_answer import along_easy_axes, answer, easy_axes
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, multipole_csv, sections_of_circles
 from halbach_fe.report.page import (
@@ -528,12 +528,7 @@ def _figure_height(rings: int) -> float:
 
 def _magnetization_change_figure(result: InferenceResult) -> Figure:
     """Draw the change of each magnetization along the easy axis, from nominal to posterior."""
-    nominal = result.by_block(result.response.nominal)
-    shift = result.by_block(result.posterior.mean - result.response.nominal)
-    length = np.linalg.norm(nominal, axis=1)
-    length[length == 0] = np.nan  # the place of a missing block is left blank
-    along = np.einsum("ij,ij->i", shift, nominal) / length**2
-    picture = 100 * result.magnet.by_ring(along)
+    picture = 100 * result.magnet.by_ring(along_easy_axes(result))  # blank for missing blocks
     rings, slots = picture.shape
     figure, axis = chart(_figure_height(rings), grid=False)
     limit = float(np.nanmax(np.abs(picture), initial=0.0)) or 1.0
@@ -558,8 +553,7 @@ def _contraction_in_words(result: InferenceResult, contraction: Floats) -> str:
 
 def _contraction_figure(result: InferenceResult) -> Figure:
     """Draw the contraction of each block: as bars for a single ring, else by ring and slot."""
-    percent = 100 * result.magnet.by_ring(
-        result.contraction)
+    percent = 100 * result.magnet.by_ring(result.contraction)
     rings = len(percent)
     slots = np.arange(1, percent.shape[1] + 1)
     figure, axis = chart(3 if rings == 1 else _figure_height(rings), grid=False)

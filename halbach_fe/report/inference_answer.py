@@ -257,12 +257,22 @@ def easy_axes(result: InferenceResult) -> tuple[Ints, Floats, Floats]:
     return there, nominal[there] / size[there, None], size[there]
 
 
+def along_easy_axes(result: InferenceResult) -> Floats:
+    """Return the changes (blocks,) from nominal along the easy axes, relative to the nominal
+    magnetizations; NaN for missing blocks.
+    """
+    there, axes, size = easy_axes(result)
+    found = np.full(len(result.magnet.blocks), np.nan)
+    found[there] = np.einsum("ij,ij->i", result.by_block(
+        result.posterior.mean - result.response.nominal)[there], axes) / size
+    return found
+
+
 def _blocks(result: InferenceResult, start: str = (
         "Along their easy axes the blocks deviate from the study")) -> str:
     """Say how the magnetizations along the easy axes deviate from the nominal ones."""
     there, axes, size = easy_axes(result)
-    mean = np.einsum("ij,ij->i", result.by_block(
-        result.posterior.mean - result.response.nominal)[there], axes) / size
+    mean = along_easy_axes(result)[there]
     worst = int(np.argmax(np.abs(mean)))
     row = np.zeros((1, len(result.posterior.mean)))
     result.by_block(row[0])[there[worst]] = axes[worst] / size[worst]

@@ -19,6 +19,7 @@ from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.outline import Edge, at_heights, outline_contains
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.report.inference_answer import along_easy_axes, easy_axes
 from halbach_fe.report.page import IRON, MEASURED, SECOND, Plain
 from halbach_fe.report.words import flux_density, place_of
 from halbach_fe.solver.exact_block_field import field_of
@@ -230,20 +231,15 @@ def view_of_inference(
 
     ``named`` are ring and slot of blocks whose numbers are written beside them.
     """
-    nominal = result.by_block(result.response.nominal)
-    length = np.linalg.norm(nominal, axis=1)
-    there = length > 0  # the change of a missing block is shown as 0
-    length[~there] = 1.0
-    easy = nominal / length[:, None]
-    mean = result.by_block(result.posterior.mean)
-    number = np.arange(len(easy) + 1)
-    along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
-    along.resize(len(easy), len(result.posterior.mean))  # variations in blocks do not count
-    change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
-    sd = 100 * result.posterior.sd_of(along) / length
-    values = BlockValues(mean, Colours(change, "posterior change<br>along the easy axis in %", [
-        f"{percent:+.2f} ± {error:.2f} % along the easy axis" if magnetized else "missing"
-        for percent, error, magnetized in zip(change, sd, there, strict=True)]))
+    there, axes, size = easy_axes(result)
+    along = sparse.csr_array(sparse.bsr_array((axes[:, None], there, np.arange(len(there) + 1))))
+    along.resize(len(there), len(result.posterior.mean))  # variations in blocks do not count
+    sd = 100 * result.posterior.sd_of(along) / size
+    change, words = 100 * along_easy_axes(result), ["missing"] * len(result.magnet.blocks)
+    for number, error in zip(there.tolist(), sd, strict=True):
+        words[number] = f"{change[number]:+.2f} ± {error:.2f} % along the easy axis"
+    values = BlockValues(result.by_block(result.posterior.mean), Colours(
+        np.nan_to_num(change), "posterior change<br>along the easy axis in %", words))
     scores = result.standardized(result.prediction_posterior)
     points = (residual_points(result.observation.positions, scores)
               if any(result.observation.components) else None)
