@@ -472,7 +472,7 @@ def finish(arguments: argparse.Namespace, result: object) -> int:
 
 def say_page(arguments: argparse.Namespace, page: Page, path: Path | None = None) -> None:
     """Print the tables and the answer of a page, and where it is if it was written."""
-    for sentence in page.remarks:
+    for sentence in filter(None, page.remarks):
         say(sentence)
     for title, rows in page.tables.items():
         print_table(rows, title)

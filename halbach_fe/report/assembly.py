@@ -576,7 +576,7 @@ def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> P
             Table(kinds), "Sizes are along the block's own x × y × z: in a ring x points outwards, "
             "or along the magnetization where cubes turn with it, and z along the magnet. The "
             f"magnetization points to the north pole.{upside_down}"], "Blocks to order"),
-        *([Section([Table(plates), _of_the_plates(assembly)], "Plates to make")] if plates else []),
+        Section([Table(plates), _of_the_plates(assembly)], "Plates to make", about=plates),
         Section(["Magnets attract one another from decimetres away: `halbach-fe forces` computes "
                  "what each block feels while it is inserted.", partial(_sheets, assembly)])],
         {"Blocks to order": kinds, "Plates to make": plates}, stem="assembly", files={

@@ -171,7 +171,7 @@ def page(
         diagnosis_summary(diagnosis, separations), [
             _what_is_missing(diagnosis, rows), *_what_else(diagnosis, separations, titles, rows),
             *_grounds(diagnosis), left_out_section(diagnosis.after),
-            Section(order := [*filter(None, [row_order_note(diagnosis.study)])]),
+            Section([order := row_order_note(diagnosis.study)]),
             Section([View(lambda: view_of_inference(diagnosis.after, places),
                           colours_in_words(diagnosis.after))]),
             Section([f"{STUDY_FILE} beside this page is the study's file {added}; halbach-fe solve "
@@ -181,8 +181,8 @@ def page(
          "The model before and after": change_table(diagnosis),
          "Rms difference of model and readings": residual_table(diagnosis),
          "Where nobody measured": left_out_table(diagnosis.after)},
-        rows, drawn, stem="diagnosis", remarks=[
-            *([BAYES_FACTOR_IN_WORDS] if found else []), *order],
+        rows, drawn, stem="diagnosis",
+        remarks=[BAYES_FACTOR_IN_WORDS if found else "", order],
         new_study=(STUDY_FILE, partial(
             changed_studies, study or diagnosis.corrected_study, diagnosis)))
 

@@ -198,19 +198,18 @@ def _iron_rows(found: Forces) -> Rows:
                 found.iron.error_N.tolist(), strict=True)]
 
 
-def _on_iron(found: Forces) -> list[Section]:
-    """Return the section about the forces on the iron; none without iron."""
+def _on_iron(found: Forces) -> Section:
+    """Return the section about the forces on the iron; empty without iron."""
     rows = _iron_rows(found)
     if found.magnet.iron and not rows:
-        return [Section(["The forces on the iron are not computed beside `external.dipoles` and "
-                         "`external.neighbours`."], "Forces on the iron")]
-    if not rows:
-        return []
-    return [Section([
+        return Section(["The forces on the iron are not computed beside `external.dipoles` and "
+                        "`external.neighbours`."], "Forces on the iron")
+    return Section([
         Table(rows),
         "What blocks, coils and the other bodies of iron do to each body in the finished magnet: "
         "what holds it has to bear that. Bodies that touch, or that no plane separates, have one "
-        "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron")]
+        "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron",
+        about=rows)
 
 
 def _summary(found: Forces) -> Plain:
@@ -325,9 +324,9 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
 def page(found: Forces) -> Page:
     """Return the page of the forces on the blocks."""
     iron, rows = bool(found.magnet.iron), _rows(found)
-    permeable = [] if found.magnet.is_vacuum else [
+    permeable = "" if found.magnet.is_vacuum else (
         "Every block has the mean of the polarization that its permeability gives it in the "
-        "finished magnet; how it varies inside the block is left out."]
+        "finished magnet; how it varies inside the block is left out.")
     return Page(
         "forces", "forces on the blocks", found.magnet.study, answer(found), _summary(found), [
             Section([
@@ -339,7 +338,7 @@ def page(found: Forces) -> Page:
                 "before it in place, and its place in that order"
                 f"{'; the iron is not there yet' * iron}. The forces of all blocks on each other "
                 f"add up to {_newton(found.imbalance_N)}; Newton's third law makes it zero.",
-                *permeable], "The largest forces in place"), *_on_iron(found)],
+                permeable], "The largest forces in place"), _on_iron(found)],
         {"Largest forces in place": rows} | (
             {"Forces on the iron": _iron_rows(found)} if found.iron else {}),
         figures={"forces.png": (

@@ -356,10 +356,10 @@ def page(found: HomogeneityResult) -> Page:
         "homogeneity", "homogeneity", found.magnet.study, answer(found),
         homogeneity_summary(found), [
             Section([remarks, Table(rows, "turned")], f"The field in {region}"),
-            *([Section([
+            Section([
                 "The largest ones, on the sphere's surface, in ppm of the mean field. "
                 f"{CONVENTION}.", Table(harmonics, "numbers"), Drawn("harmonics.png")],
-                "Spherical harmonics")] if harmonics else []),
+                "Spherical harmonics", about=harmonics),
             *sections_of_stray(found.stray_field, drawn=True)],
         {f"The field in {region}": rows, "Spherical harmonics in ppm of the mean field": harmonics,
          "Outside of the magnet": stray_rows(found.stray_field)},

@@ -159,13 +159,13 @@ def stretch_table(result: InferenceResult) -> Rows:
 def left_out_section(result: InferenceResult) -> Section:
     """Return the section of what was left out as a whole; empty if nothing was."""
     left_out = left_out_table(result)
-    return Section([] if not left_out else [
+    return Section([
         "Readings that were left out as a whole, each map in turn or the ends of the only one, "
         "predicted by an update with all others. Held-out lines between other lines say nothing of "
         "that. The rms difference is that with the pose and the probe that only this map has "
         "fitted to it; chi² is 1 on average if the error bars hold.",
         Table(left_out), "And where it lies, along its longest axis:",
-        Table(stretch_table(result))], "Where nobody measured")
+        Table(stretch_table(result))], "Where nobody measured", about=left_out)
 
 
 def maps_figure(result: InferenceResult) -> Figure:
@@ -344,7 +344,7 @@ def page(result: InferenceResult) -> Page:
     return Page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [
-            Section(order := [*filter(None, [row_order_note(result.study)])]),
+            Section([order := row_order_note(result.study)]),
             Section([*doubtful, Table(block_table(result)), Text(SHRUNK, "small")],
                     "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),
@@ -370,7 +370,7 @@ def page(result: InferenceResult) -> Page:
          "Where nobody measured": left_out_table(result),
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
-        remarks=order,
+        remarks=[order],
         new_study=None if result.terms is None and result.study_as_found is result.study else (
             STUDY_FILE, lambda: [(result.study_as_found, NOTE)]))
 
@@ -468,15 +468,15 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
                          "" if result.study_as_found is result.study else
                          f" {STUDY_FILE} has them as found."))
     return [
-        Section([] if not overlaps else [
+        Section([
             "Where two maps overlap, the readings of one are compared with what an update by the "
             "other alone predicts there. chi² is 1 on average if they are of the same magnet, and "
             "pose, probe and noise are as stated or uncertain.", Table(overlaps)],
-            "Do the maps agree?"),
+            "Do the maps agree?", about=overlaps),
         left_out_section(result),
-        Section([] if not poses else ["In the magnet's axes, as the update found it.",
-                                      Table(poses)], "Where the maps lie"),
-        Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]
+        Section(["In the magnet's axes, as the update found it.", Table(poses)],
+                "Where the maps lie", about=poses),
+        Section([" ".join(found), Table(terms)], "The instruments", about=terms)]
 
 
 def _model_table(result: InferenceResult) -> Rows:

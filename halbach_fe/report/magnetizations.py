@@ -101,7 +101,7 @@ def page(
                for key, value in (figures or {}).items()]
     return Page("magnetizations", what, magnet.study, answer(magnet, known, truth), {}, [
         Section([Table(rows, "numbers")]),
-        Section([Table(further, "numbers")] if further else [], "Further numbers")], rows=rows,
+        Section([Table(further, "numbers")], "Further numbers", about=further)], rows=rows,
         figures={"magnetizations.png": (
             partial(_magnetizations_figure, magnet, known, truth, ring), f"Deviation of the "
             f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are "

@@ -178,7 +178,7 @@ def total_page(data: xr.Dataset, check: TotalCheck) -> Page:
         files = {"oriented_map.csv": partial(write_map, maps["oriented_map"])}
     found = total_sentences(check)
     return Page("check", TITLE, None, total_answer(check), check.plain() | _hashes(maps),
-                [Section([Items(found)] if found else [])], remarks=found, files=files)
+                [Section([Items(found)])], remarks=found, files=files)
 
 
 def _on_a_stage(check: MapCheck) -> bool:
@@ -470,19 +470,19 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
         found.append(doubt)
     return Page(
         "check", TITLE, None, answer(check), check_summary(data, check), [
-            Section([*([Items(found)] if found else []), Text(
+            Section([Items(found), Text(
                 f"{check.readings} readings at {check.points} points, "
                 f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "
                 "compared with the field of sources outside the mapped region. A map by itself "
                 "cannot show a common factor or sign of all components, a uniform offset, a shift "
                 "of the whole map, or a position axis that counts backwards.", "small")]),
-            Section([Table(rows, "numbers"), *(Text(text, "small") for text in [
-                weighted_note(check)] if text)], "What remains"),
+            Section([Table(rows, "numbers"), Text(weighted_note(check), "small")],
+                    "What remains"),
             Section(["Distances of the sensors are along the axes of the stage, and turns of the "
                      "probe are against them; all belong to the components as they were found "
                      "above.", Table(instrument)] if instrument else
                     ["This map determines no error of the probe."], "The instrument"),
-            Section([Text(said, "small")] if said else [], "What was not asked or left out", True)],
+            Section([Text(said, "small")], "What was not asked or left out", True, said)],
         {"The instrument, by the map alone": instrument}, rows, {
             "check_maps.png": (
                 partial(_maps, points, np.asarray(data["B_T"].values), check), "The map: every "
@@ -649,7 +649,7 @@ def joined_page(maps: Mapping[str, xr.Dataset], joined: JoinedMaps) -> Page:
     summary = joined.plain() | _hashes(maps) | {"joined_sha256": readings_sha256(joined.data)}
     return Page(
         "check", "Field maps, joined", None, joined_answer(joined), summary, [
-            Section([*([Items(found)] if found else []), Text(
+            Section([Items(found), Text(
                 "No magnet is assumed. One field of sources outside all maps was fitted to them "
                 "together with their relative poses; each map was checked by itself before.",
                 "small")]),

@@ -401,6 +401,6 @@ def page(found: MultipoleTables) -> Page:
         "multipoles", "multipoles", study,
         answer(found.tables, found.limit, found.disagreement, study),
         _summary(study, found.tables, found.limit),
-        [*sections, Section([*found.left_out, *linearized(study)])], tables, figures=figures,
+        [*sections, Section([*found.left_out, linearized(study)])], tables, figures=figures,
         shown=tuple(figures),
         files={"multipoles.csv": multipole_csv(study, found.tables)})

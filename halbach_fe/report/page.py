@@ -132,11 +132,14 @@ class Section:
     """Texts, tables and figures of a page in their order."""
 
     parts: Sequence[str | Text | Items | Table | Drawn | View | Callable[[], Markup]]
-    """A plain string is a paragraph; a function returns HTML that only the page has."""
+    """A plain string is a paragraph; a function returns HTML that only the page has. What has no
+    text is not shown."""
     title: str = ""
     """What stands above them; empty if nothing does."""
     folded: bool | None = None
     """Whether the section is folded until it is clicked on; None if it cannot be folded."""
+    about: object = True
+    """Rows, or whatever else it is about: without any, the page does not have the section."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,7 @@ class Page:
     folders: Mapping[str, Page] = field(default_factory=dict)
     """Pages of parts of the result, each in a folder of its own beside the page, by its name."""
     remarks: Sequence[str] = ()
-    """Sentences that the terminal says before its tables."""
+    """Sentences that the terminal says before its tables; empty ones are left out."""
     stored: bool = True
     """Whether the summary is a file, too."""
     stem: str = ""
@@ -292,9 +295,9 @@ def write_changed_study(
     write_edited(path, file.read_text(encoding="utf-8-sig"), [(before, COMPLETE_NOTE), *steps])
 
 
-def linearized(study: Study) -> list[str]:
-    """Return the sentence about a nonlinear iron, if there is one."""
-    return (["The iron is linearized about the nominal magnet."] if is_nonlinear(study) else [])
+def linearized(study: Study) -> str:
+    """Return the sentence about a nonlinear iron; empty without one."""
+    return "The iron is linearized about the nominal magnet." if is_nonlinear(study) else ""
 
 
 def save(
@@ -390,6 +393,8 @@ def _templates() -> jinja2.Environment:
     environment.filters |= {"units_kept": units_kept, "marked": _marked}
     environment.tests |= {kind.__name__.lower(): lambda part, kind=kind: isinstance(part, kind)
                           for kind in (Text, Items, Table, Drawn, View)}
+    environment.tests["empty"] = lambda part: not (
+        part[0] if isinstance(part, Text | Items) else part)
     return environment
 
 

@@ -604,7 +604,7 @@ def page(
                 "chi² per reading is that of the updated blocks; about 1 is expected. Odds compare "
                 "poses that explain the map; there are none if none does, or if poses were left "
                 "out.", "small")], "Poses"),
-            Section([Table(doubts)] if doubts else [], "Far from what was known before"),
+            Section([Table(doubts)], "Far from what was known before", about=doubts),
             Section(["The pose is where the middle of the map lies in the magnet, and how the map "
                      "is turned about the axes of the magnet, once its own axes were put along "
                      "those above.", Table(

@@ -358,7 +358,7 @@ def page(shim: Shim) -> Page:
     move_title = "Moves that would be made" if against else "Moves"
     aim, moves = aim_of(shim.model), _move_table(shim)
     rows = values_table(shim.model, _compared(shim, *(shim.fields or (shim.before, shim.after))))
-    sections = [Section([_convention(shim), Table(rows, aim.table), *linearized(shim.study)],
+    sections = [Section([_convention(shim), Table(rows, aim.table), linearized(shim.study)],
                         aim.title)]
     values = "the unwanted multipoles" if shim.fields is None else "the deviation of |B|"
     figures = {} if shim.fields else {"shim_multipoles.png": (
@@ -366,8 +366,8 @@ def page(shim: Shim) -> Page:
         f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
         "and skew (right); bars are two standard deviations")}
     if shim.steps:
-        sections.insert(0, Section([*([Text(against, "warning")] if against else []),
-                                    _of_the_moves(shim), Table(moves)], move_title))
+        sections.insert(0, Section([
+            Text(against, "warning"), _of_the_moves(shim), Table(moves)], move_title))
         figures |= {
             "shim_moves.png": (
                 partial(_moves_figure, shim), f"{move_title}, with their numbers in the table"),

@@ -241,13 +241,13 @@ def page(found: SortedBlocks) -> Page:
         Section([by_serial, Table(places)], "Which block goes where",
                 folded=len(places) > 12),
         Section([_convention(found), Table(rows, aim.table)], aim.title),
-        *([Section([
+        Section([
             "Each is put into its slot as it was measured, and then turned about its own axes. "
             "The moments in blocks.sorted.csv are those of the turned blocks, and its columns "
             "turn_x_deg, turn_y_deg and turn_z_deg have the turns: `halbach-fe cad` says them in "
             "the plan to assemble.",
-            Table(_turn_table(found))], "Blocks that are turned in their slots")]
-          if turned else [])], {aim.title: rows}, figures=figures, files=files)
+            Table(_turn_table(found))], "Blocks that are turned in their slots", about=turned)],
+        {aim.title: rows}, figures=figures, files=files)
 
 
 def _convention(found: SortedBlocks) -> str:

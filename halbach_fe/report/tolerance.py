@@ -184,7 +184,7 @@ def page(found: Tolerance | HomogeneityTolerance) -> Page:
             "include the error of the solver, quantiles do not. “95 % below” is the size that "
             "|c_n| stays below in 95 % of them. Main multipole: "
             f"{main_in_words(found.model, found.known)}.",
-            Table(rows, "numbers"), *linearized(found.study)])],
+            Table(rows, "numbers"), linearized(found.study)])],
         {"Multipoles |c_n| in units of 1e-4": rows},
         figures={
             "tolerance_sizes.png": (
@@ -202,7 +202,7 @@ def _homogeneity_page(found: HomogeneityTolerance) -> Page:
         "tolerance", "homogeneity to expect from the tolerances", found.study, answer(found),
         _homogeneity_summary(found), [
             Section([_drawn(found.study, str(len(found.rms_ppm)))]),
-            Section([SIZES, Table(rows, "turned"), *linearized(found.study)],
+            Section([SIZES, Table(rows, "turned"), linearized(found.study)],
                     f"The field in {region}")],
         {f"Deviations of |B| in {region}": rows},
         figures={"tolerance_ppm.png": (

@@ -201,11 +201,11 @@ def page(found: Verification) -> Page:
         f"{'the iron, ' if magnet.iron else ''}and the study's positions")
     fourier = (" Fourier: the same for the Fourier coefficients of B_r on the study's circles."
                if rows and "Fourier in ppm" in rows[0] else "")
-    changes = [Section([Table(rows, "numbers"), Text(
+    changes = Section([Table(rows, "numbers"), Text(
         f"Of the nominal magnet at the study's {len(found.points)} positions. Pointwise: the "
         f"largest change of B, in ppm of the largest field at these positions, {main_field}."
         f"{fourier} {error_basis(found)}", "small")],
-        "Changes of the model, and how much they change the field")] if rows else []
+        "Changes of the model, and how much they change the field", about=rows)
     model = {"route": found.route.replace("_", " "), "method": magnet.study.solver.method,
              "elements at the magnet": f"{1e3 * found.element_size_m:.3g} mm; finer by a factor of "
              f"{REFINEMENT}, coarser by it and by its square", **magnet_rows(magnet)}
@@ -217,7 +217,7 @@ def page(found: Verification) -> Page:
         "positions of the study by the magnitude of the field")
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
-        [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
+        [changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
          Section([Table(listed(model))], "Model")],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
         files={"verification.csv": csv_file(
