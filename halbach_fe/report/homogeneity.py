@@ -40,7 +40,7 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
 )
-from halbach_fe.report.words import decimals, flux_density, ppm, with_error, with_unit
+from halbach_fe.report.words import best_known, decimals, flux_density, ppm, with_error, with_unit
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 from halbach_fe.response.stray_field import NEAREST, StrayField
 from halbach_fe.study.model import Study
@@ -76,7 +76,7 @@ def answer(found: HomogeneityResult) -> Answer:
     # Deviation in ppm rms from which a tray of small magnets is not advised: 64 cubes of 4 mm in a
     # magnet of 80 cubes of 12 mm took 6600 ppm away, of 77000.
     too_large_for_a_tray = 1e4
-    name, best = list(found.by_name.items())[-1]
+    name, best = best_known(found.by_name)
     question = f"How homogeneous is the field in {found.model.region.text}?"
     low, middle, high = map(ppm, best.rms_range_ppm)
     likely = "" if name == "prior" or _cancels(best) or found.disagreement else (
@@ -135,7 +135,7 @@ def _of_map(found: HomogeneityResult) -> str:
     remarks = "".join(f". {remark.rstrip('.')}" for remark in found.map_remarks)
     if not found.of_map or found.map_misfit > POOR:
         return remarks
-    name, known = list(found.of_map.items())[-1]
+    name, known = best_known(found.of_map)
     low, _, high = map(ppm, known.rms_range_ppm)
     return (f"; a fit to the {'held-out ' if name == HELD_OUT_PART else ''}readings alone has "
             f"{ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high}){remarks}")
@@ -285,7 +285,6 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
     round_levels = MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(-largest, largest)
     *axes, last = figure.subplots(2, 2).ravel()
     for axis, each, deviation in zip(axes, slices, deviations, strict=True):
-        names = [name for name in "xyz" if name != each.across]
         axis.contourf(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels, cmap="RdBu_r",
                       extend="both")
         lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m,
@@ -296,9 +295,7 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
         axis.add_patch(Ellipse(
             (middle[0], middle[1]), *(1e3 * float(np.ptp(own)) for own in (
                 each.first_m, each.second_m)), fill=False, ec="black", lw=0.8, ls="--"))
-        axis.set_aspect("equal")
-        axis.set_xlabel(f"{names[0]} in mm")
-        axis.set_ylabel(f"{names[1]} in mm")
+        _of_plane(axis, each.across)
     colours = ScalarMappable(Normalize(-largest, largest), "RdBu_r")
     last.set_axis_off()
     last.legend(handles=[Line2D([], [], color="black", lw=0.8, ls="--", label="the region")],
@@ -307,6 +304,12 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
                     orientation="horizontal", label="|B| over its mean, in ppm",
                     ticks=MaxNLocator(4))
     return figure
+
+
+def _of_plane(axis: Axes, across: str) -> None:
+    """Label the axes of a plane, drawn to scale, that is across an axis of the magnet."""
+    first, second = (name for name in "xyz" if name != across)
+    axis.set(aspect="equal", xlabel=f"{first} in mm", ylabel=f"{second} in mm")
 
 
 def harmonics_figure(known: Homogeneity) -> Figure:
@@ -330,7 +333,7 @@ def harmonics_figure(known: Homogeneity) -> Figure:
 
 def page(found: HomogeneityResult) -> Page:
     """Return the page of the homogeneity of a magnet's field."""
-    name, best = list(found.by_name.items())[-1]
+    name, best = best_known(found.by_name)
     every, region = {**found.by_name, **found.of_map}, found.model.region.text
     rows, harmonics = homogeneity_rows(every), harmonic_rows(found)
     figures: dict[str, tuple[Callable[[], Figure], str]] = {"homogeneity.png": (
@@ -442,7 +445,6 @@ def stray_figure(stray: StrayField) -> Figure:
     widest = 1e3 * (around * max(reached) if reached else max(
         float(np.abs(plane.first_m).max()) for plane in stray.planes))
     for axis, plane in zip(axes[:-1], stray.planes, strict=True):
-        names = [name for name in "xyz" if name != plane.across]
         first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
         size = np.log(np.maximum(plane.size_T, min(*others_t, stray.limit_T) / 10))  # may be 0
         sides = [1e3 * reach.distance_m if reach else 0.0 for reach in (stray.radial, stray.axial)]
@@ -463,8 +465,8 @@ def stray_figure(stray: StrayField) -> Figure:
         if low < stray.limit_T < high:
             axis.contour(first, second, size, [np.log(stray.limit_T)], colors=POSTERIOR,
                          linewidths=2, linestyles="solid")
-        axis.set(aspect="equal", xlabel=f"{names[0]} in mm", ylabel=f"{names[1]} in mm",
-                 xlim=(-widest, widest), ylim=(-widest, widest))
+        _of_plane(axis, plane.across)
+        axis.set(xlim=(-widest, widest), ylim=(-widest, widest))
         axis.grid(alpha=0.3)
     _explain(axes[-1], stray)
     return figure

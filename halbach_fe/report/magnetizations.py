@@ -22,7 +22,7 @@ from halbach_fe.report.page import (
     charts,
     legend_above,
 )
-from halbach_fe.report.words import capital, decimals, fraction, rms
+from halbach_fe.report.words import best_known, capital, decimals, fraction, rms
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
@@ -53,7 +53,7 @@ def answer(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats) -> Answ
     Error bars hold if the rms of error over standard deviation is within three of its standard
     deviations of 1.
     """
-    (before, *_), (name, best) = known.values(), list(known.items())[-1]
+    (before, *_), (name, best) = known.values(), best_known(known)
     size = float(np.sqrt(np.mean(truth**2) * magnet.dimension))
     _, left, ratio = error_summary(best, truth).values()
     first = error_summary(before, truth)["rms_error_A_per_m"]

@@ -31,6 +31,7 @@ from halbach_fe.report.page import (
     linearized,
 )
 from halbach_fe.report.words import (
+    best_known,
     capital,
     decimals,
     faults_in_words,
@@ -160,7 +161,7 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     if not tables:
         return ""
     model, magnets = middle_circle(tables)
-    known = list(magnets.values())[-1]
+    _, known = best_known(magnets)
     circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
     local = model.z is not None
     where = (f"On the circle {circle} at z = {1e3 * model.z:.4g}\u00a0mm" if model.z is not None
@@ -226,10 +227,10 @@ def answer(
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
     said += only_of_orders(tables[0][0])
-    lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
+    lacking = [lacks_main(best_known(magnets)[1]) for _, magnets in tables]
     if all(lacking):
         return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY",
-                          list(tables[0][1].values())[-1])
+                          best_known(tables[0][1])[1])
     if any(lacking):
         said += " Where there is no main multipole, units of 1e-4 of it mean nothing."
     if not measured:
@@ -263,7 +264,7 @@ def at_z(model: object) -> str:
 
 def multipole_rows(magnets: Mapping[str, Multipoles]) -> Rows:
     """Return the rows of `text_table`, with |c_n| of the last magnet, which the answer states."""
-    name, known = list(magnets.items())[-1]
+    name, known = best_known(magnets)
     rows = text_table(**magnets)
     return [row | {f"|c_n| {name}": (
         "main" if "main" in row.values() else with_error(float(size), float(sd)))}
@@ -338,7 +339,7 @@ def lacks_main(known: Multipoles) -> bool:
 def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     """Describe the last magnet of a table, which is the best known of them, in sentences."""
     model, magnets = table
-    known = list(magnets.values())[-1]
+    _, known = best_known(magnets)
     spread = _size_sd(known)
     worst = int(np.argmax(np.hypot(known.sizes, spread)))  # of nominal magnets all means are small
     sd = float(spread[worst])
@@ -385,7 +386,7 @@ def page(found: MultipoleTables) -> Page:
     tables: dict[str, Rows] = {}
     for model, magnets in found.tables:
         limit, unit, file = found.limit, "units of 1e-4", f"multipoles_{_location(model)}.png"
-        if lacks := lacks_main(list(magnets.values())[-1]):
+        if lacks := lacks_main(best_known(magnets)[1]):
             limit, unit = None, f"m{model.unit}"
             magnets = {name: known.absolute for name, known in magnets.items()}
         where = ("integrated along z" if model.integrated else

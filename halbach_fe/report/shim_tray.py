@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 
 import numpy as np
@@ -43,47 +43,31 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 
 def answer(found: FilledTray) -> Answer:
     """Say what the tray does, with how many magnets, and what to do next."""
-    said = _answer(found)
-    return (of_a_conflict(said.question, said.said, found.disagreement) if found.disagreement
-            else said)
-
-
-def _answer(found: FilledTray) -> Answer:
-    """Return the answer of an update that agrees with its map."""
-    if not found.filled:
-        return _told(found)
-    (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
-    numbers = (("rms deviation without and with the tray",
-                f"{ppm(before)} → {ppm(after)}\u00a0ppm"),)
-    useless = f"Do not fill this tray: {len(found.filled)} of its magnets hardly help."
-    return replace(_told(found), numbers=numbers, gist=useless if before < FEW * after else
-                   f"Fill the tray with {len(found.filled)} magnets in {len(found.places_m)} "
-                   "places.")
-
-
-def _told(found: FilledTray) -> Answer:
-    """Return the same without its numbers in large type."""
-    region = found.model.region.text
-    question = f"Which magnets in the tray make the field in {region} homogeneous?"
+    question = f"Which magnets in the tray make the field in {found.model.region.text} homogeneous?"
     harmonics = "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR"
-    if not found.filled:
-        return Answer(
-            question, "Leave the tray empty: none of its magnets makes the field more homogeneous "
-            f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(found),
-            "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
-            "comes from: its harmonics tell.", harmonics)
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
-    text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
-            f"the field deviates by {ppm(after)} ppm rms (95 %: {low} to {high}), without them by "
-            f"{ppm(before)}.")
-    if all(not count for count in found.left.values()):
+    count, places = len(found.filled), len(found.places_m)
+    text = (f"With {count} magnets in the {places} places of the tray, the field deviates by "
+            f"{ppm(after)} ppm rms (95 %: {low} to {high}), without them by {ppm(before)}.")
+    if not count:
+        text = ("Leave the tray empty: none of its magnets makes the field more homogeneous than "
+                f"{ppm(before)} ppm rms.")
+    elif not any(found.left.values()):
         text += " The whole inventory is used: more magnets may do better."
+    useless = before < FEW * after
+    if count and useless:
+        text = f"Do not fill this tray: {within_a_sentence(text)} That is hardly less."
+    if found.disagreement:
+        return of_a_conflict(question, text, found.disagreement)
+    if not count:
+        return Answer(question, text, _ranges(found), "Put smaller magnets or more places into "
+                      "[shim_tray], or look for what the deviation comes from: its harmonics tell.",
+                      harmonics)
     step, trust = (f"Fill the tray from shim_tray.csv, then measure again and update {STUDY_FILE}, "
                    "which has the tray's magnets as free blocks."), ""
     command = f"halbach-fe infer DIR/{STUDY_FILE} --measurements NEW_MAP -o DIR"
-    if before < FEW * after:
-        text = f"Do not fill this tray: {within_a_sentence(text)} That is hardly less."
+    if useless:
         step, command = (
             ("The deviation is that of the design, and too large for a tray: search for a "
              "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")
@@ -96,7 +80,12 @@ def _told(found: FilledTray) -> Answer:
         step = (f"Fill the tray from shim_tray.csv, measure again with it, update {STUDY_FILE}, "
                 "which has its magnets as free blocks, and fill a second one in places that are "
                 "still free.")
-    return Answer(question, text, f"{trust}{_ranges(found)}", step, command)
+    return Answer(
+        question, text, f"{trust}{_ranges(found)}", step, command,
+        gist=f"Do not fill this tray: {count} of its magnets hardly help." if useless else
+        f"Fill the tray with {count} magnets in {places} places.",
+        numbers=(("rms deviation without and with the tray",
+                  f"{ppm(before)} → {ppm(after)}\u00a0ppm"),))
 
 
 def _ranges(found: FilledTray) -> str:

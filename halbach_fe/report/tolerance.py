@@ -126,18 +126,23 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     if lacks_main(found.known):
         return of_no_main(question, said, "Not in these units", "tolerance STUDY",
                           found.known)
-    step = (_sorting(found) if found.table_doubts or share is None or share < ENOUGH else
-            ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
-             "halbach-fe infer STUDY --measurements MAP -o DIR"))
     return Answer(question, said, f"{_trust(found)} {whole(len(found.sizes))} magnets were drawn.",
-                  *step, sound=not found.table_doubts)
+                  *_next_step(found), sound=not found.table_doubts)
 
 
-def _sorting(found: Tolerance | HomogeneityTolerance) -> tuple[str, str]:
-    """Return the next step, and its command, if the blocks make a part of the errors."""
+def _next_step(found: Tolerance | HomogeneityTolerance, of_design: str = "") -> tuple[str, str]:
+    """Return the next step, and its command; ``of_design`` is the step if the design, not the
+    blocks, makes most of the errors.
+    """
     if found.table_doubts:
         return ("Answer what is asked of the table of blocks, correct it or the study, and ask "
                 "again.", f"halbach-fe tolerance STUDY --blocks BLOCKS{at_z(found.model)} -o DIR")
+    if found.share is not None and found.share >= ENOUGH:
+        return ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
+                "halbach-fe infer STUDY --measurements MAP -o DIR")
+    if of_design:
+        return (of_design, "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
+                "halbach-fe sort STUDY BLOCKS -o DIR")
     if all(len(blocks) == 1 for blocks in types_of(build_magnet(found.study)).values()):
         return ("Every slot is a type of its own, so that no blocks can change places: state in "
                 "prior.types which slots take the same ones, then sort measured blocks.",
@@ -295,22 +300,15 @@ def _homogeneity_answer(found: HomogeneityTolerance) -> Answer:
     if share is not None and found.limit is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
-    enough = share is not None and share >= ENOUGH
-    step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
-             "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
-            ("Look for a better design first: perfect blocks would leave "
-             f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured "
-             "blocks can use their errors against it, but takes only a part of it away.",
-             "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
-             "halbach-fe sort STUDY BLOCKS -o DIR")
-            if found.ordered.rms_ppm > OF_THE_DESIGN * half else _sorting(found))
-    if found.table_doubts:
-        step = _sorting(found)
+    of_design = "" if found.ordered.rms_ppm <= OF_THE_DESIGN * half else (
+        "Look for a better design first: perfect blocks would leave "
+        f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured blocks "
+        "can use their errors against it, but takes only a part of it away.")
     text, small = solver_error_text(found.model, half)
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,
-        f"{_trust(found)} {whole(len(found.rms_ppm))} magnets were drawn. {text}", *step,
-        sound=small and not found.table_doubts)
+        f"{_trust(found)} {whole(len(found.rms_ppm))} magnets were drawn. {text}",
+        *_next_step(found, of_design), sound=small and not found.table_doubts)
 
 
 NOMINAL = ("Shapes and places count as nominal: what their tolerances make comes on top of these "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.symmetry import as_meant, is_as_meant
 from halbach_fe.study.model import Study, iron_of
 from halbach_fe.study.types import COMPONENTS
+
+T = TypeVar("T")
 
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
@@ -192,6 +195,11 @@ def place_of(block: MagnetBlock) -> str:
 def fraction(value: float) -> str:
     """Format a fraction in percent, with one decimal."""
     return f"{100 * value:.1f}\u00a0%"
+
+
+def best_known(by_name: Mapping[str, T]) -> tuple[str, T]:
+    """Return the last of some magnets, which is the best known one, and its name."""
+    return list(by_name.items())[-1]
 
 
 def listed(values: Mapping[str, str]) -> list[dict[str, str]]:
