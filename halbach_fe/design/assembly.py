@@ -382,7 +382,7 @@ def _of_table(
             "halbach-fe sort assigns blocks to slots: give its blocks.sorted.csv."))
     prior_from_blocks(magnet, table)  # which refuses blocks of another magnet
     row_of = {place: row for row, place in enumerate(table.places)}
-    rows = {number: row_of[magnet.blocks[source].ring, magnet.blocks[source].slot]
+    rows = {number: row_of[magnet.blocks[source].place]
             for number, (source, matrix) in enumerate(mountings(magnet)) if matrix.any()}
     turns = {} if table.turn_deg is None else {
         number: (float(x), float(y), float(z)) for number, row in rows.items()

@@ -346,8 +346,7 @@ def _order(blocks: _Blocks, generator: np.random.Generator | None = None) -> Int
 def _placed_order(table: BlockTable, magnet: Magnet) -> Ints | None:
     """Return the assignment by the table's own rings and slots, or None if a slot has no block."""
     row_of = {place: row for row, place in enumerate(table.places) if place[0]}
-    places = [(magnet.blocks[number].ring, magnet.blocks[number].slot)
-              for number in present(magnet)]
+    places = [magnet.blocks[number].place for number in present(magnet)]
     if not all(place in row_of for place in places):
         return None
     return np.array([row_of[place] for place in places])

@@ -32,7 +32,7 @@ def blocks_of_array(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
     nominal = nominal_blocks(array, dimension)
     if not array.exceptions:
         return nominal
-    places = {(block.ring, block.slot): block for block in nominal}
+    places = {block.place: block for block in nominal}
     of_block = exceptions_of(array)
     return tuple(_with_exceptions(block, of_block(block.ring, block.slot), places)
                  for block in nominal)

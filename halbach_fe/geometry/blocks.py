@@ -186,6 +186,11 @@ class MagnetBlock:
         return across * np.eye(3) + (along - across) * np.outer(axis, axis)
 
     @property
+    def place(self) -> tuple[int, int]:
+        """Ring and slot."""
+        return self.ring, self.slot
+
+    @property
     def name(self) -> str:
         """Name of the block in regions, parameters and reports: ``r01s05`` is ring 1, slot 5."""
         return self.label or f"r{self.ring:02d}s{self.slot:02d}"

@@ -170,7 +170,7 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def _numbers(self) -> dict[tuple[int, int], int]:
-        return {(block.ring, block.slot): number for number, block in enumerate(self.blocks)}
+        return {block.place: number for number, block in enumerate(self.blocks)}
 
     def number_of(self, ring: int, slot: int) -> int:
         """Return the number of a block, from 0 in the order of `blocks`.

@@ -246,7 +246,7 @@ def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
     """
     of_block, found = exceptions_of(magnet.array), []
     for block in magnet.blocks:
-        ring, slot = block.mounted_from or (block.ring, block.slot)
+        ring, slot = block.mounted_from or block.place
         number = magnet.number_of(ring, slot)
         turn = rotation_matrix(block.rotation_rad) @ block.carried_from(magnet.blocks[number])
         factor = magnetization_factor(of_block(block.ring, block.slot))

@@ -83,7 +83,7 @@ def sheets(assembly: Assembly) -> list[Sheet]:
         heights[-1].append(one)
     for level in heights:
         if len(level) > 1:
-            level.sort(key=lambda one: (one.block.ring, one.block.slot))
+            level.sort(key=lambda one: one.block.place)
             found.append(Sheet(f"Without a holder: {_rings(level)}, middle at z = "
                                f"{height_mm(float(level[0].block.middle[2]))} mm", level))
     alone = [level[0] for level in heights if len(level) == 1]

@@ -309,7 +309,7 @@ def magnet_view(
                         *_arrow_traces(blocks, values, [corners for corners, _ in bodies])])
     for number, body in enumerate(magnet.iron):  # one entry of the legend for all of them
         figure.add_trace(_iron_trace(body, _prism_height(magnet)).update(showlegend=not number))
-    if found := [block for block in magnet.blocks if (block.ring, block.slot) in named]:
+    if found := [block for block in magnet.blocks if block.place in named]:
         figure.add_trace(_named_trace(found, max(
             float(np.nanmax(np.hypot(trace.x, trace.y))) for trace in figure.data
             if trace.x is not None and len(trace.x))))

@@ -172,12 +172,12 @@ def faults_in_words(study: Study) -> str:
     magnet = build_magnet(study)
     found: dict[str, list[str]] = {}
     for block, meant in zip(magnet.blocks, as_meant(magnet).blocks, strict=True):
-        if (block.ring, block.slot) not in places or (
+        if block.place not in places or (
                 block.remanence and is_as_meant(block, meant, math.radians(as_ordered_deg))):
             continue
         kind = ("missing" if not block.remanence else "reversed" if block.remanence < 0 else
                 "made for another place"
-                if block.mounted_from not in (None, (block.ring, block.slot)) else
+                if block.mounted_from not in (None, block.place) else
                 "put in the wrong way")
         found.setdefault(kind, []).append(block_in_words(block.ring, block.slot))
     # largest number of blocks that a line names
