@@ -28,7 +28,7 @@ import scipy.sparse as sparse
 import xarray as xr
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
@@ -271,7 +271,7 @@ def candidate_measurements(
                 np.zeros((1, 3)), np.zeros(1), sparse.csr_array(centre[None] / size),
                 independent_noise(np.array([nmr_relative_sd * size])), np.eye(3), np.eye(3),
                 mapped=False)))
-    radii = np.unique(np.round(np.hypot(places[:, 0], places[:, 1]), 6))
+    radii = np.unique(np.round(radii_of(places), 6))
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
@@ -213,7 +213,7 @@ class Magnet(ShownInNotebook):
             found.setdefault(block.ring, []).append(points)
         sections = []
         for points in map(np.vstack, found.values()):
-            radius = np.hypot(points[:, 0], points[:, 1])
+            radius = radii_of(points)
             sections.append(((float(points[:, 2].min()), float(points[:, 2].max())),
                              (float(radius.min()), float(radius.max()))))
         return tuple(sections)

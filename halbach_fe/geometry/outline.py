@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, unit_circle
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def trapezoid_corners(x: tuple[float, float], half_widths: tuple[float, float]) 
 def circle(radius: float) -> Outline:
     """Return a circle about the origin, in four arcs; the x axis crosses the middle of one."""
     angles = np.pi / 4 * np.array([-3, -1, 1, 3])
-    return closed_outline(radius * np.column_stack([np.cos(angles), np.sin(angles)]), (0, 1, 2, 3))
+    return closed_outline(radius * unit_circle(angles)[:, :2], (0, 1, 2, 3))
 
 
 def rectangle(size_x: float, size_y: float) -> Outline:

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, azimuths_of
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
 from halbach_fe.study.iron import windings
 from halbach_fe.study.types import look_like_mm
@@ -267,7 +267,7 @@ def _section(outline: Outline, points: Floats) -> _Section:
             continue
         if edge.arc:
             first, sweep = edge.angles
-            turn = np.sign(sweep) * (np.arctan2(points[:, 1], points[:, 0]) - first)
+            turn = np.sign(sweep) * (azimuths_of(points) - first)
             # from the middle of the arc, so that what is beyond an end is nearest to that end
             middle = abs(sweep) / 2
             share = ((turn - middle + np.pi) % (2 * np.pi) - np.pi + middle) / abs(sweep)

@@ -22,7 +22,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, unit_circle
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
@@ -404,7 +404,7 @@ def _turns(
                 words = f"{name} {_by_slots(k, count)}"
             else:
                 angle = np.pi * k / count + np.radians(blocks[numbers[0]].angle_deg)
-                turn = Rotation.from_rotvec(np.pi * np.array([np.cos(angle), np.sin(angle), 0.0]))
+                turn = Rotation.from_rotvec(np.pi * unit_circle(angle))
                 words = f"{name} about {np.degrees(angle) % 180:.4g}° from x"
             pairs = _pairs(blocks, (numbers, numbers), turn.as_matrix(),
                            middle - turn.apply(middle))

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.instrument_terms import prior_sd
@@ -308,7 +308,7 @@ def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
              ylabel="y in mm")
     for axis in others:
         shown = _draw_points(axis, plan, lambda points: np.column_stack(
-            [1e3 * points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
+            [1e3 * points[:, 2], np.degrees(azimuths_of(points))]))
         axis.set(xlabel="z in mm", ylabel="angle in degrees")
     figure.colorbar(shown, label="order of choice", ax=[left, *others])
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, azimuths_of, radii_of
 from halbach_fe.inference.result import (
     COVERAGE_Z,
     HELD_OUT,
@@ -82,7 +82,7 @@ def curve(points: Floats) -> tuple[Floats, str] | None:
         if abs(along[number]) > 1 - SAME:
             return 1e3 * points[:, number], f"{'xyz'[number]} in mm"
         return 1e3 * (centred @ along), "distance along the line in mm"
-    radii = np.hypot(points[:, 0], points[:, 1])
+    radii = radii_of(points)
     if np.ptp(points[:, 2]) <= SAME * radii.max() and np.ptp(radii) <= SAME * radii.max():
         return _angle(points), "angle in degrees"
     return None
@@ -94,7 +94,7 @@ def panels(points: Floats) -> list[Panel]:
     few_radii = 3  # largest number of radii for which points count as circles about the axis
     every, z = np.arange(len(points)), 1e3 * points[:, 2]
     size = float(np.ptp(points, axis=0).max())
-    radii = np.hypot(points[:, 0], points[:, 1])
+    radii = radii_of(points)
     if np.ptp(points[:, 2]) <= SAME * size:
         return [_slice(points, every, 2)]
     from_middle = np.linalg.norm(points - _centre(points), axis=1)
@@ -142,7 +142,7 @@ def _different(values: Floats, apart: float) -> tuple[Floats, Ints]:
 
 def _angle(points: Floats) -> Floats:
     """Return the angles (n,) of points (n, 3) about z, from 0 to 360 degrees."""
-    angle = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    angle = np.degrees(azimuths_of(points)) % 360
     return np.asarray(np.where(angle > 360 - SAME, 0.0, angle), np.float64)  # -1e-17 is 0
 
 

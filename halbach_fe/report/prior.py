@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from scipy import special
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
@@ -121,7 +121,7 @@ def _axes(nominal: Floats) -> Floats:
         return np.stack([along, np.column_stack([-along[:, 1], along[:, 0]])], axis=1)
     # part of a magnetization in the plane of the ring below which it is along z
     along_z = 1e-9
-    flat = np.hypot(along[:, 0], along[:, 1])[:, None] > along_z
+    flat = radii_of(along)[:, None] > along_z
     across = np.where(flat, np.column_stack([-along[:, 1], along[:, 0], 0 * along[:, 0]]),
                       [0.0, 1.0, 0.0])
     across = across / np.linalg.norm(across, axis=1)[:, None]

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
@@ -147,11 +147,11 @@ def _tray_figure(found: FilledTray) -> Figure:
     larger angles.
     """
     columns, rows = (len(np.unique(values.round(6))) for values in (
-        np.arctan2(found.places_m[:, 1], found.places_m[:, 0]), found.places_m[:, 2]))
+        azimuths_of(found.places_m), found.places_m[:, 2]))
     figure, axis = chart(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)), grid=False)
 
     def unrolled(places: Floats) -> tuple[Floats, Floats]:
-        return np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360, 1e3 * places[:, 2]
+        return np.degrees(azimuths_of(places)) % 360, 1e3 * places[:, 2]
 
     axis.plot(*unrolled(found.places_m), "o", ms=12, mfc="none", mec=PUBLISHED, lw=0.5,
               label="place")

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import lpmv, roots_jacobi
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -708,7 +708,7 @@ def real_harmonics(
     sphere of a radius, relative to that of the amplitudes.
     """
     points, weights = sphere_points(surface_degree)
-    phi = np.arctan2(points[:, 1], points[:, 0])
+    phi = azimuths_of(points)
     terms, rows = [], []
     for degree in range(1, degrees + 1):
         for order in range(degree + 1):

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 
 Fractions = tuple[float, float]
 Vector = tuple[float, float, float]
@@ -335,7 +335,7 @@ class CylinderBody:
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Tell which points (n, 3) in m, in the shape's axes, are inside or on the surface."""
-        return (np.hypot(points[:, 0], points[:, 1]) <= self.radius) & (
+        return (radii_of(points) <= self.radius) & (
             np.abs(points[:, 2]) <= self.length / 2)
 
 

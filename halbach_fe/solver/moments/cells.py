@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, azimuths_of
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of
 from halbach_fe.geometry.outline import Edge, Outline, at_heights
 
@@ -189,7 +189,7 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     # along a side of a cuboid; along a diagonal of others, which no triangle lacks: so the cells of
     # congruent sectors are equal in their frames
     first = np.where(cuboid[:, None], sides[:, 0], local[:, 2] - local[:, 0])
-    angle = np.arctan2(first[:, 1], first[:, 0])
+    angle = azimuths_of(first)
     turn = np.zeros((len(quads), 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
     turn[:, 1, 0], turn[:, 0, 1] = np.sin(angle), -np.sin(angle)
