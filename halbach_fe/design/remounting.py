@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
@@ -65,13 +64,13 @@ class Mounts:
     places: tuple[tuple[int, int], ...]
     frames: Floats
     turns: Floats
-    allowed: NDArray[np.bool_]
+    allowed: Bools
     designed: Floats
     current: Floats
     kinds: Ints
     current_kinds: Ints
 
-    def fits(self, directions: Floats, kinds: Ints) -> NDArray[np.bool_]:
+    def fits(self, directions: Floats, kinds: Ints) -> Bools:
         """Return which blocks fit which slots, shape (turns, slots, blocks).
 
         Parameters

@@ -20,9 +20,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints, azimuths_of, radii_of, unit_circle
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -508,7 +507,7 @@ class _Search:
         change[there] -= 2 * self.products[own[there], np.flatnonzero(there)]
         return change, empty
 
-    def _allowed(self) -> NDArray[np.bool_]:
+    def _allowed(self) -> Bools:
         """Return which choices (m,) the inventory allows, instead of what is in the place."""
         own = self.chosen[self.place]
         same = (own != EMPTY) & (self.kinds[np.maximum(own, 0)] == self.kinds)

@@ -29,10 +29,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import DeviationModel, Objective
@@ -404,7 +403,7 @@ class Slots:
     blocks: Floats
     spread: Floats
     turns: Floats
-    fits: NDArray[np.bool_]
+    fits: Bools
     slot_class: Ints
     block_class: Ints
 
@@ -419,7 +418,7 @@ class Slots:
         return np.ascontiguousarray(self.effect.reshape(len(self.effect), -1))
 
     @cached_property
-    def choices(self) -> tuple[Ints, NDArray[np.bool_]]:
+    def choices(self) -> tuple[Ints, Bools]:
         """Numbers of the turns of each pair of classes (A, C, k), and which of them there are."""
         most = int(self.fits.sum(axis=0).max(initial=1))
         order = np.argsort(~self.fits, axis=0, kind="stable")[:most]

@@ -26,9 +26,8 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, radii_of
+from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
@@ -528,7 +527,7 @@ def _point_scan(points: Floats, sigma: float, name: str | None) -> ProposedScan:
         independent_noise(np.full(count, sigma)), np.eye(3), np.eye(3), map=name)
 
 
-def _point_sigma(diagnosis: Diagnosis, own: NDArray[np.bool_] | slice) -> float:
+def _point_sigma(diagnosis: Diagnosis, own: Bools | slice) -> float:
     """Return the noise in T of one component at one point, among ``own`` readings.
 
     The noise of a study with Fourier coefficients is that of a coefficient, which averages over the

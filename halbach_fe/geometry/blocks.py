@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.geometry.outline import (
     Outline,
     along_edges,
@@ -220,7 +219,7 @@ class MagnetBlock:
         """Nominal magnetization M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
         return self.polarization / (MU_0 * self.recoil_permeability)
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m lie inside the block, and not on its surface."""
         return self.contact(points).inside
 

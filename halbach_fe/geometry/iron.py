@@ -7,10 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.convex_pieces import triangles_of_polygon
@@ -172,7 +171,7 @@ class IronSolid:
             return max(-self.z_min, self.z_max)
         return float(np.abs(self.surface[2]).max())
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m lie inside the body, and not on its surface."""
         return self.contact(points).inside
 

@@ -12,11 +12,11 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, radii_of
+from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
@@ -296,7 +296,7 @@ class Magnet(ShownInNotebook):
         """Half the length of the magnet in m, including its iron."""
         return max(self.array_half_length, self.iron_half_length)
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are not in air.
 
         These are inside a block, a neighbour's block or the iron, on an edge, or between two bodies

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Floats, unit_circle
+from halbach_fe.core.arrays import Bools, Floats, unit_circle
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ def mean_corner(outline: Outline) -> tuple[float, float]:
     return x, y
 
 
-def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
+def outline_contains(outline: Outline, points: Floats) -> Bools:
     """Tell which points (n, 2) in m lie inside an outline.
 
     The even-odd rule (crossings of a ray along +x) decides for the polygon of the corners. Points

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_matrix
 from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
@@ -191,7 +190,7 @@ class _Bodies:
     position: Floats
 
     @cached_property
-    def infinite(self) -> NDArray[np.bool_]:
+    def infinite(self) -> Bools:
         """Whether bodies are infinitely long, (n,)."""
         return np.asarray(np.isinf(self.limits).any(axis=1))
 

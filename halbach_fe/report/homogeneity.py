@@ -17,10 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from halbach_fe.api import HomogeneityResult
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
@@ -259,7 +258,7 @@ def homogeneity_summary(found: HomogeneityResult) -> Plain:
         "of_map": {name: plain_homogeneity(known) for name, known in found.of_map.items()}}
 
 
-def _deviations(slices: list[Slice], mean_T: float) -> tuple[list[Floats], NDArray[np.bool_]]:
+def _deviations(slices: list[Slice], mean_T: float) -> tuple[list[Floats], Bools]:
     """Return deviations of |B| in ppm in every slice, and which pixels are in the ellipse in it."""
     x, y = np.meshgrid(*2 * [np.linspace(-1, 1, len(slices[0].first_m))])
     return [PPM * (each.size_T / mean_T - 1) for each in slices], x**2 + y**2 <= 1

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
 from halbach_fe.report.answer import STATE_NOISE, Answer
@@ -218,7 +217,7 @@ def _prediction(result: InferenceResult) -> str:
             f"The 95 % band holds {fraction(held)} of them.")
 
 
-def _tested(result: InferenceResult) -> tuple[str | None, NDArray[np.bool_]]:
+def _tested(result: InferenceResult) -> tuple[str | None, Bools]:
     """Return the part of the readings that the update has not seen, and a mask (readings,) of it;
     None and all readings if it has seen all.
     """

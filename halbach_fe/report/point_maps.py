@@ -12,10 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, Ints, azimuths_of, radii_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
 from halbach_fe.inference.result import (
     COVERAGE_Z,
     HELD_OUT,
@@ -465,7 +464,7 @@ def predictions(result: InferenceResult) -> list[tuple[str, Prediction, str]]:
             ("posterior", result.prediction_posterior, POSTERIOR)]
 
 
-def parts_of(result: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def parts_of(result: InferenceResult, index: Ints) -> Iterator[tuple[str, Bools]]:
     """Yield each part of the readings that is present, and the mask of its readings."""
     parts = np.array(result.parts)[index]
     for part in MARKERS:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson, simpson
 
-from halbach_fe.core.arrays import Floats, plain
+from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.blocks import present_blocks
@@ -360,7 +360,7 @@ class _Beside:
         step = np.full(len(lines.points), relative * magnet.radius)
         halvings = 8
 
-        def blocked(factors: tuple[int, ...], numbers: NDArray[np.intp]) -> NDArray[np.bool_]:
+        def blocked(factors: tuple[int, ...], numbers: NDArray[np.intp]) -> Bools:
             found = np.zeros(len(numbers), bool)
             for factor in factors:
                 shift = factor * step[numbers, None, None] * lines.axes[0]
@@ -637,7 +637,7 @@ def _linearized(factor: Floats, slope: Floats, field: Floats) -> Floats:
 
 def _add_answer(
     of_change: Floats, iron: IronReaction | BodiesReaction, magnet: Magnet, remanence: Floats,
-    points: Floats, in_iron: NDArray[np.bool_]
+    points: Floats, in_iron: Bools
 ) -> None:
     """Add to mu_0 H (n, 3, q) in T of deviations what iron answers to them.
 

@@ -32,7 +32,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import pro
-from halbach_fe.core.arrays import Floats, Ints, azimuths_of, radii_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -99,7 +99,7 @@ def is_axisymmetric(magnet: Magnet) -> bool:
     return bool(alike.all())
 
 
-def few_modes_suffice(magnet: Magnet, points: Floats) -> NDArray[np.bool_]:
+def few_modes_suffice(magnet: Magnet, points: Floats) -> Bools:
     """Tell at which points (n, 3) in m at most 64 modes matter, if the route applies."""
     if not is_axisymmetric(magnet):
         return np.zeros(len(points), bool)
@@ -482,7 +482,7 @@ def read_run(case: ModesCase, folder: Path, modes: int, sources: int, printed: i
     return result.reshape(modes, sources, *result.shape[1:])
 
 
-def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None:
+def _limit_on_axis(m: int, gradient: Floats, on_axis: Bools) -> None:
     """Replace d psi/dr, psi/r, d psi/dz (..., points, 3) on the axis by their limits, in place.
 
     Near the axis psi_m is proportional to r^m. The functions of the elements are not, so that their

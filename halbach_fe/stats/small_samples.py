@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.special as special
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.stats.gaussian import Gaussian, block_diagonal_root, stacked_root
 
 
@@ -276,7 +275,7 @@ class Bin:
 
 
 def frequencies(
-    stated: Floats, happened: NDArray[np.bool_], edges: Sequence[float]
+    stated: Floats, happened: Bools, edges: Sequence[float]
 ) -> tuple[Bin, ...]:
     """Return how often statements were true, for bins of their probability.
 

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints, azimuths_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of
 from halbach_fe.geometry.outline import Edge, Outline, at_heights
 
@@ -55,7 +54,7 @@ class Cells:
     axes: Floats
     vertices: Floats
     half: Floats
-    cuboid: NDArray[np.bool_]
+    cuboid: Bools
     divisions: int = 2
 
     def __len__(self) -> int:
