@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, unit_circle
+from halbach_fe.core.arrays import Floats, polygon_area, unit_circle
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
 from halbach_fe.geometry.outline import Outline, circle, closed_outline, trapezoid_corners
@@ -134,9 +134,7 @@ def sector_outline(inner: float, outer: float, start: float, stop: float) -> Out
 
 def counter_clockwise(corners: Floats) -> Floats:
     """Return the corners (n, 2) of a polygon in the order in which it runs counter-clockwise."""
-    x, y = corners.T
-    area = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    return corners if area > 0 else corners[::-1]
+    return corners if polygon_area(corners) > 0 else corners[::-1]
 
 
 RELATIVE_ROUNDING = 1e-12

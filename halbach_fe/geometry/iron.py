@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.core.arrays import Bools, Floats, polygon_area
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.convex_pieces import triangles_of_polygon
@@ -143,8 +143,7 @@ class IronSolid:
             rim = 2 * np.pi * (self.inner_radius + self.outer_radius)
             area, corners = np.pi * (self.outer_radius**2 - self.inner_radius**2), 0
         else:
-            x, y = np.array([edge.start for edge in self.outline]).T
-            area = float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+            area = polygon_area(np.array([edge.start for edge in self.outline]))
             rim, corners = sum(edge.length for edge in self.outline), len(self.outline)
         length = self.z_max - self.z_min
         return area * length, 2 * area + rim * length, 2 * rim + corners * length

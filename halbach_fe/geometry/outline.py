@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Bools, Floats, unit_circle
+from halbach_fe.core.arrays import Bools, Floats, box_middle, unit_circle
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def thinnest_wall(polygons: Sequence[Floats], owners: Sequence[object]) -> tuple
         0 if two polygons overlap; infinite if there is nothing to compare.
     first, second : int
     """
-    centres = np.array([(polygon.max(axis=0) + polygon.min(axis=0)) / 2 for polygon in polygons])
+    centres = np.array([box_middle(polygon) for polygon in polygons])
     reach = np.array([np.hypot(*(polygon - centre).T).max()
                       for polygon, centre in zip(polygons, centres, strict=True)])
     nearest = (np.inf, 0, 0)

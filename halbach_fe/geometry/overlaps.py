@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, box_middle
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_matrix
 from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
@@ -161,7 +161,7 @@ def points_of_block(block: MagnetBlock, depth: float = 0.0) -> Floats:
     """
     points = at_heights(along_edges(block.outline, 5), block.z_min, (block.z_min + block.z_max) / 2,
                         block.z_max)
-    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    middle = box_middle(points)
     shrunk = 1 - 2 * depth / np.ptp(points, axis=0).min()
     return block.from_frame(np.vstack([middle + shrunk * (points - middle), middle]))
 

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, face_vectors
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
 from halbach_fe.study.iron import windings
 from halbach_fe.study.types import look_like_mm
@@ -157,7 +157,7 @@ def _touch_triangles(found: Contact, triangles: Floats, points: Floats, some: In
                      small: float) -> None:
     """Set the contact of ``some`` of the points with triangles, ``small`` in m thick."""
     a, b, c = np.moveaxis(triangles[None] - points[some, None, None], 2, 0)
-    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    across = face_vectors(triangles)
     normal = across / np.linalg.norm(across, axis=1)[:, None]
     height = -np.einsum("nmi,mi->nm", a, normal)
     # distances in the plane from the three sides, inwards

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from markupsafe import Markup
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.pace import Progress
 from halbach_fe.design.assembly import AssembledBlock, Assembly
@@ -192,8 +192,8 @@ def drawing(
     drawn = []
     for number, (one, polygon, label) in enumerate(zip(
             sheet.blocks, outlines, labels, strict=True)):
-        middle = (polygon.max(axis=0) + polygon.min(axis=0)) / 2
-        width = float(np.sqrt(_area(polygon)))
+        middle = box_middle(polygon)
+        width = float(np.sqrt(abs(polygon_area(polygon))))
         angle = float(np.arctan2(middle[1], middle[0]))
         place: tuple[float, float, float, str, float]
         if layers[number] == max(layers):
@@ -216,9 +216,8 @@ def drawing(
 
 def _layers(outlines: Sequence[Floats]) -> list[int]:
     """Return the number of the layer about the axis of every block, the innermost is 0."""
-    radii = np.array([float(np.hypot(*((one.max(axis=0) + one.min(axis=0)) / 2)))
-                      for one in outlines])
-    widths = np.array([np.sqrt(_area(one)) for one in outlines])
+    radii = np.array([float(np.hypot(*box_middle(one))) for one in outlines])
+    widths = np.array([np.sqrt(abs(polygon_area(one))) for one in outlines])
     order = np.argsort(radii, kind="stable")
     steps = np.diff(radii[order]) > 0.5 * widths[order][1:]
     layer = np.zeros(len(radii), int)
@@ -329,12 +328,6 @@ def common_beginning(serials: Sequence[str]) -> str:
     return first[:same]
 
 
-def _area(polygon: Floats) -> float:
-    """Return the area of a polygon (n, 2)."""
-    x, y = polygon.T
-    return float(abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2)
-
-
 def _path(polygon: Floats) -> str:
     """Return a closed polygon as a path of SVG, whose y axis points down."""
     return "M" + "L".join(f"{x:.2f} {-y:.2f}" for x, y in polygon) + "Z"
@@ -422,7 +415,7 @@ def write_stl(triangles: Floats, title: str, path: Path) -> None:
 
     ``title`` stands at the beginning of the file.
     """
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = face_vectors(triangles)
     records = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)),
                                         ("attributes", "<u2")])
     records["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
+from halbach_fe.core.numbers import first_of
 from halbach_fe.core.result_folder import Record, Results, finished_results
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import block_in_words
@@ -416,8 +417,7 @@ def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
             changed = {key: values for key, values in changed.items()
                        if key.partition(".")[0] not in OF_MAPPER}
         texts = [_difference(key, old, new) for key, (old, new) in changed.items()]
-        more = f" and {len(texts) - MOST_KEYS} more" if len(texts) > MOST_KEYS else ""
-        changes = "; ".join(texts[:MOST_KEYS]) + more
+        changes = first_of(texts, MOST_KEYS, "; ")
         of = f"{_listed(group)} {'is' if len(group) == 1 else 'are'} of"
         if source is not None:
             other, name = source

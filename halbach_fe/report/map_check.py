@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import first_of
 from halbach_fe.measurement.field_map import points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import (
     SCATTERED_M,
@@ -303,8 +304,7 @@ OPEN_SIGN = (
 def _numbers(rows: Sequence[int]) -> str:
     """Return the numbers of some rows, the first ones of many."""
     rows_named = 10  # number of broken rows that are listed by number
-    more = f" and {len(rows) - rows_named} more" if len(rows) > rows_named else ""
-    return f"{', '.join(map(str, rows[:rows_named]))}{more}"
+    return first_of([*map(str, rows)], rows_named)
 
 
 BROKEN = {"zero": "all components are zero",

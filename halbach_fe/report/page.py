@@ -33,7 +33,7 @@ from tomlkit.items import Array, Trivia, Whitespace
 
 import halbach_fe
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
@@ -546,7 +546,7 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
         shown = []
     for block, outline in zip(shown, outlines, strict=False):
         axis.plot(*outline.T, color=colour, lw=0.6)
-        middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
+        middle = box_middle(outline)
         length = 0.3 * float(np.ptp(outline, axis=0).min())
         axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
                       middle - length * np.array(block.easy_axis[:2]),

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.numbers import EMPTY_CELL
+from halbach_fe.core.numbers import EMPTY_CELL, first_of
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
@@ -277,7 +277,6 @@ def iron_description(magnet: Magnet) -> str:
             f", z {1e3 * body.z_min:g} to {1e3 * body.z_max:g} mm")
         bodies.append(f"{kind}, r {1e3 * body.inner_radius:g} to "
                       f"{1e3 * body.outer_radius:g} mm{length}")
-    more = f" and {len(bodies) - 4} more" if len(bodies) > 4 else ""
     if any(body.own_material for body in getattr(iron, "bodies", ())):
         material = "iron of several materials"
     elif iron.curve is None:
@@ -286,7 +285,7 @@ def iron_description(magnet: Magnet) -> str:
         material = f"magnetization curve ({iron.curve.kind.replace('_', '–').title()})"
         if iron.curve.kind == "steel":
             material = f"steel {iron.curve.name}"
-    return f"{material}; {'; '.join(bodies[:4])}{more}"
+    return f"{material}; {first_of(bodies, 4, '; ')}"
 
 
 def capital(text: str) -> str:
