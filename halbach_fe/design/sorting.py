@@ -23,7 +23,7 @@ sum of squares has ``tr(K_s R C_b R')`` in addition.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
 from halbach_fe.geometry.magnet import Magnet
@@ -157,7 +158,7 @@ class _Blocks:
 def sort_blocks(
     magnet: Magnet, table: BlockTable, model: Objective,
     generator: np.random.Generator,
-    progress: Callable[[int, int], None] = lambda done, total: None, turns: bool = False,
+    progress: Progress = quiet, turns: bool = False,
 ) -> SortedBlocks:
     """Assign measured blocks to slots of their type such that the values of a model are small.
 

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import LEVEL_M, Plate
 from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_text
@@ -557,7 +557,7 @@ def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
         "way_round": [one.way_round for one in blocks]}
 
 
-def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> Page:
+def page(assembly: Assembly, progress: Progress = quiet) -> Page:
     """Return the page of what is to be ordered and made; its files are the solids, too."""
     kinds, plates = _kind_rows(assembly), _plate_rows(assembly)
     upside_down = ("" if not kinds or "to order" not in kinds[0] else " Kinds that differ only in "

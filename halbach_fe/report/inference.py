@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
@@ -219,8 +220,6 @@ def definition(axis: MagneticAxis) -> str:
                else ". ") + roll)
 
 
-NOTHING = "–"
-
 ALONE = "by the readings alone"
 """Head of a column of deviations along easy axes."""
 
@@ -258,7 +257,7 @@ def score_table(result: InferenceResult) -> Rows:
             "before, rms": flux_density(score.rms_error_prior_T, zeros=True),
             "after, rms": flux_density(score.rms_error_posterior_T, zeros=True),
             "after, of the largest reading": relative(score.rms_error_posterior_T / largest)
-            if largest else NOTHING,
+            if largest else EMPTY_CELL,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
             "chi²/reading, before": _chi2(
@@ -272,14 +271,14 @@ def score_table(result: InferenceResult) -> Rows:
         together = {"region": "together", "readings": f"{training.sum()} {TRAINING}".replace(
             " ", "\u00a0"), "before, rms": off[0], "after, rms": off[1],
             "chi²/reading, before": _chi2(result.prior_conflict)}
-        rows.append({name: together.get(name, NOTHING) for name in rows[0]})
+        rows.append({name: together.get(name, EMPTY_CELL) for name in rows[0]})
     if len({row["region"] for row in rows}) == 1:  # its name tells nothing
         rows = [{name: text for name, text in row.items() if name != "region"} for row in rows]
     return rows
 
 
 def _chi2(value: float | None) -> str:
-    return NOTHING if value is None else decimals(value)
+    return EMPTY_CELL if value is None else decimals(value)
 
 
 def block_table(result: InferenceResult) -> Rows:
@@ -320,7 +319,7 @@ def _by_readings(result: InferenceResult, directions: Floats, of: Floats) -> lis
         return []
     mean, sd = by_readings_alone(result.prior, result.posterior, directions)
     mean = of * (mean + directions @ (result.prior.mean - result.response.nominal))
-    return [f"{with_error(value, bar)}\u00a0%" if bar < 100 else NOTHING  # not even a whole block
+    return [f"{with_error(value, bar)}\u00a0%" if bar < 100 else EMPTY_CELL  # not a whole block
             for value, bar in zip(mean.tolist(), (of * sd).tolist(), strict=True)]
 
 
@@ -518,7 +517,7 @@ def _solver_error(result: InferenceResult) -> str:
 
 
 def _percent(value: float | None) -> str:
-    return NOTHING if value is None else f"{100 * value:.3g}\u00a0%"
+    return EMPTY_CELL if value is None else f"{100 * value:.3g}\u00a0%"
 
 
 def _figure_height(rings: int) -> float:

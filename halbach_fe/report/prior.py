@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from scipy import special
 
 from halbach_fe.core.arrays import Floats, radii_of
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
@@ -35,8 +36,6 @@ UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 PARTS = ("in length", "in direction, in the plane of the ring", "in direction, towards z")
 """Parts of the deviation of a magnetization from the nominal one."""
 
-NOTHING = "–"
-
 
 def type_table(prior: MeasuredPrior) -> Rows:
     """Return the rows of the table of block types, as text: mean ± sd and adjusted p-values.
@@ -50,7 +49,7 @@ def type_table(prior: MeasuredPrior) -> Rows:
              DIRECTIONS, ("%", "°", "°"), _mean_of_type(samples),
              ["" if np.isnan(sd) else f" ± {sd:.2f}" for sd in _sd_of_type(samples)],
              strict=False)},
-         **{f"p {name}": NOTHING if np.isnan(p) else p_value(p)
+         **{f"p {name}": EMPTY_CELL if np.isnan(p) else p_value(p)
             for name, p in zip(DIRECTIONS, samples.p, strict=False) if tested}}
         for samples in prior.types]
 

@@ -23,6 +23,7 @@ import numpy as np
 import scipy.special as special
 
 from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.stats.gaussian import Gaussian, block_diagonal_root, stacked_root
 
 
@@ -194,7 +195,7 @@ BINS = 10
 def ranks(
     prior: Gaussian, simulate: Simulator, sampler: Sampler, repeats: int,
     generator: np.random.Generator,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = quiet,
 ) -> tuple[Ints, int]:
     """Simulate ``repeats`` inferences and rank the true parameters among posterior draws.
 
