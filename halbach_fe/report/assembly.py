@@ -460,8 +460,8 @@ def answer(assembly: Assembly) -> Answer:
     else:
         step = "See which forces the blocks feel, for tools and glue."
     if assembly.left_over:
-        said.append(f"{counted(assembly.left_over, 'measured block')} "
-                    f"{'is' if assembly.left_over == 1 else 'are'} left over.")
+        said.append(f"{counted(assembly.left_over, 'measured block is', 'measured blocks are')} "
+                    "left over.")
     return Answer("What is to be ordered and made?", " ".join(said), trust, step,
                   "halbach-fe forces STUDY -o DIR")
 

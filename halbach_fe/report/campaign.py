@@ -18,17 +18,7 @@ from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
-from halbach_fe.report.page import (
-    POSTERIOR,
-    PRIOR,
-    SECOND,
-    Page,
-    Section,
-    Table,
-    View,
-    chart,
-    geometry_figure,
-)
+from halbach_fe.report.page import OF_COMPONENTS, Page, Section, Table, View, chart, geometry_figure
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
@@ -39,8 +29,6 @@ from halbach_fe.synthetic.simulate import (
     observed_components,
     point_noise,
 )
-
-COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 
 def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: int) -> Answer:
@@ -150,7 +138,8 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
     figure, axis = chart(4)
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
         place, label = curve(points_of(data)) or (np.zeros(0), "")
-        for (shown, column), colour in zip(_columns(study, data).items(), COLOURS, strict=False):
+        for (shown, column), colour in zip(
+                _columns(study, data).items(), OF_COMPONENTS, strict=False):
             axis.plot(place, 1e3 * column, marker, ms=4, color=colour, label=f"{shown}, {name}")
         axis.set_xlabel(label)
     axis.set_ylabel("reading in mT")

@@ -19,6 +19,7 @@ from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
 from halbach_fe.report.page import (
+    LISTED,
     MEASURED,
     POSTERIOR,
     PRIOR,
@@ -270,14 +271,13 @@ _SCALED = ". At other temperatures the field of the iron is scaled with the rema
 
 def _worst_block_table(rows: list[dict[str, Any]]) -> Rows:
     """Return the rows of the few blocks with the smallest margins, as text."""
-    worst_rows = 12  # number of blocks in the page's table
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
              "lowest H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
              "past the knee": f"{100 * row['share_beyond_knee']:.1f} %",
              "H_cJ needed in kA/m": f"{1e-3 * row['needed_coercivity_A_per_m']:.0f}"}
-            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:worst_rows]]
+            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:LISTED]]
 
 
 def _layers(found: DemagnetizationMap) -> dict[str, Ints]:

@@ -18,6 +18,7 @@ from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
+    LISTED,
     MEASURED,
     POSTERIOR,
     PRIOR,
@@ -33,9 +34,6 @@ from halbach_fe.report.page import (
 )
 from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_unit
 from halbach_fe.study.types import COMPONENTS
-
-LISTED = 12
-"""Number of the blocks on page and terminal: those with the largest forces."""
 
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""

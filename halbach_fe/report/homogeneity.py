@@ -24,6 +24,7 @@ from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
+    LISTED,
     POSTERIOR,
     PUBLISHED,
     SECOND,
@@ -58,10 +59,6 @@ MAP_ROWS = ("Those of the map are of a fit of its readings by solid harmonics, w
 
 ROUNDING = 1e-9
 """Size below which a harmonic is zero but for rounding, relative to the largest one."""
-
-LISTED = 12
-"""Number of the harmonics on the page and the terminal: the largest ones."""
-
 
 LEAST_OF_SD = 5e-3
 """Part of its standard deviation below which a number is 0 in tables."""

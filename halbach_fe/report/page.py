@@ -61,6 +61,7 @@ from halbach_fe.study.study_file import study_text, write_edited
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 SECOND, THIRD = "#009E73", "#CC79A7"
 IRON = "#56B4E9"
+OF_COMPONENTS = (POSTERIOR, PRIOR, SECOND)
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
@@ -78,6 +79,9 @@ own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
 
+
+LISTED = 12
+"""Number of rows that a page or the terminal lists of many: the largest ones, or the first."""
 
 Rows = list[dict[str, str]]
 """Rows of text, each by the names of its columns."""

@@ -137,7 +137,7 @@ def answer(
     least_bad = f" for B{best.component}" if best.component else ""
     alike = sum(_fit_alike(best, each) or is_symmetric_to(best, each) for each in rivals(found))
     if alike:
-        said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
+        said += (f" {counted(alike, 'other pose of the map is', 'other poses of the map are')} as "
                  "likely.")
     trust = [*_other_poses(found), *_reversed(best, assumed), _fit(best, before)]
     stated = assumed or Instrument()
@@ -359,8 +359,8 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
     probability, said = stated_odds(found), []
     alike, unlike = [], []
     if left := found[0].left_out:
-        said.append(f"Of the {len(found) + left} poses that the search found, {len(found)} "
-                    f"{'was' if len(found) == 1 else 'were'} fitted; the others may be as likely.")
+        said.append(f"Of the {len(found) + left} poses that the search found, "
+                    f"{counted(len(found), 'was', 'were')} fitted; the others may be as likely.")
     if not found[0].explains:
         alike = rivals(found)
     for each, value in zip(found[1:], probability[1:], strict=True):
@@ -369,15 +369,14 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
                 alike.append(each)
             else:
                 unlike.append(f"{100 * value:.0f}\u00a0%")
-    others, one = counted(len(alike), "other pose"), len(alike) == 1
     if alike and all(is_symmetric_to(found[0], each) for each in alike):
         said.append(
-            f"{others} {'predicts' if one else 'predict'} the same readings, because the nominal "
-            "magnet is the same after the turn from one pose to the other: no reading can tell "
-            "them apart." + (USE_ANY if is_sound(found[0]) else ""))
+            f"{counted(len(alike), 'other pose predicts', 'other poses predict')} the same "
+            "readings, because the nominal magnet is the same after the turn from one pose to the "
+            "other: no reading can tell them apart." + (USE_ANY if is_sound(found[0]) else ""))
     elif alike:
-        said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
-                    "how the map was measured which one is real.")
+        said.append(f"{counted(len(alike), 'other pose fits', 'other poses fit')} these readings "
+                    "equally well: decide by how the map was measured which one is real.")
     if unlike and found[0].explains and found[0].at_rest:
         least = (", which is taken because its axes are turned least: decide by how the map was "
                  "measured" if probability[0] < probability.max() else "")

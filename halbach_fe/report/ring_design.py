@@ -77,8 +77,8 @@ def at_limits(found: Designed) -> str:
         for word, end in (("smallest", min(layer.radii_m)), ("largest", max(layer.radii_m))):
             count = int(np.isclose(radii, end).sum())
             if count and len(layer.radii_m) > 1:
-                said.append(f"{counted(count, 'ring')} {'has' if count == 1 else 'have'} the "
-                            f"{word} radius{of} that [design] allows, {1e3 * end:.6g}\u00a0mm")
+                said.append(f"{counted(count, 'ring has', 'rings have')} the {word} "
+                            f"radius{of} that [design] allows, {1e3 * end:.6g}\u00a0mm")
     return f" {in_a_row(said)}: radii beyond that may be better." if said else ""
 
 

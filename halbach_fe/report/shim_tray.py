@@ -14,6 +14,7 @@ from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
 from halbach_fe.report.page import (
+    LISTED,
     PUBLISHED,
     Drawn,
     Page,
@@ -31,9 +32,6 @@ from halbach_fe.response.homogeneity import Homogeneity
 
 STUDY_FILE = "study.filled.toml"
 """Name of the study that has the magnets of the tray."""
-
-LISTED = 12
-"""Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""
 
 FEW = 1.2
 """Factor below which the deviations are called hardly smaller."""

@@ -21,9 +21,7 @@ from halbach_fe.report.multipoles import (
 )
 from halbach_fe.report.page import (
     MEASURED,
-    POSTERIOR,
-    PRIOR,
-    SECOND,
+    OF_COMPONENTS,
     Drawn,
     Figures,
     Page,
@@ -51,8 +49,6 @@ from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution, write_solution
 from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.types import COMPONENTS
-
-COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 ROUGH = 1e-3
 """Error of the solver relative to the field above which a solution is not to be used."""
@@ -207,7 +203,7 @@ def field_figure(solution: Solution) -> Figure:
     figure, (top, *others) = charts(5.8, 2, height_ratios=[2, 1], sharex=not fourier) if (
         below) else charts(4.1)
     order = np.argsort(place, kind="stable")
-    for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], COLOURS,
+    for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], OF_COMPONENTS,
                                          solution.flux_density.T, strict=False):
         top.plot(place[order], 1e3 * column[order], ".-", ms=4, lw=0.8, color=colour,
                  label=f"B{component}")

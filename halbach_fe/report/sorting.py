@@ -135,13 +135,13 @@ def _answer(found: SortedBlocks) -> Answer:
     sizes = "" if found.fields is None else " ({} instead of {} peak to peak)".format(
         *(ppm(each.peak_to_peak_ppm) for each in found.fields))
     question = "Which block goes into which slot?"
-    left = ("" if not found.left_over else f" {counted(found.left_over, 'block')} "
-            f"{'is' if found.left_over == 1 else 'are'} left over.")
+    left = ("" if not found.left_over else
+            f" {counted(found.left_over, 'block is', 'blocks are')} left over.")
     if not isinstance(found.model, DeviationModel) and lacks_main(found.numbered):
         return of_no_main(question, f"Not known: {what} {text(own)} {unit}.", "Not in these units",
                           "sort STUDY BLOCKS", found.numbered)
-    turned = ("" if not found.turned else f" {counted(found.turned, 'block')} "
-              f"{'is' if found.turned == 1 else 'are'} turned in the slot, as sort.csv says.")
+    turned = "" if not found.turned else (
+        f" {counted(found.turned, 'block is', 'blocks are')} turned in the slot, as sort.csv says.")
     if found.has_choice and not _chose(found):
         return Answer(
             question, f"It does not matter: {what} {text(best)} {unit} in every order that is "

@@ -145,7 +145,7 @@ def share_in_words(share: float, sd: float | None) -> str:
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return a number and its noun: 1 move, 2 moves."""
+    """Return a number and its noun, perhaps with its verb: 1 move, 2 moves; 1 is, 2 are."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
