@@ -249,7 +249,7 @@ def _with_error_of_iron(loads: Loads, charges: Charges, blocks: Sequence[MagnetB
     """
     if iron.coarse is None:
         return loads
-    middles = np.array([_middle(block) for block in blocks])
+    middles = np.array([block.mounted_middle for block in blocks])
     whole, coarse = (charges.loads(each.field(charges.points), middles, len(blocks))
                      for each in (iron, iron.coarse))
     bars = []
@@ -363,7 +363,7 @@ def _loads(
     """
     near, far = (Charges.of([blocks[number] for number in targets], order)
                  for order in (near_order, far_order))
-    middles = np.array([_middle(block) for block in blocks])
+    middles = np.array([block.mounted_middle for block in blocks])
     reach = np.array([_reach(block) for block in blocks])
     tree = KDTree(middles[targets])
     near_field, far_field = (np.zeros((2, len(each.points), 3)) for each in (near, far))
@@ -408,15 +408,10 @@ def _jump(block: MagnetBlock, points: Floats, normals: Floats) -> Floats:
     return jump
 
 
-def _middle(block: MagnetBlock) -> Floats:
-    """Return the middle of a block where it is mounted, (3,) in m."""
-    return np.asarray(block.middle + np.array(block.displacement_m))
-
-
 def _reach(block: MagnetBlock) -> float:
     """Return the radius in m of a sphere about the middle that contains the block."""
     points = block.from_frame(at_heights(along_edges(block.outline, 5), block.z_min, block.z_max))
-    return float(np.linalg.norm(points - _middle(block), axis=1).max())
+    return float(np.linalg.norm(points - block.mounted_middle, axis=1).max())
 
 
 @dataclass(frozen=True)

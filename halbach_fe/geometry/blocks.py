@@ -111,6 +111,11 @@ class MagnetBlock:
         return np.asarray(turn @ [*mean_corner(self.outline), z] + np.array(self.origin_m))
 
     @cached_property
+    def mounted_middle(self) -> Floats:
+        """The same of the block where it is mounted, (3,) in m."""
+        return np.asarray(self.middle + self.displacement_m)
+
+    @cached_property
     def axes(self) -> Floats:
         """Axes of the block's frame as columns (3, 3), turned with a rotated block."""
         nominal = rotation_matrix(self.orientation_rad)
@@ -137,7 +142,7 @@ class MagnetBlock:
     def position(self) -> Floats:
         """Origin of the block's frame, (3,) in m, moved with a displaced or rotated block."""
         turned = rotation_matrix(self.rotation_rad) @ (np.array(self.origin_m) - self.middle)
-        return np.asarray(turned + self.middle + self.displacement_m)
+        return np.asarray(turned + self.mounted_middle)
 
     def to_frame(self, points: Floats) -> Floats:
         """Return points (n, 3) of the magnet in the block's frame, in m."""

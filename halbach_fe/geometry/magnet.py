@@ -309,7 +309,7 @@ class Magnet(ShownInNotebook):
         if not len(points):
             return surroundings((), points)
         size = min(self.dimension, 3)  # blocks of a cross-section have no middle along z
-        middles = np.array([block.middle + block.displacement_m for block in self.blocks])
+        middles = np.array([block.mounted_middle for block in self.blocks])
         distance, _ = KDTree(points[:, :size]).query(middles[:, :size])
         near = [self.blocks[number] for number in np.flatnonzero(distance <= self._reaches)]
         others = neighbour_blocks(self.blocks, self.external.neighbours)

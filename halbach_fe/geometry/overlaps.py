@@ -136,7 +136,7 @@ def _in_triangles(
     for number, block in enumerate(blocks):
         outline = np.array([edge.start for edge in block.outline])
         extent = max(*np.ptp(outline, axis=0), block.z_max - block.z_min)
-        middle = block.middle + block.displacement_m
+        middle = block.mounted_middle
         if (np.maximum(low - middle, middle - high) > 2 * extent).any():  # far away
             continue
         near = ((corners.min(axis=1) < middle + extent)

@@ -539,7 +539,7 @@ def _arrow_traces(
     """Return arrows of the magnetization on the upper faces of the blocks with these corners."""
     # Largest number of blocks whose arrows have heads; more would make the page slow.
     most_cones = 2000
-    middles = np.array([[*(block.middle + block.displacement_m)[:2], own[:, 2].max()]
+    middles = np.array([[*block.mounted_middle[:2], own[:, 2].max()]
                         for block, own in zip(blocks, corners, strict=True)])
     vectors = np.zeros((len(blocks), 3))
     vectors[:, :values.magnetization.shape[1]] = values.magnetization
