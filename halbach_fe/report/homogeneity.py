@@ -4,7 +4,7 @@ outside of the magnet.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -36,6 +36,7 @@ from halbach_fe.report.page import (
     Rows,
     Section,
     Table,
+    Text,
     chart,
     csv_file,
     figure_of,
@@ -373,7 +374,9 @@ def line_name(stray: StrayField) -> str:
     return f"{decimals(1e3 * stray.limit_T)}\u00a0mT line"
 
 
-def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Section]:
+def sections_of_stray(
+    stray: StrayField | None, drawn: bool = False, warning: Sequence[Text] = ()
+) -> list[Section]:
     """Return the section of a page about the field outside; none if there is nothing to say.
 
     ``drawn`` tells whether the figure of `stray_pictures` is in it.
@@ -387,7 +390,8 @@ def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Sec
             reach.sd_m for reach in (stray.radial, stray.axial) if reach) else
         " Without ± the standard deviation is below 0.5 mm."))
     rows = stray_rows(stray)
-    return [Section([said, Table(rows), *([Drawn(STRAY_FIGURE)] if drawn and rows else [])],
+    figure = [Drawn(STRAY_FIGURE)] if drawn and rows else []
+    return [Section([*warning, said, Table(rows), *figure],
                     f"Outside of the magnet: the {line_name(stray)}")]
 
 

@@ -28,7 +28,6 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     SMALL,
-    Drawn,
     Figures,
     Page,
     Rows,
@@ -38,6 +37,7 @@ from halbach_fe.report.page import (
     View,
     chart,
     draw_by_slot,
+    last_sections,
     legend_above,
     magnet_panels,
 )
@@ -53,7 +53,6 @@ from halbach_fe.report.words import (
     capital,
     decimals,
     flux_density,
-    listed,
     magnet_rows,
     place_of,
     ppm,
@@ -203,13 +202,18 @@ def axis_rows(axis: MagneticAxis | None) -> Rows:
     return [{"of the updated magnet": what, "value": value} for what, value in found.items()]
 
 
-def definition(axis: MagneticAxis) -> str:
-    """Return how centre, axis and roll are defined for the magnet's order, in sentences."""
+def definition(axis: MagneticAxis | None) -> str:
+    """Return how centre, axis and roll are defined for the magnet's order, in sentences; empty
+    without an axis.
+    """
+    if axis is None:
+        return ""
     roll = ("The roll is the turn of the main multipole about z from that of the nominal magnet, "
             "right-handed; in a magnet of finite length in the mean along its middle half, "
             "weighted by the square of the field. The integral along z, whose roll shim states, "
             "has another one if rings are turned against each other. In the table of multipoles, "
-            "a of the main order says the same of one circle, with the other sign.")
+            "a of the main order says the same of one circle, with the other sign. ± is the "
+            "standard deviation.")
     if axis.order == 1:
         return ("A dipole has no axis. Its centre is the point near the middle, of a magnet of "
                 "finite length, where the gradient of the main component vanishes; a homogeneous "
@@ -348,11 +352,9 @@ def page(result: InferenceResult) -> Page:
                     "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),
             Section([View(lambda: view_of_inference(result), colours_in_words(result))]),
-            Section([] if result.magnetic_axis is None else [
-                *doubtful, f"{definition(result.magnetic_axis)} ± is the standard deviation.",
-                Table(axis)], "Magnetic centre, axis and roll"),
-            *(Section([*doubtful, *section.parts], section.title)
-              for section in sections_of_stray(stray)),
+            Section([*doubtful, definition(result.magnetic_axis), Table(axis)],
+                    "Magnetic centre, axis and roll", about=axis),
+            *sections_of_stray(stray, warning=doubtful),
             *sections_of_circles(
                 multipoles, result.study, "They are those of the readings on the circle about the "
                 "axis of the magnet, where the study says that the map lies. With m readings, "
@@ -360,8 +362,7 @@ def page(result: InferenceResult) -> Page:
                 "blocks make it in vacuum. Their error bars take the solver's error of every "
                 "reading in full: `halbach-fe multipoles` takes as many points as are needed, and "
                 "has smaller bars.", " ± is the standard deviation.", doubtful),
-            Section([*map(Drawn, [*figures][1:])], "Pictures"),
-            Section([Table(_model_table(result))], "Model")],
+            *last_sections(figures, _model(result))],
         {"Differences of readings and predictions": rows,
          "The instruments, estimated with the blocks": term_table(result),
          "Where the maps lie in the magnet": pose_table(result),
@@ -478,15 +479,15 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
         Section([" ".join(found), Table(terms)], "The instruments", about=terms)]
 
 
-def _model_table(result: InferenceResult) -> Rows:
-    """Return rows of text: how the update was made, and of what magnet."""
+def _model(result: InferenceResult) -> dict[str, str]:
+    """Return how the update was made, and of what magnet."""
     study, noise = result.study, result.noise
     sizes = dict.fromkeys(flux_density(float(end), 2) for end in (noise.sd.min(), noise.sd.max()))
     positions = study.noise.position_sd_m if study.noise else None
     moved = "" if not positions else (
         f"; sd of positions {', '.join(f'{1e3 * sd:.3g}' for sd in positions)} mm")
     blocks = result.measured_blocks
-    return listed({
+    return {
         "method of inference": result.kind, **magnet_rows(result.magnet),
         "finite-element method": study.solver.method,
         "unknown magnetizations, readings":
@@ -498,7 +499,7 @@ def _model_table(result: InferenceResult) -> Rows:
         "error of the finite elements": _solver_error(result),
         "superposition of the blocks":
             f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what "
-            "permeable blocks and iron add to their fields"})
+            "permeable blocks and iron add to their fields"}
 
 
 def _contraction(result: InferenceResult) -> Floats:

@@ -52,7 +52,7 @@ from halbach_fe.report.answer import (
     inputs_of_command,
     write_record,
 )
-from halbach_fe.report.words import faults_in_words
+from halbach_fe.report.words import faults_in_words, listed
 from halbach_fe.study.model import Study, is_nonlinear
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.study_file import study_text, write_edited
@@ -203,6 +203,12 @@ class Page:
         placed = {part.file for section in self.sections for part in section.parts
                   if isinstance(part, Drawn)}
         return [name for name in self.figures if name not in placed]
+
+
+def last_sections(figures: Figures, model: Mapping[str, str]) -> list[Section]:
+    """Return the pictures but that below the answer, and what model the results are of."""
+    return [Section([*map(Drawn, [*figures][1:])], "Pictures"),
+            Section([Table(listed(model))], "Model")]
 
 
 PAGES = {

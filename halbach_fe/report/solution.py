@@ -22,7 +22,6 @@ from halbach_fe.report.multipoles import (
 from halbach_fe.report.page import (
     MEASURED,
     OF_COMPONENTS,
-    Drawn,
     Figures,
     Page,
     Rows,
@@ -32,6 +31,7 @@ from halbach_fe.report.page import (
     charts,
     geometry_figure,
     label_logarithmic,
+    last_sections,
     legend_above,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
@@ -41,7 +41,6 @@ from halbach_fe.report.words import (
     decimals,
     flux_density,
     is_fourier,
-    listed,
     magnet_rows,
     relative,
 )
@@ -150,8 +149,7 @@ def page(solution: Solution) -> Page:
                 "order n would contain order m − n too; that part is subtracted, as the blocks "
                 "make it in vacuum.", "" if not solution.errors.any() else
                 " ± is the standard deviation that the solver's error allows."),
-            Section([*map(Drawn, [*figures][1:])], "Pictures"),
-            Section([Table(listed(magnet_rows(magnet)))], "Model")],
+            *last_sections(figures, magnet_rows(magnet))],
         {"The field at the study's positions": rows,
          "Outside of the magnet": stray_rows(solution.stray_field)},
         figures=figures, shown=("field.png",), files=files, stored=False, stem="report",

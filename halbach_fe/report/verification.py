@@ -17,7 +17,6 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     THIRD,
-    Drawn,
     Page,
     Rows,
     Section,
@@ -30,6 +29,7 @@ from halbach_fe.report.page import (
     csv_file,
     geometry_figure,
     label_logarithmic,
+    last_sections,
     legend_above,
 )
 from halbach_fe.report.words import (
@@ -38,7 +38,6 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     is_fourier,
-    listed,
     magnet_rows,
     ppm,
     relative,
@@ -217,8 +216,7 @@ def page(found: Verification) -> Page:
         "positions of the study by the magnitude of the field")
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
-        [changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
-         Section([Table(listed(model))], "Model")],
+        [changes, Section([view]), *last_sections(figures, model)],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
         files={"verification.csv": csv_file(
             columns_by_axis("{}_m", found.points) | {
