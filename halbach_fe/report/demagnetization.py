@@ -240,8 +240,9 @@ def page(found: DemagnetizationMap) -> Page:
             Text("H diverges logarithmically at the edges of blocks, so that the smallest margin "
                  "falls slightly with smaller cells (--across); shares of the volume converge. Not "
                  "modelled: fields across the easy axis, which demagnetize less, and the field "
-                 "change that the loss of one cell causes in others"
-                 f"{_SCALED if is_nonlinear(found.study) else ''}.", "small"),
+                 "change that the loss of one cell causes in others." + (
+                     " At other temperatures the field of the iron is scaled with the remanence."
+                     if is_nonlinear(found.study) else ""), "small"),
             View(partial(_view, found, blocks), "blocks by their smallest margin to the knee")]),
         Section([
             f"{of_all if len(blocks) > len(rows) else ''}H_cJ needed is the smallest intrinsic "
@@ -264,9 +265,6 @@ def page(found: DemagnetizationMap) -> Page:
                 {key: [row[key] for row in blocks] for key in blocks[0]}, {
                     "study": found.study.name, "temperature_C": str(material.temperature_C)}),
             "demagnetization.vtu": partial(write_vtu, found)})
-
-
-_SCALED = ". At other temperatures the field of the iron is scaled with the remanence"
 
 
 def _worst_block_table(rows: list[dict[str, Any]]) -> Rows:

@@ -326,10 +326,6 @@ def _further_measurements(
         f"**Measure next: {pair.recommended.title}.**" if pair.recommended else
         "None of the measurements below would distinguish them.") for pair in own), Table([
             {"measurement": title} | {
-                f"against {pair.rival.effect.name}": _gain(pair.gains[name]) for pair in own}
+                f"against {pair.rival.effect.name}": bayes_factor(max(pair.gains[name], 0.0))
+                for pair in own}
             for name, title in candidates.items()], "numbers")]
-
-
-def _gain(value: float) -> str:
-    """Format a gain in the log Bayes factor."""
-    return bayes_factor(max(value, 0.0))

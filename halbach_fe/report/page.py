@@ -557,9 +557,8 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
     for block, outline in zip(shown, outlines, strict=False):
         axis.plot(*outline.T, color=colour, lw=0.6)
         middle = box_middle(outline)
-        length = 0.3 * float(np.ptp(outline, axis=0).min())
-        axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
-                      middle - length * np.array(block.easy_axis[:2]),
+        arrow = 0.3 * float(np.ptp(outline, axis=0).min()) * np.array(block.easy_axis[:2])
+        axis.annotate("", tuple(middle + arrow), tuple(middle - arrow),
                       arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
         distance = float(np.hypot(*middle))
         if numbered and distance > outermost * reach:
@@ -570,8 +569,9 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
             if beyond:
                 axis.margins(0.12)
             axis.annotate(
-                str(block.slot), outwards * (edge if beyond else 0.25 * distance + 0.75 * edge),
-                outwards * (SMALL if beyond else 0), textcoords="offset points",
+                str(block.slot),
+                tuple(outwards * (edge if beyond else 0.25 * distance + 0.75 * edge)),
+                tuple(outwards * (SMALL if beyond else 0)), textcoords="offset points",
                 ha="center", va="center", fontsize=SMALL, color=colour)
     for body in magnet.iron:
         if body.sphere or not body.in_place:  # its shadow

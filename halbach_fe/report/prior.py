@@ -270,7 +270,7 @@ def _deviations_figure(prior: MeasuredPrior) -> Figure:
         axis.plot(np.arange(1, len(values) + 1), factor * values, "o", color=MEASURED, ms=4)
         axis.set_ylabel(f"{name} in {unit}")
     axes[-1].set_xlabel("block, by type")
-    axes[-1].xaxis.get_major_locator().set_params(integer=True)
+    axes[-1].locator_params("x", integer=True)
     return figure
 
 
