@@ -45,7 +45,7 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import decimals
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.pace import Pace, quiet
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
@@ -433,7 +433,7 @@ def progress_bar(label: str, told: bool = False) -> Iterator[Callable[[int, int]
     )
 
     console = Console(stderr=True)
-    pace = Pace(say if told and not console.is_terminal else lambda text: None)
+    pace = Pace(say if told and not console.is_terminal else quiet)
     pace.begin(label)
     with Progress(TextColumn("[progress.description]{task.description}"), BarColumn(),
                   MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
@@ -472,7 +472,7 @@ def finish(arguments: argparse.Namespace, result: object) -> int:
 
 def say_page(arguments: argparse.Namespace, page: Page, path: Path | None = None) -> None:
     """Print the tables and the answer of a page, and where it is if it was written."""
-    for sentence in page.remarks:
+    for sentence in filter(None, page.remarks):
         say(sentence)
     for title, rows in page.tables.items():
         print_table(rows, title)

@@ -9,7 +9,7 @@ import io
 import json
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,6 +53,7 @@ from halbach_fe.core.errors import (
 )
 from halbach_fe.core.files import InputFile
 from halbach_fe.core.numbers import parse_number
+from halbach_fe.core.pace import Say, quiet
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def check(arguments: argparse.Namespace) -> int:
                               f"{'a single map' if arguments.others else 'several maps'}, which "
                               "this one would remove. Name another folder, or remove this one.")
         common.own_folder(arguments)
-    say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
+    say = quiet if arguments.json else common.say
     with common.progress_bar("checking") as show:
         if arguments.others:
             from halbach_fe.measurement.joined_probe import TURN_RAD
@@ -219,7 +220,7 @@ def register(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
 
     study = magnet.study
     data = common.read_measurements(arguments, study)
-    say: Callable[[str], None] = (lambda _: None) if arguments.json else common.say
+    say = quiet if arguments.json else common.say
     if isinstance(data, dict):
         for name in ("alternative", "most", "across_m", "turn_rad"):
             if getattr(arguments, name):
@@ -242,7 +243,7 @@ def register(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
 
 def _run_campaign(
     arguments: argparse.Namespace, study: hf.Study, data: dict[str, xr.Dataset],
-    say: Callable[[str], None],
+    say: Say,
 ) -> int:
     """Register all maps that the study lists, each with a page in a folder of its own."""
     from halbach_fe.core.files import make_folder

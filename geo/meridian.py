@@ -14,9 +14,8 @@ from pathlib import Path
 
 import gmsh
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.geo.session import gmsh_session, write_mesh
 from halbach_fe.geometry import domain as tags
 from halbach_fe.geometry.domain import BlockRegion, Regions, boundary_half_length, boundary_radius
@@ -146,7 +145,7 @@ def _materials(magnet: Magnet, r: Floats, z: Floats) -> Ints:
 
 
 def mesh_half_plane(
-    name: str, r: Floats, z: Floats, in_iron: NDArray[np.bool_], mesh_path: Path
+    name: str, r: Floats, z: Floats, in_iron: Bools, mesh_path: Path
 ) -> Regions:
     """Mesh the half-plane by a grid, write the mesh, and return its regions.
 

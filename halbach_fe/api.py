@@ -22,7 +22,7 @@ from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError,
 from halbach_fe.core.files import as_path
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import ACROSS, DRAWS, HIGHEST_DEGREE, check_number
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.pace import Progress, Say, quiet
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.design import demagnetization as demagnetization_room
 from halbach_fe.design.demagnetization import DemagnetizationMap
@@ -42,7 +42,6 @@ from halbach_fe.diagnosis import diagnose as diagnosis_room
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect
 from halbach_fe.diagnosis.result import Diagnosis
-from halbach_fe.diagnosis.search import Say
 from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
@@ -304,7 +303,7 @@ class HomogeneityResult(ShownInNotebook):
 def diagnose(
     magnet: Magnet, data: xr.Dataset | Mapping[str, xr.Dataset], session: Session = NOT_KEPT,
     blocks: BlockTable | None = None, effects: Sequence[str | Effect] | None = None,
-    validation_map: xr.Dataset | None = None, say: Say = lambda text: None,
+    validation_map: xr.Dataset | None = None, say: Say = quiet,
     floor_T: Mapping[str, float] | Mapping[str, Mapping[str, float]] | None = None,
     time_limit_s: float | None = None,
 ) -> Diagnosis:
@@ -750,7 +749,7 @@ def sort(
     blocks = sortable(magnet, blocks)  # before the solves, which may take long
     model = objective_of(magnet, reference, session)
     return sort_blocks(magnet, blocks, model, np.random.default_rng(seed),
-                       progress or (lambda done, total: None), turns)
+                       progress or quiet, turns)
 
 
 @alone
@@ -857,7 +856,7 @@ def demagnetization(
 @typed
 def simulate_measurement(
     study: Study, seed: int = 1, hide: Sequence[str] = (), hide_random: int = 0,
-    progress: Progress = lambda done, total: None, placed: BlockTable | None = None,
+    progress: Progress = quiet, placed: BlockTable | None = None,
     magnitude: bool = False,
 ) -> SimulatedCampaign:
     """Simulate the measurement of a magnet whose blocks are drawn from the study's prior.

@@ -6,7 +6,6 @@ memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,6 +14,7 @@ import xarray as xr
 
 from halbach_fe.api import diagnose
 from halbach_fe.core.errors import MeasurementError, StudyError
+from halbach_fe.core.pace import Say, quiet
 from halbach_fe.diagnosis.result import Diagnosis
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.infer import infer
@@ -96,7 +96,7 @@ class Explanation:
 @alone
 def explain(
     magnet: Magnet, data: xr.Dataset, session: Session = NOT_KEPT,
-    blocks: BlockTable | None = None, say: Callable[[str], None] = lambda text: None,
+    blocks: BlockTable | None = None, say: Say = quiet,
 ) -> Explanation:
     """Check a map, update the magnet by it, and find what is missing where that is not enough.
 
@@ -144,7 +144,7 @@ class _InMemory:
     data: xr.Dataset
     session: Session
     blocks: BlockTable | None
-    say: Callable[[str], None]
+    say: Say
     answers: dict[str, Answer] = field(default_factory=dict)
     checked: MapCheck | None = None
     result: InferenceResult | None = None

@@ -26,6 +26,7 @@ from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.core.result_folder import single_file
 from halbach_fe.geometry.free_blocks import beside_blocks, blocks_table, free_outline
 from halbach_fe.geometry.magnet import Magnet, build_magnet
+from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.solver.exact_block_field import field_of, gradient_of
 from halbach_fe.study.free_blocks import COLUMNS, REMANENCE_VECTOR, FreeBlocks
@@ -390,9 +391,8 @@ def _source(magpylib: Any, table: FreeBlocks, number: int) -> Any:
     if len(ConvexHull(corners).vertices) != len(corners):
         raise StudyError(must_be(f"block {row['name']}", "to_magpylib", "a convex prism",
                                  "one that is not"))
-    return magpylib.magnet.TriangularMesh.from_ConvexHull(points=np.vstack([
-        np.column_stack([corners, np.full(len(corners), z)]) for z in (-length / 2, length / 2)]),
-        **common)
+    return magpylib.magnet.TriangularMesh.from_ConvexHull(
+        points=at_heights(corners, -length / 2, length / 2), **common)
 
 
 @typed

@@ -1,4 +1,4 @@
-"""Type aliases of NumPy arrays."""
+"""Type aliases of NumPy arrays, and points about the z axis."""
 
 from __future__ import annotations
 
@@ -14,6 +14,38 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+def radii_of(points: Floats) -> Floats:
+    """Return the distances (n,) of points (n, 2 or 3) from the z axis."""
+    return np.asarray(np.hypot(points[:, 0], points[:, 1]), np.float64)
+
+
+def azimuths_of(points: Floats) -> Floats:
+    """Return the angles (n,) in rad of points (n, 2 or 3) about the z axis, from -pi to pi."""
+    return np.asarray(np.arctan2(points[:, 1], points[:, 0]), np.float64)
+
+
+def box_middle(points: Floats) -> Floats:
+    """Return the middle (D,) of the box around points (n, D)."""
+    return np.asarray((points.max(axis=0) + points.min(axis=0)) / 2)
+
+
+def polygon_area(corners: Floats) -> float:
+    """Return the area of a polygon (n, 2), which is negative if it runs clockwise."""
+    x, y = corners.T
+    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+
+
+def face_vectors(triangles: Floats) -> Floats:
+    """Return vectors (n, 3) across triangles (n, 3, 3), twice as long as these are large."""
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def unit_circle(angles: ArrayLike) -> Floats:
+    """Return the points (..., 3) at angles (...) in rad on the unit circle about the z axis."""
+    return np.stack([np.cos(angles), np.sin(angles), np.zeros(np.shape(angles))], axis=-1)
 
 
 AXIS = re.compile(r"[bB]?_?([xyzXYZ])(?![A-Za-z])")

@@ -226,6 +226,13 @@ def printable(text: object, most: int) -> str:
     return "".join(c if c.isprintable() or c in NO_BREAK_SPACES else "?" for c in line)
 
 
+def not_utf8(where: str, error: UnicodeDecodeError) -> str:
+    """Return the error sentence about a file that is not text in UTF-8."""
+    return must_be("encoding", where, "UTF-8",
+                   f"byte 0x{error.object[error.start]:02x} at {error.start}",
+                   "Save it as UTF-8 text.")
+
+
 def must_be(what: str, where: str, expected: str, received: object, hint: str = "") -> str:
     """Return an error sentence: which input, where, what was expected, received, and what to do."""
     sentence = (f"Input {printable(what, MAX_QUOTED)} of {where} must be {expected}; instead "

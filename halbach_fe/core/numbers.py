@@ -81,6 +81,18 @@ def in_a_row(names: Sequence[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
+def first_of(texts: Sequence[str], most: int, by: str = ", ") -> str:
+    """Return the first of some texts, and how many more there are.
+
+    Examples
+    --------
+    >>> first_of(["one", "two", "three"], 2), first_of(["one", "two"], 2)
+    ('one, two and 1 more', 'one, two')
+    """
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return f"{by.join(texts[:most])}{more}"
+
+
 def parse_number(cell: str) -> float:
     """Return the finite number in a cell of a table.
 

@@ -9,6 +9,14 @@ from dataclasses import dataclass, field
 Progress = Callable[[int, int], None]
 """Takes the numbers of finished and of all parts of a step."""
 
+Say = Callable[[str], None]
+"""Takes a line of text."""
+
+
+def quiet(*_: object) -> None:
+    """Say and show nothing."""
+
+
 QUIET_S = 10.0
 """Time in s between two lines about the progress of one step."""
 
@@ -29,7 +37,7 @@ class Pace:
         Returns the time in s.
     """
 
-    say: Callable[[str], None]
+    say: Say
     show: Progress | None = None
     limit_s: float | None = None
     clock: Callable[[], float] = time.monotonic

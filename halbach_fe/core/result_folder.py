@@ -32,6 +32,7 @@ from pydantic_core import from_json
 
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
 from halbach_fe.core.files import is_told, make_folder, telling
+from halbach_fe.core.numbers import first_of
 
 RECORD = "run.json"
 
@@ -243,10 +244,9 @@ class _Writer:
             return
         names = [str(path.relative_to(self.base)) for path in foreign]
         changed = set(names) <= self.record.files.keys()
-        named = 5  # largest number of files that a refusal names
-        others = f" and {len(names) - named} more" if len(names) > named else ""
+        most_named = 5  # files of a refusal
         raise OutputError(
-            f"File {', '.join(names[:named])}{others} in folder {self.base} "
+            f"File {first_of(names, most_named)} in folder {self.base} "
             + (f"changed after `{self.record.command}` had written it" if changed else
                f"was not written by `{self.record.command}`")
             + f", which would replace it. Name another {self.other}, or move this elsewhere.")

@@ -19,6 +19,7 @@ from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
 from halbach_fe.geometry.free_blocks import blocks_of_table, blocks_table
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import at_heights
 from halbach_fe.geometry.prism import Prism, upright
 from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.inference.block_prior import prior_from_blocks
@@ -356,9 +357,8 @@ def _plates(
 
 def _z_limits(block: MagnetBlock) -> tuple[float, float]:
     """Return the lowest and the highest z of a block in m."""
-    corners = np.array([[*edge.start, z] for edge in block.outline
-                        for z in (block.z_min, block.z_max)])
-    z = block.from_frame(corners)[:, 2]
+    corners = np.array([edge.start for edge in block.outline])
+    z = block.from_frame(at_heights(corners, block.z_min, block.z_max))[:, 2]
     return float(z.min()), float(z.max())
 
 
@@ -382,7 +382,7 @@ def _of_table(
             "halbach-fe sort assigns blocks to slots: give its blocks.sorted.csv."))
     prior_from_blocks(magnet, table)  # which refuses blocks of another magnet
     row_of = {place: row for row, place in enumerate(table.places)}
-    rows = {number: row_of[magnet.blocks[source].ring, magnet.blocks[source].slot]
+    rows = {number: row_of[magnet.blocks[source].place]
             for number, (source, matrix) in enumerate(mountings(magnet)) if matrix.any()}
     turns = {} if table.turn_deg is None else {
         number: (float(x), float(y), float(z)) for number, row in rows.items()

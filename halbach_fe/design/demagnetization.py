@@ -17,9 +17,8 @@ from typing import Any
 
 import meshio
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic
 from halbach_fe.core.notebook import ShownInNotebook
@@ -150,7 +149,7 @@ class DemagnetizationMap(ShownInNotebook):
         return max(abs(self.share_beyond_now - float(half)), least)
 
     @property
-    def past_the_knee(self) -> NDArray[np.bool_]:
+    def past_the_knee(self) -> Bools:
         """Whether the places (n,) are past the knee at the temperature of the map."""
         return np.asarray(self.places.along < -knee(self.material, self.material.temperature_C))
 

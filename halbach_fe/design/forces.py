@@ -50,6 +50,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.numbers import DENSITY, check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, rotation_matrix, vector
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.solver.coil_field import current_elements
 from halbach_fe.solver.exact_block_field import external_field, field_of
 from halbach_fe.solver.iron_bodies import BodiesReaction
@@ -248,7 +249,7 @@ def _with_error_of_iron(loads: Loads, charges: Charges, blocks: Sequence[MagnetB
     """
     if iron.coarse is None:
         return loads
-    middles = np.array([_middle(block) for block in blocks])
+    middles = np.array([block.mounted_middle for block in blocks])
     whole, coarse = (charges.loads(each.field(charges.points), middles, len(blocks))
                      for each in (iron, iron.coarse))
     bars = []
@@ -362,7 +363,7 @@ def _loads(
     """
     near, far = (Charges.of([blocks[number] for number in targets], order)
                  for order in (near_order, far_order))
-    middles = np.array([_middle(block) for block in blocks])
+    middles = np.array([block.mounted_middle for block in blocks])
     reach = np.array([_reach(block) for block in blocks])
     tree = KDTree(middles[targets])
     near_field, far_field = (np.zeros((2, len(each.points), 3)) for each in (near, far))
@@ -407,18 +408,10 @@ def _jump(block: MagnetBlock, points: Floats, normals: Floats) -> Floats:
     return jump
 
 
-def _middle(block: MagnetBlock) -> Floats:
-    """Return the middle of a block where it is mounted, (3,) in m."""
-    return np.asarray(block.middle + np.array(block.displacement_m))
-
-
 def _reach(block: MagnetBlock) -> float:
     """Return the radius in m of a sphere about the middle that contains the block."""
-    t = np.linspace(0.0, 1.0, 5)
-    outline = np.vstack([edge.at(t)[0] for edge in block.outline])
-    points = block.from_frame(np.vstack([
-        np.column_stack([outline, np.full(len(outline), z)]) for z in (block.z_min, block.z_max)]))
-    return float(np.linalg.norm(points - _middle(block), axis=1).max())
+    points = block.from_frame(at_heights(along_edges(block.outline, 5), block.z_min, block.z_max))
+    return float(np.linalg.norm(points - block.mounted_middle, axis=1).max())
 
 
 @dataclass(frozen=True)
@@ -517,8 +510,7 @@ def _ends(block: MagnetBlock, flat: Floats, area: Floats) -> Iterator[tuple[Floa
     """Yield points and area vectors of both ends of a block, see `_faces`."""
     zero = np.zeros(len(flat))
     for z, sign in ((block.z_min, -1), (block.z_max, 1)):
-        yield (np.column_stack([flat, np.full(len(flat), z)]),
-               np.column_stack([zero, zero, sign * area]))
+        yield at_heights(flat, z), np.column_stack([zero, zero, sign * area])
 
 
 def _graded(order: int) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.outline import (
@@ -49,7 +49,7 @@ def digits(
     bottom, top : float, in m
         Limits of z.
     """
-    out = np.array([np.cos(angle), np.sin(angle)])
+    out = unit_circle(angle)[:2]
     axes = np.column_stack([[out[1], -out[0]], out])
     # size of a bar, and distance of two digits, relative to their height
     length, width, pitch = 0.3, 0.12, 0.8
@@ -302,7 +302,7 @@ def _rods(rods: Rods, least: float) -> tuple[Prism, ...]:
     first = pitch / 2 if rods.first_angle_deg is None else rods.first_angle_deg
     angles = np.radians(first + pitch * np.arange(rods.count))
     hole = circle(rods.diameter_m / 2)
-    return tuple(Prism(hole, -1.0, 0.0, origin=radius * np.array([np.cos(angle), np.sin(angle)]))
+    return tuple(Prism(hole, -1.0, 0.0, origin=radius * unit_circle(angle)[:2])
                  for angle in angles)
 
 
@@ -415,7 +415,7 @@ def _rim(radius: float, mark: float) -> Outline:
         return outline
     x, beside = np.array([1.0, 0.0]), 5 * mark / radius
     outline = with_notch(outline, np.zeros(2), x, -2 * mark, 2 * mark)
-    return with_notch(outline, np.zeros(2), np.array([np.cos(beside), np.sin(beside)]), -mark, mark)
+    return with_notch(outline, np.zeros(2), unit_circle(beside)[:2], -mark, mark)
 
 
 def _shape(plate: Plate) -> object:

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
@@ -65,13 +64,13 @@ class Mounts:
     places: tuple[tuple[int, int], ...]
     frames: Floats
     turns: Floats
-    allowed: NDArray[np.bool_]
+    allowed: Bools
     designed: Floats
     current: Floats
     kinds: Ints
     current_kinds: Ints
 
-    def fits(self, directions: Floats, kinds: Ints) -> NDArray[np.bool_]:
+    def fits(self, directions: Floats, kinds: Ints) -> Bools:
         """Return which blocks fit which slots, shape (turns, slots, blocks).
 
         Parameters
@@ -111,7 +110,7 @@ def mounts_of(magnet: Magnet) -> Mounts:
                       for turn in every])
     some = found.any(axis=1)
     return Mounts(
-        tuple((block.ring, block.slot) for block in meant), frames, every[some],
+        tuple(block.place for block in meant), frames, every[some],
         found[some][:, shapes], _directions(meant, frames), _directions(built, frames),
         kinds, kinds[sources])
 
@@ -252,7 +251,7 @@ def remounted(
                        **_taken_along(old[source], factor, still[to], left)}
         exceptions.append(BlockException.model_validate({
             "ring": old[to].ring, "slot": old[to].slot,
-            "mounted_from": (old[meant].ring, old[meant].slot), **changed}))
+            "mounted_from": old[meant].place, **changed}))
         expected[to] = source, meant, total
     after_all = magnet.with_(array__exceptions=(*kept, *exceptions))
     after, new = mountings(after_all), after_all.blocks
@@ -270,7 +269,7 @@ def _of_positions(magnet: Magnet, slots: Iterable[int]) -> tuple[BlockException,
     """Return the exceptions of a magnet, without what those of single slots (counted from 0) say of
     the block that is there and how it is mounted.
     """
-    places = {(magnet.blocks[slot].ring, magnet.blocks[slot].slot) for slot in slots}
+    places = {magnet.blocks[slot].place for slot in slots}
     left = {name: field.default for name, field in BlockException.model_fields.items()
             if name in (*OF_A_BLOCK, "magnetization_factor", "mounted_from", "rotation_deg")}
     kept = [one.with_(**left) if magnet.array.block_of(one) in places else one

@@ -8,9 +8,8 @@ from itertools import pairwise, product
 from math import asin, atan, floor, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -78,7 +77,7 @@ class Sample:
 
     points: Floats
     weights: Floats
-    surface: NDArray[np.bool_]
+    surface: Bools
     direction: Floats
 
     @classmethod
@@ -153,7 +152,7 @@ class Catalogue:
         return design_of(self.study)
 
     @property
-    def decide(self) -> NDArray[np.bool_]:
+    def decide(self) -> Bools:
         """Which points of the sample decide, by the objective."""
         sample = self.sample
         return sample.weights > 0 if self.design.objective == "rms" else sample.surface

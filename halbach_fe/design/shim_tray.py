@@ -20,9 +20,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -274,7 +273,7 @@ class _Choices:
                 "`shim_tray`", f"study {study}", f"at most {most_choices} choices",
                 f"{len(every)} places times {len(options)} magnets and angles",
                 "Leave out places, kinds of magnets or angles."))
-        azimuth = np.arctan2(every[:, 1], every[:, 0])
+        azimuth = azimuths_of(every)
         return cls(tray, every, azimuth, np.array([number for number, _ in options]),
                    np.array([angle for _, angle in options]))
 
@@ -322,7 +321,7 @@ class _Choices:
     def _direction(self, place: int, option: int) -> Floats:
         """Return the direction (3,) of a polarization."""
         angle = self.azimuth[place] + np.radians(self.angle[option])
-        return np.array([np.cos(angle), np.sin(angle), 0.0])
+        return unit_circle(angle)
 
 
 def _block(magnet: ShimMagnet, place: Floats, azimuth: float, number: int) -> MagnetBlock:
@@ -355,7 +354,7 @@ def _check(magnet: Magnet, choices: _Choices, region: Region) -> None:
             "What iron answers to the shims is not computed: leave it out and measure again with "
             "the tray filled."))
     study = f"study {magnet.name}"
-    outer = np.hypot(choices.places[:, 0], choices.places[:, 1])
+    outer = radii_of(choices.places)
     if (outer > magnet.radius).any():
         first = int(np.argmax(outer > magnet.radius))
         raise StudyError(must_be(
@@ -508,7 +507,7 @@ class _Search:
         change[there] -= 2 * self.products[own[there], np.flatnonzero(there)]
         return change, empty
 
-    def _allowed(self) -> NDArray[np.bool_]:
+    def _allowed(self) -> Bools:
         """Return which choices (m,) the inventory allows, instead of what is in the place."""
         own = self.chosen[self.place]
         same = (own != EMPTY) & (self.kinds[np.maximum(own, 0)] == self.kinds)

@@ -28,9 +28,8 @@ from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg as linalg
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import DeviationModel, Known, Objective
@@ -274,7 +273,7 @@ class _MoveModel:
     loose_mean: Floats
     loose: Floats
     own: Floats
-    fits: NDArray[np.bool_]
+    fits: Bools
 
     @property
     def size(self) -> int:

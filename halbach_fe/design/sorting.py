@@ -23,18 +23,18 @@ sum of squares has ``tr(K_s R C_b R')`` in addition.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
 from halbach_fe.geometry.magnet import Magnet
@@ -158,7 +158,7 @@ class _Blocks:
 def sort_blocks(
     magnet: Magnet, table: BlockTable, model: Objective,
     generator: np.random.Generator,
-    progress: Callable[[int, int], None] = lambda done, total: None, turns: bool = False,
+    progress: Progress = quiet, turns: bool = False,
 ) -> SortedBlocks:
     """Assign measured blocks to slots of their type such that the values of a model are small.
 
@@ -346,8 +346,7 @@ def _order(blocks: _Blocks, generator: np.random.Generator | None = None) -> Int
 def _placed_order(table: BlockTable, magnet: Magnet) -> Ints | None:
     """Return the assignment by the table's own rings and slots, or None if a slot has no block."""
     row_of = {place: row for row, place in enumerate(table.places) if place[0]}
-    places = [(magnet.blocks[number].ring, magnet.blocks[number].slot)
-              for number in present(magnet)]
+    places = [magnet.blocks[number].place for number in present(magnet)]
     if not all(place in row_of for place in places):
         return None
     return np.array([row_of[place] for place in places])
@@ -405,7 +404,7 @@ class Slots:
     blocks: Floats
     spread: Floats
     turns: Floats
-    fits: NDArray[np.bool_]
+    fits: Bools
     slot_class: Ints
     block_class: Ints
 
@@ -420,7 +419,7 @@ class Slots:
         return np.ascontiguousarray(self.effect.reshape(len(self.effect), -1))
 
     @cached_property
-    def choices(self) -> tuple[Ints, NDArray[np.bool_]]:
+    def choices(self) -> tuple[Ints, Bools]:
         """Numbers of the turns of each pair of classes (A, C, k), and which of them there are."""
         most = int(self.fits.sum(axis=0).max(initial=1))
         order = np.argsort(~self.fits, axis=0, kind="stable")[:most]

@@ -37,7 +37,7 @@ import xarray as xr
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import ColumnsError, HalbachWarning, NotConvergedError
-from halbach_fe.core.pace import Pace
+from halbach_fe.core.pace import Pace, Say, quiet
 from halbach_fe.diagnosis.detection_limits import detection_limits
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
@@ -93,7 +93,6 @@ from halbach_fe.diagnosis.result import (
 )
 from halbach_fe.diagnosis.scene import Campaign
 from halbach_fe.diagnosis.search import (
-    Say,
     Search,
     identify_effects,
     possible,
@@ -159,7 +158,7 @@ class _Round:
 def diagnose(
     study: Study, data: Data, session: Session, blocks: BlockTable | None = None,
     effects: Sequence[Effect] | None = None, validation_map: xr.Dataset | None = None,
-    say: Say = lambda text: None, solver: NominalSolver | None = None,
+    say: Say = quiet, solver: NominalSolver | None = None,
     floor_T: Floor | None = None, time_limit_s: float | None = None,
 ) -> Diagnosis:
     """Find which effects a study lacks to explain its maps.

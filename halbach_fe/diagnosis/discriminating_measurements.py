@@ -26,9 +26,8 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
@@ -271,7 +270,7 @@ def candidate_measurements(
                 np.zeros((1, 3)), np.zeros(1), sparse.csr_array(centre[None] / size),
                 independent_noise(np.array([nmr_relative_sd * size])), np.eye(3), np.eye(3),
                 mapped=False)))
-    radii = np.unique(np.round(np.hypot(places[:, 0], places[:, 1]), 6))
+    radii = np.unique(np.round(radii_of(places), 6))
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
@@ -528,7 +527,7 @@ def _point_scan(points: Floats, sigma: float, name: str | None) -> ProposedScan:
         independent_noise(np.full(count, sigma)), np.eye(3), np.eye(3), map=name)
 
 
-def _point_sigma(diagnosis: Diagnosis, own: NDArray[np.bool_] | slice) -> float:
+def _point_sigma(diagnosis: Diagnosis, own: Bools | slice) -> float:
     """Return the noise in T of one component at one point, among ``own`` readings.
 
     The noise of a study with Fourier coefficients is that of a coefficient, which averages over the

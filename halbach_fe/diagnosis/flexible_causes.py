@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 from scipy import linalg, special
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
 from halbach_fe.diagnosis.marginal_evidence import Evidence
 from halbach_fe.geometry.surface import is_in_plane
 
@@ -68,13 +68,13 @@ def harmonic_fields(
     in_plane : int
         The same of a map in one plane, over its diameter: the field varies along z there, too.
     """
-    radius = np.hypot(points[:, 0], points[:, 1])
-    angle = np.arctan2(points[:, 1], points[:, 0])
+    radius = radii_of(points)
+    angle = azimuths_of(points)
     z = points[:, 2] - points[:, 2].mean()
     # longer than the map, on which the terms must not be periodic
     flat, scale = is_in_plane(points), max(radius.max(), 1e-9)
     length = (2 * scale if flat else max(np.ptp(z), 1e-9)) * 1.2
-    along, across = np.eye(3)[2], np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    along, across = np.eye(3)[2], unit_circle(angle)
     around = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
     found: list[Floats] = []
     fineness: list[tuple[int, int]] = []
@@ -131,7 +131,7 @@ def sensor_errors(points: Floats, orders: int = 3, waves: int = 8) -> SmoothTerm
     waves : int
         Largest number of half waves over the length of the map.
     """
-    angle = np.arctan2(points[:, 1], points[:, 0])
+    angle = azimuths_of(points)
     z = points[:, 2] - points[:, 2].mean()
     length = max(np.ptp(z), 1e-9)
     found: list[Floats] = []
@@ -341,7 +341,7 @@ def instrument_families(
     # function (squared-exponential covariance) and of a rough one (exponential covariance) falls
     # off.
     smooth_waves, rough_waves = (2.0, 5.0), (3.0, 15.0)
-    angle, radius = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    angle, radius = azimuths_of(points), radii_of(points)
     found = [_of_smooth_terms("readings", "z and angle", sensor_errors(points), noise_T, True,
                               np.ptp(points[:, 2]))]
     coordinates = {"z": points[:, 2], "angle": angle, "radius": radius,

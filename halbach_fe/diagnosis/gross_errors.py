@@ -26,7 +26,7 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import least_squares, minimize_scalar
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of, unit_circle
 from halbach_fe.core.errors import HalbachError, HalbachWarning, StudyError
 from halbach_fe.diagnosis.map_conventions import (
     ALL_AXES,
@@ -427,7 +427,7 @@ class _Search:
 
         The points are at another radius or, if that is the only error, all displaced alike.
         """
-        radii = np.hypot(self.points[:, 0], self.points[:, 1])
+        radii = radii_of(self.points)
         circles, smallest = radii.any(), radii[radii > 0].min(initial=np.inf)
         size = build_magnet(self.study).bore_radius
         for unit in self.lengths if level > 1 else (1.0,):
@@ -464,7 +464,7 @@ class _Search:
         """Yield the best convention with all points displaced by the same vector."""
         size = build_magnet(self.study).bore_radius
         starts = [np.zeros(3)] + [
-            size * part * np.array([np.cos(angle), np.sin(angle), 0.0])
+            size * part * unit_circle(angle)
             for part in (0.2, 0.5) for angle in np.pi / 4 * np.arange(8)]
         if self.study.dimension == 3:
             starts += [np.array([0.0, 0.0, sign * part * size])

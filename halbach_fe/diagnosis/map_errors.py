@@ -20,6 +20,7 @@ import numpy as np
 import xarray as xr
 
 from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.pace import Say
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis
 from halbach_fe.diagnosis.gross_errors import MIN_READINGS, GrossError, find_gross_errors, misfit_of
 from halbach_fe.diagnosis.linearization import Training
@@ -259,7 +260,7 @@ def misfits_of(study: Study, data: Data, iron: Field | None = None) -> dict[str,
 
 
 def find_poses(
-    study: Study, data: Data, session: Session, say: Callable[[str], None],
+    study: Study, data: Data, session: Session, say: Say,
     iron: Field | None = None,
 ) -> tuple[tuple[FoundPose, ...], Study]:
     """Register the maps if one of them is far from the magnet's field where the study states it.

@@ -17,9 +17,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 
 DETECTION_LOG_ODDS = 5.0
@@ -199,7 +198,7 @@ def with_wide_priors(evidence: Evidence, candidates: Sequence[Candidate]) -> Evi
 
 
 def _likeliest_widths(
-    evidence: Evidence, spans: Sequence[slice], pinned: NDArray[np.bool_]
+    evidence: Evidence, spans: Sequence[slice], pinned: Bools
 ) -> Floats:
     """Return the standard deviations (k,) of the likeliest prior of every column, by candidates."""
     every = range(len(pinned))
@@ -214,7 +213,7 @@ def _likeliest_widths(
 
 def _needless(
     evidence: Evidence, widths: Floats, span: slice, candidate: Candidate
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return which amplitudes of a candidate are 0 in its likeliest part.
 
     The evidence of a part relative to that of all amplitudes is the posterior density of 0 over the

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.diagnosis.competition import Competition, Explanation, Term
 from halbach_fe.diagnosis.effects.base import Hypothesis
@@ -159,7 +159,7 @@ def are_scattered(places: Sequence[tuple[float, ...]]) -> bool:
     if len(places) < many:
         return False
     points = np.array(places)
-    radius = np.hypot(points[:, 0], points[:, 1])
+    radius = radii_of(points)
     apart = np.linalg.norm(points[:, None] - points, axis=2)
     near = apart < near_sources * np.maximum(radius[:, None], radius)
     return bool(connected_components(near)[0] > 1)

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as linalg
-from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.numbers import MAD_TO_SD
 from halbach_fe.diagnosis.marginal_evidence import Marginal, with_fewer_columns
 from halbach_fe.diagnosis.scene import Campaign
@@ -131,7 +130,7 @@ class LeaveOneOut:
 
 
 def leave_one_out(
-    root: Floats, residual: Floats, noise: NoiseCovariance, used: NDArray[np.bool_]
+    root: Floats, residual: Floats, noise: NoiseCovariance, used: Bools
 ) -> LeaveOneOut:
     """Predict every reading from the used readings; a used reading from all other used ones.
 
@@ -167,9 +166,9 @@ def leave_one_out(
 
 
 def find_outliers(
-    root: Floats, residual: Floats, noise: NoiseCovariance, training: NDArray[np.bool_],
+    root: Floats, residual: Floats, noise: NoiseCovariance, training: Bools,
     labels: Sequence[str], positions: Floats, largest: float,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Tell which readings are outliers.
 
     Parameters
@@ -205,8 +204,8 @@ def find_outliers(
 
 
 def _crowded(
-    flagged: NDArray[np.bool_], neighbourhoods: Sequence[_Neighbourhood]
-) -> NDArray[np.bool_]:
+    flagged: Bools, neighbourhoods: Sequence[_Neighbourhood]
+) -> Bools:
     """Tell which flagged readings have more flagged neighbours than chance explains.
 
     Such readings are no outliers: a local source, for example, affects neighbours alike.
@@ -258,8 +257,8 @@ class _Neighbourhood:
             np.ones((*nearest.shape, 1)), away, away[:, :, first] * away[:, :, second]], axis=2))
 
     def outlying(
-        self, predicted: LeaveOneOut, flagged: NDArray[np.bool_], largest: float
-    ) -> NDArray[np.bool_]:
+        self, predicted: LeaveOneOut, flagged: Bools, largest: float
+    ) -> Bools:
         """Tell which readings (k,) are outliers.
 
         Suspects deviate from a robust fit to their neighbours. Outliers are those suspects that
@@ -280,7 +279,7 @@ class _Neighbourhood:
         local_scale_factor = 9.0
         difference, sd = predicted.difference[self.rows], predicted.sd[self.rows]
 
-        def is_outlying(flagged: NDArray[np.bool_], fits: int) -> NDArray[np.bool_]:
+        def is_outlying(flagged: Bools, fits: int) -> Bools:
             deviation, own, local = self._deviations(difference, flagged, fits)
             standard = deviation / (own * sd)
             volume = 2 * outlier_range * largest / (np.sqrt(2 * np.pi) * sd)
@@ -295,7 +294,7 @@ class _Neighbourhood:
             suspects = left
 
     def _deviations(
-        self, difference: Floats, flagged: NDArray[np.bool_], fits: int
+        self, difference: Floats, flagged: Bools, fits: int
     ) -> tuple[Floats, Floats, Floats]:
         """Return deviations of readings (k,) from the fit to their neighbours that are not flagged.
 

@@ -13,9 +13,8 @@ from functools import cached_property
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -74,7 +73,7 @@ class ScannedMap:
     points: Floats
     time: Floats
     rows: slice
-    missing: NDArray[np.bool_]
+    missing: Bools
     is_total: bool = False
     timed: bool = True
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.errors import HalbachError, HalbachWarning
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.linearization import Linearization, amplitude_scale, apply_effects
 from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
@@ -38,9 +38,6 @@ from halbach_fe.study.model import Study
 
 SHOWN_PROBABILITY = 1e-3
 """Probability of a candidate below which it is not asked what would be otherwise with it."""
-
-Say = Callable[[str], None]
-"""A callable that reports progress; its argument is a line of text."""
 
 
 @dataclass(frozen=True)
@@ -267,7 +264,7 @@ class _Comparison:
 
 def score_hypotheses(
     point: Linearization, effects: Sequence[Effect],
-    progress: Progress = lambda done, total: None, is_over: Callable[[], bool] = lambda: False,
+    progress: Progress = quiet, is_over: Callable[[], bool] = lambda: False,
 ) -> Search:
     """Compare all effects at a point where some effects are in the model already.
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from halbach_fe.core.arrays import unit_circle
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
 from halbach_fe.geometry.free_blocks import nominal_free_blocks
@@ -32,7 +33,7 @@ def blocks_of_array(array: Array, dimension: int) -> tuple[MagnetBlock, ...]:
     nominal = nominal_blocks(array, dimension)
     if not array.exceptions:
         return nominal
-    places = {(block.ring, block.slot): block for block in nominal}
+    places = {block.place: block for block in nominal}
     of_block = exceptions_of(array)
     return tuple(_with_exceptions(block, of_block(block.ring, block.slot), places)
                  for block in nominal)
@@ -95,7 +96,7 @@ def _with_exceptions(
             easy_axis = block.carried_from(meant) @ meant.easy_axis
         if exception.magnetization_angle_deg is not None:
             direction = np.radians(exception.magnetization_angle_deg)
-            easy_axis = np.array([np.cos(direction), np.sin(direction), 0.0])
+            easy_axis = unit_circle(direction)
         if exception.recoil_permeability is not None:
             permeability = across = exception.recoil_permeability
         across = exception.recoil_permeability_across or across
@@ -271,5 +272,5 @@ def outline_of_slot(array: Array, slot: int) -> Outline:
     half_width, half_depth = block.width_m / 2, (outer - inner) / 2
     local = trapezoid_corners((-half_depth, half_depth), (half_width, half_width))
     facing = np.radians(facing_angle_deg(array, slot))
-    centre = (inner + outer) / 2 * np.array([np.cos(middle), np.sin(middle)])
+    centre = (inner + outer) / 2 * unit_circle(middle)[:2]
     return closed_outline(local @ rotation_about_z(facing)[:2, :2].T + centre)

@@ -13,11 +13,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
-from halbach_fe.geometry.outline import Outline, mean_corner, outline_area, outline_part, ring_radii
+from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.geometry.outline import (
+    Outline,
+    along_edges,
+    at_heights,
+    mean_corner,
+    outline_area,
+    outline_part,
+    ring_radii,
+)
 from halbach_fe.geometry.surface import Contact, contact_of_prism, contact_of_tube
 from halbach_fe.study.materials import MU_0
 
@@ -104,6 +111,11 @@ class MagnetBlock:
         return np.asarray(turn @ [*mean_corner(self.outline), z] + np.array(self.origin_m))
 
     @cached_property
+    def mounted_middle(self) -> Floats:
+        """The same of the block where it is mounted, (3,) in m."""
+        return np.asarray(self.middle + self.displacement_m)
+
+    @cached_property
     def axes(self) -> Floats:
         """Axes of the block's frame as columns (3, 3), turned with a rotated block."""
         nominal = rotation_matrix(self.orientation_rad)
@@ -130,7 +142,7 @@ class MagnetBlock:
     def position(self) -> Floats:
         """Origin of the block's frame, (3,) in m, moved with a displaced or rotated block."""
         turned = rotation_matrix(self.rotation_rad) @ (np.array(self.origin_m) - self.middle)
-        return np.asarray(turned + self.middle + self.displacement_m)
+        return np.asarray(turned + self.mounted_middle)
 
     def to_frame(self, points: Floats) -> Floats:
         """Return points (n, 3) of the magnet in the block's frame, in m."""
@@ -178,6 +190,11 @@ class MagnetBlock:
         return across * np.eye(3) + (along - across) * np.outer(axis, axis)
 
     @property
+    def place(self) -> tuple[int, int]:
+        """Ring and slot."""
+        return self.ring, self.slot
+
+    @property
     def name(self) -> str:
         """Name of the block in regions, parameters and reports: ``r01s05`` is ring 1, slot 5."""
         return self.label or f"r{self.ring:02d}s{self.slot:02d}"
@@ -207,7 +224,7 @@ class MagnetBlock:
         """Nominal magnetization M = B_r / (mu_0 mu_r) of ``nu B = H + M``, (3,) in A/m."""
         return self.polarization / (MU_0 * self.recoil_permeability)
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m lie inside the block, and not on its surface."""
         return self.contact(points).inside
 
@@ -285,16 +302,13 @@ def bore_radius(blocks: Sequence[MagnetBlock]) -> float:
     free, by points on their outlines, at least 1e-4 m. If a block covers the axis, it is how far
     the block's outline is from it.
     """
-    t = np.linspace(0.0, 1.0, 17)
     smallest = np.inf
     for block in blocks:
-        outline = np.vstack([edge.at(t)[0] for edge in block.outline])
+        outline = along_edges(block.outline, 17)
         if any(block.orientation_rad) or any(block.origin_m):
             heights = [0.0] if np.isinf(block.z_max) else np.linspace(block.z_min, block.z_max, 9)
             nominal = rotation_matrix(block.orientation_rad)
-            outline = np.vstack([
-                (np.column_stack([outline, np.full(len(outline), z)]) @ nominal.T
-                 + block.origin_m)[:, :2] for z in heights])
+            outline = (at_heights(outline, *heights) @ nominal.T + block.origin_m)[:, :2]
         smallest = min(smallest, float(np.hypot(*outline.T).min()))
     return max(smallest, 1e-4)
 

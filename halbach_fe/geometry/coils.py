@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, unit_circle
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.study.magnet import AnyCoil, PolygonCoil, Racetrack, RoundCoil
 
@@ -59,7 +59,7 @@ def turn_corners(coil: Racetrack, across: float, chords: int) -> Floats:
     radii = np.array([1.0, *(wider,) * (chords - 1), 1.0])
     middle = np.array(coil.size_m) / 2 - coil.corner_radius_m
     corners = [np.array(sign) * middle + (coil.corner_radius_m + across) * radii[:, None]
-               * np.column_stack([np.cos(angle), np.sin(angle)])
+               * unit_circle(angle)[:, :2]
                for number, sign in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)])
                for angle in [np.pi / 2 * number + step * np.arange(chords + 1)]]
     turn = np.vstack([*corners, corners[0][:1]])

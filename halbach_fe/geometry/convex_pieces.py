@@ -23,7 +23,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, azimuths_of
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.outline import Edge, Outline
 
@@ -164,7 +164,7 @@ def _sector_pieces(
 def _directions(corners: Floats) -> Floats:
     """Return the directions (m, 2) of a polygon's edges; of parallel edges, only one."""
     edges = corners[np.arange(len(corners)) - 1] - corners
-    angles = np.sort(np.arctan2(edges[:, 1], edges[:, 0]) % np.pi)
+    angles = np.sort(azimuths_of(edges) % np.pi)
     new = np.append(True, np.diff(angles) > 1e-12)
     if len(angles) > 1 and angles[-1] - angles[0] > np.pi - 1e-12:
         new[-1] = False

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, polygon_area, unit_circle
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix, vector
 from halbach_fe.geometry.outline import Outline, circle, closed_outline, trapezoid_corners
@@ -112,7 +112,7 @@ def _outline(shape: Shape, sizes: tuple[Any, ...]) -> Outline:
         return circle(size["radius_m"])
     if shape == "polygon":
         angles = 2 * np.pi / size["sides"] * np.arange(size["sides"])
-        return closed_outline(size["radius_m"] * np.column_stack([np.cos(angles), np.sin(angles)]))
+        return closed_outline(size["radius_m"] * unit_circle(angles)[:, :2])
     widths = ((size["size_y_m"],) * 2 if shape == "cuboid"
               else (size["inner_width_m"], size["outer_width_m"]))
     depth = size["size_x_m"] / 2
@@ -125,8 +125,8 @@ def sector_outline(inner: float, outer: float, start: float, stop: float) -> Out
     Arcs longer than half a turn are cut in two, since an edge's end points do not tell its sweep.
     """
     angles = np.linspace(start, stop, 2 if stop - start < 0.99 * np.pi else 4)
-    there = outer * np.column_stack([np.cos(angles), np.sin(angles)])
-    back = inner * np.column_stack([np.cos(angles), np.sin(angles)])[::-1]
+    there = outer * unit_circle(angles)[:, :2]
+    back = inner * unit_circle(angles)[:, :2][::-1]
     count = len(angles)
     arcs = (*range(1, count), *range(count + 1, 2 * count))
     return closed_outline(np.vstack([back[-1:], there, back[:-1]]), arcs)
@@ -134,9 +134,7 @@ def sector_outline(inner: float, outer: float, start: float, stop: float) -> Out
 
 def counter_clockwise(corners: Floats) -> Floats:
     """Return the corners (n, 2) of a polygon in the order in which it runs counter-clockwise."""
-    x, y = corners.T
-    area = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    return corners if area > 0 else corners[::-1]
+    return corners if polygon_area(corners) > 0 else corners[::-1]
 
 
 RELATIVE_ROUNDING = 1e-12

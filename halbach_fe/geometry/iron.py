@@ -7,15 +7,14 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats, polygon_area
 from halbach_fe.core.errors import StudyError
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.convex_pieces import triangles_of_polygon
 from halbach_fe.geometry.free_blocks import counter_clockwise
-from halbach_fe.geometry.outline import Outline, closed_outline
+from halbach_fe.geometry.outline import Outline, along_edges, closed_outline
 from halbach_fe.geometry.surface import (
     Contact,
     contact_of_prism,
@@ -144,8 +143,7 @@ class IronSolid:
             rim = 2 * np.pi * (self.inner_radius + self.outer_radius)
             area, corners = np.pi * (self.outer_radius**2 - self.inner_radius**2), 0
         else:
-            x, y = np.array([edge.start for edge in self.outline]).T
-            area = float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+            area = polygon_area(np.array([edge.start for edge in self.outline]))
             rim, corners = sum(edge.length for edge in self.outline), len(self.outline)
         length = self.z_max - self.z_min
         return area * length, 2 * area + rim * length, 2 * rim + corners * length
@@ -172,7 +170,7 @@ class IronSolid:
             return max(-self.z_min, self.z_max)
         return float(np.abs(self.surface[2]).max())
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m lie inside the body, and not on its surface."""
         return self.contact(points).inside
 
@@ -239,8 +237,7 @@ def _prism(corners: Floats, ends: tuple[float, float], holes: tuple[IronHole, ..
     """Return a prism on a polygon (n, 2) in m with holes, which are yet to be turned (2, 2)."""
     axes = np.eye(2) if turn is None else turn
     outline = closed_outline(corners @ axes.T)
-    t = np.linspace(0.0, 1.0, 17)
-    radii = np.hypot(*np.vstack([edge.at(t)[0] for edge in outline]).T)
+    radii = np.hypot(*along_edges(outline, 17).T)
     solid = IronSolid(float(radii.min()), float(radii.max()), *ends, outline)
     if not holes or np.isinf(ends).any():  # in 2D the study is refused
         return replace(solid, holes=tuple(hole.corners for hole in holes))

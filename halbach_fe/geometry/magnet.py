@@ -12,18 +12,18 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
 from halbach_fe.geometry.coils import in_winding, points_in_winding
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
-from halbach_fe.geometry.outline import points_on
+from halbach_fe.geometry.outline import at_heights, points_on
 from halbach_fe.geometry.overlaps import (
     block_in_iron,
     block_in_others,
@@ -170,7 +170,7 @@ class Magnet(ShownInNotebook):
 
     @cached_property
     def _numbers(self) -> dict[tuple[int, int], int]:
-        return {(block.ring, block.slot): number for number, block in enumerate(self.blocks)}
+        return {block.place: number for number, block in enumerate(self.blocks)}
 
     def number_of(self, ring: int, slot: int) -> int:
         """Return the number of a block, from 0 in the order of `blocks`.
@@ -197,10 +197,8 @@ class Magnet(ShownInNotebook):
         """
         found = []
         for block in self.blocks:
-            outline = points_on(block.outline)
-            ends = [0.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
-            points = np.vstack([np.column_stack([outline, np.full(len(outline), z)])
-                                for z in ends])
+            ends = (0.0,) if np.isinf(block.z_max) else (block.z_min, block.z_max)
+            points = at_heights(points_on(block.outline), *ends)
             found.append(points @ rotation_matrix(block.orientation_rad).T + block.origin_m)
         return tuple(found)
 
@@ -215,7 +213,7 @@ class Magnet(ShownInNotebook):
             found.setdefault(block.ring, []).append(points)
         sections = []
         for points in map(np.vstack, found.values()):
-            radius = np.hypot(points[:, 0], points[:, 1])
+            radius = radii_of(points)
             sections.append(((float(points[:, 2].min()), float(points[:, 2].max())),
                              (float(radius.min()), float(radius.max()))))
         return tuple(sections)
@@ -298,7 +296,7 @@ class Magnet(ShownInNotebook):
         """Half the length of the magnet in m, including its iron."""
         return max(self.array_half_length, self.iron_half_length)
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are not in air.
 
         These are inside a block, a neighbour's block or the iron, on an edge, or between two bodies
@@ -311,7 +309,7 @@ class Magnet(ShownInNotebook):
         if not len(points):
             return surroundings((), points)
         size = min(self.dimension, 3)  # blocks of a cross-section have no middle along z
-        middles = np.array([block.middle + block.displacement_m for block in self.blocks])
+        middles = np.array([block.mounted_middle for block in self.blocks])
         distance, _ = KDTree(points[:, :size]).query(middles[:, :size])
         near = [self.blocks[number] for number in np.flatnonzero(distance <= self._reaches)]
         others = neighbour_blocks(self.blocks, self.external.neighbours)

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats, box_middle, unit_circle
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,16 @@ def points_on(outline: Outline) -> Floats:
     return points
 
 
+def along_edges(outline: Outline, per_edge: int) -> Floats:
+    """Return points (n, 2) in m along an outline, evenly spread over each edge, ends and all."""
+    return np.vstack([edge.at(np.linspace(0.0, 1.0, per_edge))[0] for edge in outline])
+
+
+def at_heights(flat: Floats, *heights: float) -> Floats:
+    """Return points (n, 2) at each of some heights, (heights n, 3), in m."""
+    return np.vstack([np.column_stack([flat, np.full(len(flat), z)]) for z in heights])
+
+
 @lru_cache(maxsize=4096)
 def mean_corner(outline: Outline) -> tuple[float, float]:
     """Return the mean of the corners of an outline, in m."""
@@ -88,7 +97,7 @@ def mean_corner(outline: Outline) -> tuple[float, float]:
     return x, y
 
 
-def outline_contains(outline: Outline, points: Floats) -> NDArray[np.bool_]:
+def outline_contains(outline: Outline, points: Floats) -> Bools:
     """Tell which points (n, 2) in m lie inside an outline.
 
     The even-odd rule (crossings of a ray along +x) decides for the polygon of the corners. Points
@@ -196,7 +205,7 @@ def trapezoid_corners(x: tuple[float, float], half_widths: tuple[float, float]) 
 def circle(radius: float) -> Outline:
     """Return a circle about the origin, in four arcs; the x axis crosses the middle of one."""
     angles = np.pi / 4 * np.array([-3, -1, 1, 3])
-    return closed_outline(radius * np.column_stack([np.cos(angles), np.sin(angles)]), (0, 1, 2, 3))
+    return closed_outline(radius * unit_circle(angles)[:, :2], (0, 1, 2, 3))
 
 
 def rectangle(size_x: float, size_y: float) -> Outline:
@@ -220,7 +229,7 @@ def thinnest_wall(polygons: Sequence[Floats], owners: Sequence[object]) -> tuple
         0 if two polygons overlap; infinite if there is nothing to compare.
     first, second : int
     """
-    centres = np.array([(polygon.max(axis=0) + polygon.min(axis=0)) / 2 for polygon in polygons])
+    centres = np.array([box_middle(polygon) for polygon in polygons])
     reach = np.array([np.hypot(*(polygon - centre).T).max()
                       for polygon, centre in zip(polygons, centres, strict=True)])
     nearest = (np.inf, 0, 0)

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, box_middle
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_matrix
 from halbach_fe.geometry.convex_pieces import PARALLEL, Prisms, Shape, annulus
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import Outline
+from halbach_fe.geometry.outline import Outline, along_edges, at_heights
 from halbach_fe.geometry.surface import distance_from_prism
 
 ALLOWED_PENETRATION = 1e-6
@@ -137,7 +136,7 @@ def _in_triangles(
     for number, block in enumerate(blocks):
         outline = np.array([edge.start for edge in block.outline])
         extent = max(*np.ptp(outline, axis=0), block.z_max - block.z_min)
-        middle = block.middle + block.displacement_m
+        middle = block.mounted_middle
         if (np.maximum(low - middle, middle - high) > 2 * extent).any():  # far away
             continue
         near = ((corners.min(axis=1) < middle + extent)
@@ -160,10 +159,9 @@ def points_of_block(block: MagnetBlock, depth: float = 0.0) -> Floats:
     """Return points (n, 3) in m along the edges of a finite block, ``depth`` m deep, and in its
     middle.
     """
-    edges = np.vstack([edge.at(np.linspace(0, 1, 5))[0] for edge in block.outline])
-    points = np.vstack([np.column_stack([edges, np.full(len(edges), z)]) for z in (
-        block.z_min, (block.z_min + block.z_max) / 2, block.z_max)])
-    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    points = at_heights(along_edges(block.outline, 5), block.z_min, (block.z_min + block.z_max) / 2,
+                        block.z_max)
+    middle = box_middle(points)
     shrunk = 1 - 2 * depth / np.ptp(points, axis=0).min()
     return block.from_frame(np.vstack([middle + shrunk * (points - middle), middle]))
 
@@ -192,7 +190,7 @@ class _Bodies:
     position: Floats
 
     @cached_property
-    def infinite(self) -> NDArray[np.bool_]:
+    def infinite(self) -> Bools:
         """Whether bodies are infinitely long, (n,)."""
         return np.asarray(np.isinf(self.limits).any(axis=1))
 

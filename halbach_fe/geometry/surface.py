@@ -14,9 +14,8 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, face_vectors
 from halbach_fe.geometry.outline import Outline, outline_contains, points_on
 from halbach_fe.study.iron import windings
 from halbach_fe.study.types import look_like_mm
@@ -62,9 +61,9 @@ class Contact:
         What takes a point on a face to its place just outside; zero for others.
     """
 
-    inside: NDArray[np.bool_]
-    on_edge: NDArray[np.bool_]
-    on_face: NDArray[np.bool_]
+    inside: Bools
+    on_edge: Bools
+    on_face: Bools
     outward: Floats
 
     @classmethod
@@ -97,7 +96,7 @@ class _Section:
     distance: Floats
     normal: Floats
     corner: Floats
-    curved: NDArray[np.bool_]
+    curved: Bools
 
 
 def contact_of_prism(outline: Outline, z_min: float, z_max: float, points: Floats) -> Contact:
@@ -158,7 +157,7 @@ def _touch_triangles(found: Contact, triangles: Floats, points: Floats, some: In
                      small: float) -> None:
     """Set the contact of ``some`` of the points with triangles, ``small`` in m thick."""
     a, b, c = np.moveaxis(triangles[None] - points[some, None, None], 2, 0)
-    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    across = face_vectors(triangles)
     normal = across / np.linalg.norm(across, axis=1)[:, None]
     height = -np.einsum("nmi,mi->nm", a, normal)
     # distances in the plane from the three sides, inwards
@@ -187,7 +186,7 @@ def distance_from_prism(outline: Outline, z_min: float, z_max: float, points: Fl
 
 
 def _in_box(points: Floats, low: Sequence[float], high: Sequence[float],
-            margin: float) -> NDArray[np.bool_]:
+            margin: float) -> Bools:
     """Tell which points (n, 3) lie in a box that is widened by a margin in m."""
     inside = np.ones(len(points), bool)
     for values, first, last in zip(points.T, low, high, strict=True):
@@ -267,7 +266,7 @@ def _section(outline: Outline, points: Floats) -> _Section:
             continue
         if edge.arc:
             first, sweep = edge.angles
-            turn = np.sign(sweep) * (np.arctan2(points[:, 1], points[:, 0]) - first)
+            turn = np.sign(sweep) * (azimuths_of(points) - first)
             # from the middle of the arc, so that what is beyond an end is nearest to that end
             middle = abs(sweep) / 2
             share = ((turn - middle + np.pi) % (2 * np.pi) - np.pi + middle) / abs(sweep)
@@ -311,14 +310,14 @@ class Surroundings:
     """
 
     points: Floats
-    inside: NDArray[np.bool_]
-    on_edge: NDArray[np.bool_]
+    inside: Bools
+    on_edge: Bools
     faces: Ints
     names: dict[int, list[str]]
     reach: float = np.inf
 
     @property
-    def no_air(self) -> NDArray[np.bool_]:
+    def no_air(self) -> Bools:
         """Which points have no field that a probe could measure."""
         return np.asarray(self.inside | self.on_edge | (self.faces > 1))
 

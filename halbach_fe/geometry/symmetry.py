@@ -22,11 +22,11 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, unit_circle
 from halbach_fe.geometry.array_layout import exceptions_of, magnetization_factor, nominal_blocks
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Outline, outline_contains, points_on
+from halbach_fe.geometry.outline import Outline, at_heights, outline_contains, points_on
 from halbach_fe.study.array import Array
 from halbach_fe.study.magnet import External
 
@@ -246,7 +246,7 @@ def mountings(magnet: Magnet) -> list[tuple[int, Floats]]:
     """
     of_block, found = exceptions_of(magnet.array), []
     for block in magnet.blocks:
-        ring, slot = block.mounted_from or (block.ring, block.slot)
+        ring, slot = block.mounted_from or block.place
         number = magnet.number_of(ring, slot)
         turn = rotation_matrix(block.rotation_rad) @ block.carried_from(magnet.blocks[number])
         factor = magnetization_factor(of_block(block.ring, block.slot))
@@ -404,7 +404,7 @@ def _turns(
                 words = f"{name} {_by_slots(k, count)}"
             else:
                 angle = np.pi * k / count + np.radians(blocks[numbers[0]].angle_deg)
-                turn = Rotation.from_rotvec(np.pi * np.array([np.cos(angle), np.sin(angle), 0.0]))
+                turn = Rotation.from_rotvec(np.pi * unit_circle(angle))
                 words = f"{name} about {np.degrees(angle) % 180:.4g}° from x"
             pairs = _pairs(blocks, (numbers, numbers), turn.as_matrix(),
                            middle - turn.apply(middle))
@@ -477,10 +477,8 @@ def _fits(block: MagnetBlock, shrunk: Floats) -> bool:
 @lru_cache(maxsize=4096)
 def _corners(block: MagnetBlock) -> Floats:
     """Return points (n, 3) in m on the edges of a block; of an infinite one, at |z| of 1 m."""
-    ends = [-1.0, 1.0] if np.isinf(block.z_max) else [block.z_min, block.z_max]
-    outline = points_on(block.outline)
-    corners = block.from_frame(np.vstack([
-        np.column_stack([outline, np.full(len(outline), z)]) for z in ends]))
+    ends = (-1.0, 1.0) if np.isinf(block.z_max) else (block.z_min, block.z_max)
+    corners = block.from_frame(at_heights(points_on(block.outline), *ends))
     corners.flags.writeable = False
     return corners
 

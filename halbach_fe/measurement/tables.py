@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.errors import MeasurementError, must_be
+from halbach_fe.core.errors import MeasurementError, must_be, not_utf8
 from halbach_fe.core.numbers import WITH_COMMAS, other_separator
 from halbach_fe.core.numbers import parse_number as number_in
 
@@ -52,9 +52,7 @@ def csv_table(
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise MeasurementError(
-            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
-                    "Save it as UTF-8 text.")) from None
+        raise MeasurementError(not_utf8(where, error)) from None
     attributes: dict[str, str] = {}
     rows: list[tuple[int, list[str]]] = []
     for number, line in enumerate(text.splitlines(), start=1):

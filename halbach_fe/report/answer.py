@@ -10,7 +10,7 @@ import base64
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,16 +50,21 @@ _INPUTS: ContextVar[Mapping[str, str] | None] = ContextVar("inputs", default=Non
 
 
 @contextmanager
-def known_inputs(inputs: Mapping[str, str]) -> Iterator[None]:
+def _while_it_runs(variable: ContextVar[Any], value: object) -> Iterator[None]:
+    """Let a variable have a value while the block runs."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+def known_inputs(inputs: Mapping[str, str]) -> AbstractContextManager[None]:
     """While the block runs, let the provenance of pages have these files.
 
     They are texts with name and SHA-256, by what the file is.
     """
-    token = _INPUTS.set(inputs)
-    try:
-        yield
-    finally:
-        _INPUTS.reset(token)
+    return _while_it_runs(_INPUTS, inputs)
 
 
 def inputs_of_command() -> Mapping[str, str]:
@@ -67,14 +72,9 @@ def inputs_of_command() -> Mapping[str, str]:
     return _INPUTS.get() or {}
 
 
-@contextmanager
-def known_paths(paths: Mapping[str, object]) -> Iterator[None]:
+def known_paths(paths: Mapping[str, object]) -> AbstractContextManager[None]:
     """While the block runs, let answers of pages name these files, see `Answer.with_paths`."""
-    token = _NAMES.set(paths)
-    try:
-        yield
-    finally:
-        _NAMES.reset(token)
+    return _while_it_runs(_NAMES, paths)
 
 
 @dataclass(frozen=True)

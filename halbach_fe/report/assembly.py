@@ -12,14 +12,14 @@ from types import MappingProxyType
 import numpy as np
 from markupsafe import Markup
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area
 from halbach_fe.core.files import atomic, write_text
-from halbach_fe.core.pace import Progress
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.assembly import AssembledBlock, Assembly
 from halbach_fe.design.holder import LEVEL_M, Plate
 from halbach_fe.geo.solid import PER_M, Group, Occurrence, Solid, solid, step_text
 from halbach_fe.geometry.iron import IronSolid
-from halbach_fe.geometry.outline import circle
+from halbach_fe.geometry.outline import at_heights, circle
 from halbach_fe.geometry.prism import Prism, upright
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
@@ -83,7 +83,7 @@ def sheets(assembly: Assembly) -> list[Sheet]:
         heights[-1].append(one)
     for level in heights:
         if len(level) > 1:
-            level.sort(key=lambda one: (one.block.ring, one.block.slot))
+            level.sort(key=lambda one: one.block.place)
             found.append(Sheet(f"Without a holder: {_rings(level)}, middle at z = "
                                f"{height_mm(float(level[0].block.middle[2]))} mm", level))
     alone = [level[0] for level in heights if len(level) == 1]
@@ -192,8 +192,8 @@ def drawing(
     drawn = []
     for number, (one, polygon, label) in enumerate(zip(
             sheet.blocks, outlines, labels, strict=True)):
-        middle = (polygon.max(axis=0) + polygon.min(axis=0)) / 2
-        width = float(np.sqrt(_area(polygon)))
+        middle = box_middle(polygon)
+        width = float(np.sqrt(abs(polygon_area(polygon))))
         angle = float(np.arctan2(middle[1], middle[0]))
         place: tuple[float, float, float, str, float]
         if layers[number] == max(layers):
@@ -216,9 +216,8 @@ def drawing(
 
 def _layers(outlines: Sequence[Floats]) -> list[int]:
     """Return the number of the layer about the axis of every block, the innermost is 0."""
-    radii = np.array([float(np.hypot(*((one.max(axis=0) + one.min(axis=0)) / 2)))
-                      for one in outlines])
-    widths = np.array([np.sqrt(_area(one)) for one in outlines])
+    radii = np.array([float(np.hypot(*box_middle(one))) for one in outlines])
+    widths = np.array([np.sqrt(abs(polygon_area(one))) for one in outlines])
     order = np.argsort(radii, kind="stable")
     steps = np.diff(radii[order]) > 0.5 * widths[order][1:]
     layer = np.zeros(len(radii), int)
@@ -317,8 +316,8 @@ def _outline_mm(one: AssembledBlock) -> Floats:
     prism = upright(one.block)
     if prism is not None:
         return 1e3 * prism.polygon
-    corners = np.array([[*edge.start, one.block.z_min] for edge in one.block.outline])
-    return np.asarray(1e3 * one.block.from_frame(corners)[:, :2])
+    corners = np.array([edge.start for edge in one.block.outline])
+    return np.asarray(1e3 * one.block.from_frame(at_heights(corners, one.block.z_min))[:, :2])
 
 
 def common_beginning(serials: Sequence[str]) -> str:
@@ -327,12 +326,6 @@ def common_beginning(serials: Sequence[str]) -> str:
     same = next((number for number, (one, other) in enumerate(zip(first, last, strict=False))
                  if one != other), 0)
     return first[:same]
-
-
-def _area(polygon: Floats) -> float:
-    """Return the area of a polygon (n, 2)."""
-    x, y = polygon.T
-    return float(abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2)
 
 
 def _path(polygon: Floats) -> str:
@@ -422,7 +415,7 @@ def write_stl(triangles: Floats, title: str, path: Path) -> None:
 
     ``title`` stands at the beginning of the file.
     """
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = face_vectors(triangles)
     records = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)),
                                         ("attributes", "<u2")])
     records["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -467,8 +460,8 @@ def answer(assembly: Assembly) -> Answer:
     else:
         step = "See which forces the blocks feel, for tools and glue."
     if assembly.left_over:
-        said.append(f"{counted(assembly.left_over, 'measured block')} "
-                    f"{'is' if assembly.left_over == 1 else 'are'} left over.")
+        said.append(f"{counted(assembly.left_over, 'measured block is', 'measured blocks are')} "
+                    "left over.")
     return Answer("What is to be ordered and made?", " ".join(said), trust, step,
                   "halbach-fe forces STUDY -o DIR")
 
@@ -564,7 +557,7 @@ def _columns(assembly: Assembly) -> dict[str, Iterable[object]]:
         "way_round": [one.way_round for one in blocks]}
 
 
-def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> Page:
+def page(assembly: Assembly, progress: Progress = quiet) -> Page:
     """Return the page of what is to be ordered and made; its files are the solids, too."""
     kinds, plates = _kind_rows(assembly), _plate_rows(assembly)
     upside_down = ("" if not kinds or "to order" not in kinds[0] else " Kinds that differ only in "
@@ -576,7 +569,7 @@ def page(assembly: Assembly, progress: Progress = lambda done, total: None) -> P
             Table(kinds), "Sizes are along the block's own x × y × z: in a ring x points outwards, "
             "or along the magnetization where cubes turn with it, and z along the magnet. The "
             f"magnetization points to the north pole.{upside_down}"], "Blocks to order"),
-        *([Section([Table(plates), _of_the_plates(assembly)], "Plates to make")] if plates else []),
+        Section([Table(plates), _of_the_plates(assembly)], "Plates to make", about=plates),
         Section(["Magnets attract one another from decimetres away: `halbach-fe forces` computes "
                  "what each block feels while it is inserted.", partial(_sheets, assembly)])],
         {"Blocks to order": kinds, "Plates to make": plates}, stem="assembly", files={

@@ -18,17 +18,7 @@ from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
-from halbach_fe.report.page import (
-    POSTERIOR,
-    PRIOR,
-    SECOND,
-    Page,
-    Section,
-    Table,
-    View,
-    geometry_figure,
-    stacked_axes,
-)
+from halbach_fe.report.page import OF_COMPONENTS, Page, Section, Table, View, chart, geometry_figure
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
@@ -39,8 +29,6 @@ from halbach_fe.synthetic.simulate import (
     observed_components,
     point_noise,
 )
-
-COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 
 def answer(study: Study, readings: xr.Dataset, held_out: xr.Dataset | None, blocks: int) -> Answer:
@@ -81,8 +69,7 @@ def page(campaign: SimulatedCampaign) -> Page:
     magnitude = 1e3 * np.linalg.norm(list(_columns(study, readings).values()), axis=0)
     view = View(lambda: view_of_nominal_magnet(magnet, ViewPoints(
         points, magnitude, "points of the map", "magnitude of the<br>readings in mT",
-        "magnitude of the readings %{customdata:.5g} mT",
-        (float(magnitude.min()), float(magnitude.max())))),
+        "magnitude of the readings %{customdata:.5g} mT")),
         "points of the map by the magnitude of the readings")
     rows = [_map_row(study, name, data) for name, data in maps.items()]
     secret = readings.attrs["truth_sha256"]
@@ -148,11 +135,11 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
         (data, *_) = maps.values()
         return maps_figure(points_of(data), {
             name: 1e3 * column for name, column in _columns(study, data).items()}, "mT")
-    figure, (axis,) = stacked_axes(1)
-    figure.set_figheight(4)
+    figure, axis = chart(4)
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
         place, label = curve(points_of(data)) or (np.zeros(0), "")
-        for (shown, column), colour in zip(_columns(study, data).items(), COLOURS, strict=False):
+        for (shown, column), colour in zip(
+                _columns(study, data).items(), OF_COMPONENTS, strict=False):
             axis.plot(place, 1e3 * column, marker, ms=4, color=colour, label=f"{shown}, {name}")
         axis.set_xlabel(label)
     axis.set_ylabel("reading in mT")

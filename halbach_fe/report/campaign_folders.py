@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from halbach_fe.core.errors import MAX_QUOTED, OutputError, must_be, printable
+from halbach_fe.core.numbers import first_of
 from halbach_fe.core.result_folder import Record, Results, finished_results
 from halbach_fe.geometry.array_layout import nominal_blocks
 from halbach_fe.geometry.blocks import block_in_words
@@ -319,7 +320,7 @@ def _out_of_date(chapters: Sequence[Chapter]) -> list[str]:
             holders = [other for other in chapters if other is not one
                        and name in {PurePath(file).name for file in other.digests.values()}]
             if holders and digest not in present:
-                hold = f"{_listed(holders)} {'holds' if len(holders) == 1 else 'hold'}"
+                hold = _listed(holders, "holds", "hold")
                 names.setdefault(hold, []).append(name)
         found += [f"{one.label} is out of date: it was computed with another {in_a_row(files)} "
                   f"than {hold}. Run {one.record.command} again, or leave out what does not belong "
@@ -359,8 +360,7 @@ def _unused_findings(chapters: Sequence[Chapter]) -> list[str]:
         if one.verb in FINDING and written and later and not any(
                 other.has_study_of(one) for other in chapters):
             found.append(f"No result here is of {one.label}/{written[0]}: {_listed(later)} "
-                         f"{'is' if len(later) == 1 else 'are'} without what "
-                         f"{one.record.command} has found.")
+                         f"without what {one.record.command} has found.")
     return found
 
 
@@ -372,8 +372,8 @@ def _unused_blocks(chapters: Sequence[Chapter]) -> list[str]:
                and "MAP" in one.record.named and "BLOCKS" not in one.record.named]
     if not known or not without:
         return []
-    return [f"{_listed(without)} {'is' if len(without) == 1 else 'are'} without the measured "
-            f"blocks that {_listed(known)} {'has' if len(known) == 1 else 'have'} read, and "
+    return [f"{_listed(without)} without the measured blocks that "
+            f"{_listed(known, 'has', 'have')} read, and "
             f"{'knows' if len(without) == 1 else 'know'} less of the magnet: run "
             f"{in_a_row(list(dict.fromkeys(one.record.command for one in without)))} again with "
             "--blocks."]
@@ -416,9 +416,8 @@ def _versions(chapters: Sequence[Chapter]) -> list[tuple[str, str]]:
             changed = {key: values for key, values in changed.items()
                        if key.partition(".")[0] not in OF_MAPPER}
         texts = [_difference(key, old, new) for key, (old, new) in changed.items()]
-        more = f" and {len(texts) - MOST_KEYS} more" if len(texts) > MOST_KEYS else ""
-        changes = "; ".join(texts[:MOST_KEYS]) + more
-        of = f"{_listed(group)} {'is' if len(group) == 1 else 'are'} of"
+        changes = first_of(texts, MOST_KEYS, "; ")
+        of = f"{_listed(group)} of"
         if source is not None:
             other, name = source
             wrote = f"{of} {other.label}/{name}, which {other.record.command} wrote"
@@ -496,6 +495,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= MOST_VALUE else f"{text[:MOST_VALUE]}…"
 
 
-def _listed(chapters: Sequence[Chapter]) -> str:
-    """Return the names of folders in words."""
-    return in_a_row([one.label for one in chapters])
+def _listed(chapters: Sequence[Chapter], singular: str = "is", plural: str = "are") -> str:
+    """Return the names of folders in words, and the verb of the sentence."""
+    return (f"{in_a_row([one.label for one in chapters])} "
+            f"{singular if len(chapters) == 1 else plural}")

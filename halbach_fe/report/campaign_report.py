@@ -318,7 +318,7 @@ class Campaign:
                         if one is found and own.concern), "")
         return replace(answer, command="", step=repeat if not concern else (
             "Put right what was not assembled as designed, and measure again. Or, if it stays, "
-            f"{repeat[0].lower()}{repeat[1:]}"))
+            f"{within_a_sentence(repeat)}"))
 
     def plain(self) -> Plain:
         """Return the answers and what does not fit as plain data."""

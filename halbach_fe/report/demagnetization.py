@@ -19,6 +19,7 @@ from halbach_fe.geometry.blocks import block_in_words
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import BlockValues, Colours, magnet_view
 from halbach_fe.report.page import (
+    LISTED,
     MEASURED,
     POSTERIOR,
     PRIOR,
@@ -239,8 +240,9 @@ def page(found: DemagnetizationMap) -> Page:
             Text("H diverges logarithmically at the edges of blocks, so that the smallest margin "
                  "falls slightly with smaller cells (--across); shares of the volume converge. Not "
                  "modelled: fields across the easy axis, which demagnetize less, and the field "
-                 "change that the loss of one cell causes in others"
-                 f"{_SCALED if is_nonlinear(found.study) else ''}.", "small"),
+                 "change that the loss of one cell causes in others." + (
+                     " At other temperatures the field of the iron is scaled with the remanence."
+                     if is_nonlinear(found.study) else ""), "small"),
             View(partial(_view, found, blocks), "blocks by their smallest margin to the knee")]),
         Section([
             f"{of_all if len(blocks) > len(rows) else ''}H_cJ needed is the smallest intrinsic "
@@ -265,19 +267,15 @@ def page(found: DemagnetizationMap) -> Page:
             "demagnetization.vtu": partial(write_vtu, found)})
 
 
-_SCALED = ". At other temperatures the field of the iron is scaled with the remanence"
-
-
 def _worst_block_table(rows: list[dict[str, Any]]) -> Rows:
     """Return the rows of the few blocks with the smallest margins, as text."""
-    worst_rows = 12  # number of blocks in the page's table
     return [{"block": block_in_words(row["ring"], row["slot"], row["block"]),
              "mean H in kA/m": f"{1e-3 * row['mean_H_A_per_m']:.0f}",
              "lowest H in kA/m": f"{1e-3 * row['least_H_A_per_m']:.0f}",
              "margin in kA/m": f"{1e-3 * row['margin_A_per_m']:+.0f}",
              "past the knee": f"{100 * row['share_beyond_knee']:.1f} %",
              "H_cJ needed in kA/m": f"{1e-3 * row['needed_coercivity_A_per_m']:.0f}"}
-            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:worst_rows]]
+            for row in sorted(rows, key=lambda row: row["margin_A_per_m"])[:LISTED]]
 
 
 def _layers(found: DemagnetizationMap) -> dict[str, Ints]:

@@ -46,6 +46,7 @@ from halbach_fe.report.page import Drawn, Page, Rows, Section, Table, View
 from halbach_fe.report.words import (
     BAYES_FACTOR_IN_WORDS,
     bayes_factor,
+    capital,
     decimals,
     flux_density,
     fraction,
@@ -170,7 +171,7 @@ def page(
         diagnosis_summary(diagnosis, separations), [
             _what_is_missing(diagnosis, rows), *_what_else(diagnosis, separations, titles, rows),
             *_grounds(diagnosis), left_out_section(diagnosis.after),
-            Section(order := [*filter(None, [row_order_note(diagnosis.study)])]),
+            Section([order := row_order_note(diagnosis.study)]),
             Section([View(lambda: view_of_inference(diagnosis.after, places),
                           colours_in_words(diagnosis.after))]),
             Section([f"{STUDY_FILE} beside this page is the study's file {added}; halbach-fe solve "
@@ -180,8 +181,8 @@ def page(
          "The model before and after": change_table(diagnosis),
          "Rms difference of model and readings": residual_table(diagnosis),
          "Where nobody measured": left_out_table(diagnosis.after)},
-        rows, drawn, stem="diagnosis", remarks=[
-            *([BAYES_FACTOR_IN_WORDS] if found else []), *order],
+        rows, drawn, stem="diagnosis",
+        remarks=[BAYES_FACTOR_IN_WORDS if found else "", order],
         new_study=(STUDY_FILE, partial(
             changed_studies, study or diagnosis.corrected_study, diagnosis)))
 
@@ -321,14 +322,10 @@ def _further_measurements(
     """Return what the page shows on measurements that distinguish an effect from its rivals."""
     candidates = {candidate.name: candidate.title for pair in own for candidate in pair.candidates}
     what = title_of(identified.hypothesis.effect.name, titles)
-    return [*(f"{what[0].upper()}{what[1:]}, or {title_of(pair.rival.effect.name, titles)}? " + (
+    return [*(f"{capital(what)}, or {title_of(pair.rival.effect.name, titles)}? " + (
         f"**Measure next: {pair.recommended.title}.**" if pair.recommended else
         "None of the measurements below would distinguish them.") for pair in own), Table([
             {"measurement": title} | {
-                f"against {pair.rival.effect.name}": _gain(pair.gains[name]) for pair in own}
+                f"against {pair.rival.effect.name}": bayes_factor(max(pair.gains[name], 0.0))
+                for pair in own}
             for name, title in candidates.items()], "numbers")]
-
-
-def _gain(value: float) -> str:
-    """Format a gain in the log Bayes factor."""
-    return bayes_factor(max(value, 0.0))

@@ -35,7 +35,7 @@ from halbach_fe.geometry.symmetry import symmetry_images
 from halbach_fe.inference.result import TRAINING
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.inference_answer import distances
-from halbach_fe.report.words import bayes_factor, decimals, in_a_row
+from halbach_fe.report.words import bayes_factor, counted, decimals, in_a_row
 from halbach_fe.solver.routes import Route, choose_route, finer_in_words
 
 COORDINATES = {
@@ -92,9 +92,8 @@ def not_compared(diagnosis: Diagnosis) -> str:
         said.append(f"{len(names)} of {len(catalogue())}" + (
             f": {', '.join(names)}" if len(names) <= few else ""))
     if diagnosis.uncompared:
-        several = diagnosis.uncompared > 1
-        said.append(f"{diagnosis.uncompared} {'hypotheses were' if several else 'hypothesis was'} "
-                    "not compared for want of time")
+        said.append(counted(diagnosis.uncompared, "hypothesis was", "hypotheses were")
+                    + " not compared for want of time")
     return "; ".join(said)
 
 
@@ -418,11 +417,10 @@ def _also_possible(diagnosis: Diagnosis) -> str:
         return ""
     magnet = build_magnet(study)
     images = symmetry_images(magnet)
-    numbers = {(block.ring, block.slot): number for number, block in enumerate(magnet.blocks)}
     said = []
     for effect in diagnosis.identified:
         place = effect.place
-        own = sorted(numbers[ring, slot] for ring, slot in (
+        own = sorted(magnet.number_of(ring, slot) for ring, slot in (
             (place.ring, place.slot), place.other) if ring and slot)
         if own:
             others = dict.fromkeys(tuple(sorted(image[each] for each in own)) for image in images)

@@ -30,6 +30,8 @@ from halbach_fe.report.page import (
     SECOND,
     SMALL,
     Rows,
+    chart,
+    charts,
     draw_by_slot,
     figure_of,
     legend_above,
@@ -94,8 +96,7 @@ def groups(diagnosis: Diagnosis) -> Figure:
     kinds = [group.kind for group in diagnosis.groups_before]
     sizes = {kind: kinds.count(kind) for kind in kinds}
     if not sizes:
-        figure = figure_of(1)
-        axis = figure.subplots()
+        figure, axis = chart(1, grid=False)
         axis.text(0.5, 0.5, "too few readings to group them", ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
@@ -291,8 +292,7 @@ def profile(diagnosis: Diagnosis) -> Figure:
     label, index, along, name, connected = _line(before, diagnosis.loo_residuals_before)
     harmonic = name == "harmonic" and connected
     line = {"lw": 1.2} if connected and not harmonic else {"ls": "none", "marker": "_", "ms": 10}
-    figure = figure_of(5.4)
-    top, bottom = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [1.4, 1]})
+    figure, (top, bottom) = charts(5.4, 2, sharex=True, height_ratios=[1.4, 1])
     held, measured = before.held_out[index], before.readings[index]
     factor, unit = unit_for(max(float(np.abs(
         state.update.readings - state.update.prediction_posterior.mean)[index].max())
@@ -333,8 +333,6 @@ def profile(diagnosis: Diagnosis) -> Figure:
     legend_above(figure, top)
     bottom.set_ylabel(f"measured − predicted\nin {unit}")
     bottom.set_xlabel("harmonic n" if harmonic else name)
-    for axis in (top, bottom):
-        axis.grid(alpha=0.3)
     return figure
 
 

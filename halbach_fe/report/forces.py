@@ -15,8 +15,10 @@ from matplotlib.figure import Figure
 from halbach_fe.core.arrays import Floats
 from halbach_fe.design.forces import Forces, Loads
 from halbach_fe.geometry.blocks import MagnetBlock
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
+    LISTED,
     MEASURED,
     POSTERIOR,
     PRIOR,
@@ -30,11 +32,8 @@ from halbach_fe.report.page import (
     csv_file,
     figure_of,
 )
-from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_error
+from halbach_fe.report.words import counted, decimals, in_a_row, place_of, with_unit
 from halbach_fe.study.types import COMPONENTS
-
-LISTED = 12
-"""Number of the blocks on page and terminal: those with the largest forces."""
 
 NEGLIGIBLE = 1e-9
 """Forces in N below which there is none."""
@@ -175,7 +174,7 @@ def _rows(found: Forces) -> Rows:
         block, size = found.blocks[number], found.in_place.magnitude[number]
         rows.append({
             "block": place_of(block),
-            "force": with_error(size, float(found.in_place.error_N[number])) + "\u00a0N",
+            "force": with_unit(size, float(found.in_place.error_N[number]), "N"),
             "direction": (direction_in_words(block, found.in_place.force_N[number])
                           if size > NEGLIGIBLE else "none"),
             "torque": decimals(float(np.linalg.norm(found.in_place.torque_Nm[number])))
@@ -190,26 +189,25 @@ def _iron_rows(found: Forces) -> Rows:
     if found.iron is None:
         return []
     sizes = np.linalg.norm(found.iron.force_N, axis=1)
-    return [{"iron": name, "force": with_error(size, error) + "\u00a0N",
+    return [{"iron": name, "force": with_unit(size, error, "N"),
              "direction (x, y, z)": _numbers(force / size) if size > error else "none that is sure"}
             for name, force, size, error in zip(
                 found.iron.names, found.iron.force_N, sizes.tolist(),
                 found.iron.error_N.tolist(), strict=True)]
 
 
-def _on_iron(found: Forces) -> list[Section]:
-    """Return the section about the forces on the iron; none without iron."""
+def _on_iron(found: Forces) -> Section:
+    """Return the section about the forces on the iron; empty without iron."""
     rows = _iron_rows(found)
     if found.magnet.iron and not rows:
-        return [Section(["The forces on the iron are not computed beside `external.dipoles` and "
-                         "`external.neighbours`."], "Forces on the iron")]
-    if not rows:
-        return []
-    return [Section([
+        return Section(["The forces on the iron are not computed beside `external.dipoles` and "
+                        "`external.neighbours`."], "Forces on the iron")
+    return Section([
         Table(rows),
         "What blocks, coils and the other bodies of iron do to each body in the finished magnet: "
         "what holds it has to bear that. Bodies that touch, or that no plane separates, have one "
-        "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron")]
+        "force together. ± is the change from a coarser mesh of the iron."], "Forces on the iron",
+        about=rows)
 
 
 def _summary(found: Forces) -> Plain:
@@ -288,14 +286,9 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
     """Draw the blocks of the ring with the largest force, coloured, with arrows of their forces."""
     size = found.in_place.magnitude
     chosen = _drawn_ring(found)
-    t = np.linspace(0, 1, 9)
-    corners = []
-    for number in chosen:
-        block = found.blocks[number]
-        outline = np.vstack([edge.at(t)[0] for edge in block.outline])
-        height = (block.z_min + block.z_max) / 2
-        corners.append(1e3 * block.from_frame(
-            np.column_stack([outline, np.full(len(outline), height)]))[:, :2])
+    corners = [1e3 * block.from_frame(at_heights(
+        along_edges(block.outline, 9), (block.z_min + block.z_max) / 2))[:, :2]
+        for block in (found.blocks[number] for number in chosen)]
     colours = Normalize(0, float(size[chosen].max()) or 1.0)
     if _is_numbered(found):
         outside = 1.1 * max(float(np.hypot(*corner.T).max()) for corner in corners)
@@ -329,9 +322,9 @@ def _draw_ring(axis: Axes, found: Forces) -> None:
 def page(found: Forces) -> Page:
     """Return the page of the forces on the blocks."""
     iron, rows = bool(found.magnet.iron), _rows(found)
-    permeable = [] if found.magnet.is_vacuum else [
+    permeable = "" if found.magnet.is_vacuum else (
         "Every block has the mean of the polarization that its permeability gives it in the "
-        "finished magnet; how it varies inside the block is left out."]
+        "finished magnet; how it varies inside the block is left out.")
     return Page(
         "forces", "forces on the blocks", found.magnet.study, answer(found), _summary(found), [
             Section([
@@ -343,7 +336,7 @@ def page(found: Forces) -> Page:
                 "before it in place, and its place in that order"
                 f"{'; the iron is not there yet' * iron}. The forces of all blocks on each other "
                 f"add up to {_newton(found.imbalance_N)}; Newton's third law makes it zero.",
-                *permeable], "The largest forces in place"), *_on_iron(found)],
+                permeable], "The largest forces in place"), _on_iron(found)],
         {"Largest forces in place": rows} | (
             {"Forces on the iron": _iron_rows(found)} if found.iron else {}),
         figures={"forces.png": (

@@ -4,7 +4,7 @@ outside of the magnet.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -17,14 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from halbach_fe.api import HomogeneityResult
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
+    LISTED,
     POSTERIOR,
     PUBLISHED,
     SECOND,
@@ -36,10 +36,12 @@ from halbach_fe.report.page import (
     Rows,
     Section,
     Table,
+    Text,
+    chart,
     csv_file,
     figure_of,
 )
-from halbach_fe.report.words import decimals, flux_density, ppm, with_error
+from halbach_fe.report.words import best_known, decimals, flux_density, ppm, with_error, with_unit
 from halbach_fe.response.homogeneity import PPM, Homogeneity, HomogeneityModel, Slice
 from halbach_fe.response.stray_field import NEAREST, StrayField
 from halbach_fe.study.model import Study
@@ -59,10 +61,6 @@ MAP_ROWS = ("Those of the map are of a fit of its readings by solid harmonics, w
 ROUNDING = 1e-9
 """Size below which a harmonic is zero but for rounding, relative to the largest one."""
 
-LISTED = 12
-"""Number of the harmonics on the page and the terminal: the largest ones."""
-
-
 LEAST_OF_SD = 5e-3
 """Part of its standard deviation below which a number is 0 in tables."""
 
@@ -75,7 +73,7 @@ def answer(found: HomogeneityResult) -> Answer:
     # Deviation in ppm rms from which a tray of small magnets is not advised: 64 cubes of 4 mm in a
     # magnet of 80 cubes of 12 mm took 6600 ppm away, of 77000.
     too_large_for_a_tray = 1e4
-    name, best = list(found.by_name.items())[-1]
+    name, best = best_known(found.by_name)
     question = f"How homogeneous is the field in {found.model.region.text}?"
     low, middle, high = map(ppm, best.rms_range_ppm)
     likely = "" if name == "prior" or _cancels(best) or found.disagreement else (
@@ -134,7 +132,7 @@ def _of_map(found: HomogeneityResult) -> str:
     remarks = "".join(f". {remark.rstrip('.')}" for remark in found.map_remarks)
     if not found.of_map or found.map_misfit > POOR:
         return remarks
-    name, known = list(found.of_map.items())[-1]
+    name, known = best_known(found.of_map)
     low, _, high = map(ppm, known.rms_range_ppm)
     return (f"; a fit to the {'held-out ' if name == HELD_OUT_PART else ''}readings alone has "
             f"{ppm(known.rms_ppm)} ppm rms (95 %: {low} to {high}){remarks}")
@@ -169,7 +167,7 @@ def _known_as(name: str) -> str:
 
 def _field(known: Homogeneity) -> str:
     """Return mean field and standard deviation as text, in mT."""
-    return f"{with_error(1e3 * known.mean_T, 1e3 * known.mean_sd_T)}\u00a0mT"
+    return with_unit(known.mean_T, known.mean_sd_T, "mT")
 
 
 def direction_in_words(unit: Floats, sd_rad: float) -> str:
@@ -181,7 +179,7 @@ def direction_in_words(unit: Floats, sd_rad: float) -> str:
     axis = f"along {'-' if unit[main] < 0 else '+'}{'xyz'[main]}"
     if off <= LEAST_OF_SD * sd_rad:
         return f"{axis} ± {decimals(1e3 * sd_rad, 2)}\u00a0mrad"
-    return f"{axis}, {with_error(1e3 * off, 1e3 * sd_rad)}\u00a0mrad off it"
+    return f"{axis}, {with_unit(off, sd_rad, 'mrad')} off it"
 
 
 def _cancels(known: Homogeneity) -> bool:
@@ -258,7 +256,7 @@ def homogeneity_summary(found: HomogeneityResult) -> Plain:
         "of_map": {name: plain_homogeneity(known) for name, known in found.of_map.items()}}
 
 
-def _deviations(slices: list[Slice], mean_T: float) -> tuple[list[Floats], NDArray[np.bool_]]:
+def _deviations(slices: list[Slice], mean_T: float) -> tuple[list[Floats], Bools]:
     """Return deviations of |B| in ppm in every slice, and which pixels are in the ellipse in it."""
     x, y = np.meshgrid(*2 * [np.linspace(-1, 1, len(slices[0].first_m))])
     return [PPM * (each.size_T / mean_T - 1) for each in slices], x**2 + y**2 <= 1
@@ -284,7 +282,6 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
     round_levels = MaxNLocator(nbins=6, steps=[1, 2, 5, 10]).tick_values(-largest, largest)
     *axes, last = figure.subplots(2, 2).ravel()
     for axis, each, deviation in zip(axes, slices, deviations, strict=True):
-        names = [name for name in "xyz" if name != each.across]
         axis.contourf(1e3 * each.first_m, 1e3 * each.second_m, deviation, levels, cmap="RdBu_r",
                       extend="both")
         lines = axis.contour(1e3 * each.first_m, 1e3 * each.second_m,
@@ -295,9 +292,7 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
         axis.add_patch(Ellipse(
             (middle[0], middle[1]), *(1e3 * float(np.ptp(own)) for own in (
                 each.first_m, each.second_m)), fill=False, ec="black", lw=0.8, ls="--"))
-        axis.set_aspect("equal")
-        axis.set_xlabel(f"{names[0]} in mm")
-        axis.set_ylabel(f"{names[1]} in mm")
+        _of_plane(axis, each.across)
     colours = ScalarMappable(Normalize(-largest, largest), "RdBu_r")
     last.set_axis_off()
     last.legend(handles=[Line2D([], [], color="black", lw=0.8, ls="--", label="the region")],
@@ -308,10 +303,15 @@ def slices_figure(slices: list[Slice], mean_T: float, largest: float | None = No
     return figure
 
 
+def _of_plane(axis: Axes, across: str) -> None:
+    """Label the axes of a plane, drawn to scale, that is across an axis of the magnet."""
+    first, second = (name for name in "xyz" if name != across)
+    axis.set(aspect="equal", xlabel=f"{first} in mm", ylabel=f"{second} in mm")
+
+
 def harmonics_figure(known: Homogeneity) -> Figure:
     """Draw the largest harmonics by degree, with error bars of two standard deviations."""
-    figure = figure_of(3.4)
-    axis = figure.subplots()
+    figure, axis = chart(3.4, grid=False)
     largest = sorted(sorted(range(len(known.harmonics)),
                             key=lambda number: -abs(known.harmonics[number].ppm))[:DRAWN])
     shown = [known.harmonics[number] for number in largest]
@@ -330,7 +330,7 @@ def harmonics_figure(known: Homogeneity) -> Figure:
 
 def page(found: HomogeneityResult) -> Page:
     """Return the page of the homogeneity of a magnet's field."""
-    name, best = list(found.by_name.items())[-1]
+    name, best = best_known(found.by_name)
     every, region = {**found.by_name, **found.of_map}, found.model.region.text
     rows, harmonics = homogeneity_rows(every), harmonic_rows(found)
     figures: dict[str, tuple[Callable[[], Figure], str]] = {"homogeneity.png": (
@@ -356,10 +356,10 @@ def page(found: HomogeneityResult) -> Page:
         "homogeneity", "homogeneity", found.magnet.study, answer(found),
         homogeneity_summary(found), [
             Section([remarks, Table(rows, "turned")], f"The field in {region}"),
-            *([Section([
+            Section([
                 "The largest ones, on the sphere's surface, in ppm of the mean field. "
                 f"{CONVENTION}.", Table(harmonics, "numbers"), Drawn("harmonics.png")],
-                "Spherical harmonics")] if harmonics else []),
+                "Spherical harmonics", about=harmonics),
             *sections_of_stray(found.stray_field, drawn=True)],
         {f"The field in {region}": rows, "Spherical harmonics in ppm of the mean field": harmonics,
          "Outside of the magnet": stray_rows(found.stray_field)},
@@ -374,7 +374,9 @@ def line_name(stray: StrayField) -> str:
     return f"{decimals(1e3 * stray.limit_T)}\u00a0mT line"
 
 
-def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Section]:
+def sections_of_stray(
+    stray: StrayField | None, drawn: bool = False, warning: Sequence[Text] = ()
+) -> list[Section]:
     """Return the section of a page about the field outside; none if there is nothing to say.
 
     ``drawn`` tells whether the figure of `stray_pictures` is in it.
@@ -388,7 +390,8 @@ def sections_of_stray(stray: StrayField | None, drawn: bool = False) -> list[Sec
             reach.sd_m for reach in (stray.radial, stray.axial) if reach) else
         " Without ± the standard deviation is below 0.5 mm."))
     rows = stray_rows(stray)
-    return [Section([said, Table(rows), *([Drawn(STRAY_FIGURE)] if drawn and rows else [])],
+    figure = [Drawn(STRAY_FIGURE)] if drawn and rows else []
+    return [Section([*warning, said, Table(rows), *figure],
                     f"Outside of the magnet: the {line_name(stray)}")]
 
 
@@ -442,7 +445,6 @@ def stray_figure(stray: StrayField) -> Figure:
     widest = 1e3 * (around * max(reached) if reached else max(
         float(np.abs(plane.first_m).max()) for plane in stray.planes))
     for axis, plane in zip(axes[:-1], stray.planes, strict=True):
-        names = [name for name in "xyz" if name != plane.across]
         first, second = 1e3 * plane.first_m, 1e3 * plane.second_m
         size = np.log(np.maximum(plane.size_T, min(*others_t, stray.limit_T) / 10))  # may be 0
         sides = [1e3 * reach.distance_m if reach else 0.0 for reach in (stray.radial, stray.axial)]
@@ -463,8 +465,8 @@ def stray_figure(stray: StrayField) -> Figure:
         if low < stray.limit_T < high:
             axis.contour(first, second, size, [np.log(stray.limit_T)], colors=POSTERIOR,
                          linewidths=2, linestyles="solid")
-        axis.set(aspect="equal", xlabel=f"{names[0]} in mm", ylabel=f"{names[1]} in mm",
-                 xlim=(-widest, widest), ylim=(-widest, widest))
+        _of_plane(axis, plane.across)
+        axis.set(xlim=(-widest, widest), ylim=(-widest, widest))
         axis.grid(alpha=0.3)
     _explain(axes[-1], stray)
     return figure

@@ -13,13 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
-from halbach_fe.report.inference_answer import answer, easy_axes
+from halbach_fe.report.inference_answer import along_easy_axes, answer, easy_axes
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
-from halbach_fe.report.multipoles import MultipoleTable, sections_of_circles, write_multipole_csv
+from halbach_fe.report.multipoles import MultipoleTable, multipole_csv, sections_of_circles
 from halbach_fe.report.page import (
     MEASURED,
     POSTERIOR,
@@ -27,7 +28,6 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     SMALL,
-    Drawn,
     Figures,
     Page,
     Rows,
@@ -35,8 +35,9 @@ from halbach_fe.report.page import (
     Table,
     Text,
     View,
+    chart,
     draw_by_slot,
-    figure_of,
+    last_sections,
     legend_above,
     magnet_panels,
 )
@@ -49,15 +50,16 @@ from halbach_fe.report.point_maps import (
     whitened_quantiles_figure,
 )
 from halbach_fe.report.words import (
+    capital,
     decimals,
     flux_density,
-    listed,
     magnet_rows,
     place_of,
     ppm,
     relative,
     rms,
     with_error,
+    with_unit,
 )
 from halbach_fe.response.homogeneity import PPM
 from halbach_fe.response.magnetic_axis import MagneticAxis
@@ -157,13 +159,13 @@ def stretch_table(result: InferenceResult) -> Rows:
 def left_out_section(result: InferenceResult) -> Section:
     """Return the section of what was left out as a whole; empty if nothing was."""
     left_out = left_out_table(result)
-    return Section([] if not left_out else [
+    return Section([
         "Readings that were left out as a whole, each map in turn or the ends of the only one, "
         "predicted by an update with all others. Held-out lines between other lines say nothing of "
         "that. The rms difference is that with the pose and the probe that only this map has "
         "fitted to it; chi² is 1 on average if the error bars hold.",
         Table(left_out), "And where it lies, along its longest axis:",
-        Table(stretch_table(result))], "Where nobody measured")
+        Table(stretch_table(result))], "Where nobody measured", about=left_out)
 
 
 def maps_figure(result: InferenceResult) -> Figure:
@@ -195,18 +197,23 @@ def axis_rows(axis: MagneticAxis | None) -> Rows:
             ("magnetic axis, d{}/dz", "mrad", "xy", axis.slope_rad, axis.slope_sd_rad),
             (f"roll about z{where}", "mrad", "z", [axis.roll_rad], [axis.roll_sd_rad])):
         if values is not None and bars is not None:
-            found |= {what.format(name): f"{with_error(1e3 * value, 1e3 * sd)}\u00a0{unit}"
+            found |= {what.format(name): with_unit(value, sd, unit)
                       for name, value, sd in zip(names, values, bars, strict=False)}
     return [{"of the updated magnet": what, "value": value} for what, value in found.items()]
 
 
-def definition(axis: MagneticAxis) -> str:
-    """Return how centre, axis and roll are defined for the magnet's order, in sentences."""
+def definition(axis: MagneticAxis | None) -> str:
+    """Return how centre, axis and roll are defined for the magnet's order, in sentences; empty
+    without an axis.
+    """
+    if axis is None:
+        return ""
     roll = ("The roll is the turn of the main multipole about z from that of the nominal magnet, "
             "right-handed; in a magnet of finite length in the mean along its middle half, "
             "weighted by the square of the field. The integral along z, whose roll shim states, "
             "has another one if rings are turned against each other. In the table of multipoles, "
-            "a of the main order says the same of one circle, with the other sign.")
+            "a of the main order says the same of one circle, with the other sign. ± is the "
+            "standard deviation.")
     if axis.order == 1:
         return ("A dipole has no axis. Its centre is the point near the middle, of a magnet of "
                 "finite length, where the gradient of the main component vanishes; a homogeneous "
@@ -217,14 +224,12 @@ def definition(axis: MagneticAxis) -> str:
                else ". ") + roll)
 
 
-NOTHING = "–"
-
 ALONE = "by the readings alone"
 """Head of a column of deviations along easy axes."""
 
 SHRUNK = (
     "± along the easy axis counts on what was known of the block before: one that is farther off "
-    f"than that is shown too near to the nominal one. “{ALONE[0].upper()}{ALONE[1:]}” leaves out "
+    f"than that is shown too near to the nominal one. “{capital(ALONE)}” leaves out "
     "what was known before of that block.")
 """What the columns of the table of blocks mean."""
 
@@ -256,7 +261,7 @@ def score_table(result: InferenceResult) -> Rows:
             "before, rms": flux_density(score.rms_error_prior_T, zeros=True),
             "after, rms": flux_density(score.rms_error_posterior_T, zeros=True),
             "after, of the largest reading": relative(score.rms_error_posterior_T / largest)
-            if largest else NOTHING,
+            if largest else EMPTY_CELL,
             "rms residual/sd": f"{score.rms_standardized_posterior:.3g}",
             "95 % band holds": _percent(score.coverage95_posterior),
             "chi²/reading, before": _chi2(
@@ -270,14 +275,14 @@ def score_table(result: InferenceResult) -> Rows:
         together = {"region": "together", "readings": f"{training.sum()} {TRAINING}".replace(
             " ", "\u00a0"), "before, rms": off[0], "after, rms": off[1],
             "chi²/reading, before": _chi2(result.prior_conflict)}
-        rows.append({name: together.get(name, NOTHING) for name in rows[0]})
+        rows.append({name: together.get(name, EMPTY_CELL) for name in rows[0]})
     if len({row["region"] for row in rows}) == 1:  # its name tells nothing
         rows = [{name: text for name, text in row.items() if name != "region"} for row in rows]
     return rows
 
 
 def _chi2(value: float | None) -> str:
-    return NOTHING if value is None else decimals(value)
+    return EMPTY_CELL if value is None else decimals(value)
 
 
 def block_table(result: InferenceResult) -> Rows:
@@ -318,7 +323,7 @@ def _by_readings(result: InferenceResult, directions: Floats, of: Floats) -> lis
         return []
     mean, sd = by_readings_alone(result.prior, result.posterior, directions)
     mean = of * (mean + directions @ (result.prior.mean - result.response.nominal))
-    return [f"{with_error(value, bar)}\u00a0%" if bar < 100 else NOTHING  # not even a whole block
+    return [f"{with_error(value, bar)}\u00a0%" if bar < 100 else EMPTY_CELL  # not a whole block
             for value, bar in zip(mean.tolist(), (of * sd).tolist(), strict=True)]
 
 
@@ -338,20 +343,18 @@ def page(result: InferenceResult) -> Page:
         "summary.json": lambda path: write_inference(result, path.parent),
         **dict.fromkeys(("prediction.csv", "posterior.h5"))}
     if multipoles:
-        files["multipoles.csv"] = partial(write_multipole_csv, result.study, multipoles)
+        files["multipoles.csv"] = multipole_csv(result.study, multipoles)
     return Page(
         "infer", "the updated magnet", result.study, answer(result, multipoles),
         inference_summary(result), [
-            Section(order := [*filter(None, [row_order_note(result.study)])]),
+            Section([order := row_order_note(result.study)]),
             Section([*doubtful, Table(block_table(result)), Text(SHRUNK, "small")],
                     "The blocks that deviate most"),
             _before_and_after(rows), *_sections_of_maps(result),
             Section([View(lambda: view_of_inference(result), colours_in_words(result))]),
-            Section([] if result.magnetic_axis is None else [
-                *doubtful, f"{definition(result.magnetic_axis)} ± is the standard deviation.",
-                Table(axis)], "Magnetic centre, axis and roll"),
-            *(Section([*doubtful, *section.parts], section.title)
-              for section in sections_of_stray(stray)),
+            Section([*doubtful, definition(result.magnetic_axis), Table(axis)],
+                    "Magnetic centre, axis and roll", about=axis),
+            *sections_of_stray(stray, warning=doubtful),
             *sections_of_circles(
                 multipoles, result.study, "They are those of the readings on the circle about the "
                 "axis of the magnet, where the study says that the map lies. With m readings, "
@@ -359,8 +362,7 @@ def page(result: InferenceResult) -> Page:
                 "blocks make it in vacuum. Their error bars take the solver's error of every "
                 "reading in full: `halbach-fe multipoles` takes as many points as are needed, and "
                 "has smaller bars.", " ± is the standard deviation.", doubtful),
-            Section([*map(Drawn, [*figures][1:])], "Pictures"),
-            Section([Table(_model_table(result))], "Model")],
+            *last_sections(figures, _model(result))],
         {"Differences of readings and predictions": rows,
          "The instruments, estimated with the blocks": term_table(result),
          "Where the maps lie in the magnet": pose_table(result),
@@ -368,7 +370,7 @@ def page(result: InferenceResult) -> Page:
          "Where nobody measured": left_out_table(result),
          "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
-        remarks=order,
+        remarks=[order],
         new_study=None if result.terms is None and result.study_as_found is result.study else (
             STUDY_FILE, lambda: [(result.study_as_found, NOTE)]))
 
@@ -466,26 +468,26 @@ def _sections_of_maps(result: InferenceResult) -> list[Section]:
                          "" if result.study_as_found is result.study else
                          f" {STUDY_FILE} has them as found."))
     return [
-        Section([] if not overlaps else [
+        Section([
             "Where two maps overlap, the readings of one are compared with what an update by the "
             "other alone predicts there. chi² is 1 on average if they are of the same magnet, and "
             "pose, probe and noise are as stated or uncertain.", Table(overlaps)],
-            "Do the maps agree?"),
+            "Do the maps agree?", about=overlaps),
         left_out_section(result),
-        Section([] if not poses else ["In the magnet's axes, as the update found it.",
-                                      Table(poses)], "Where the maps lie"),
-        Section([] if not terms else [" ".join(found), Table(terms)], "The instruments")]
+        Section(["In the magnet's axes, as the update found it.", Table(poses)],
+                "Where the maps lie", about=poses),
+        Section([" ".join(found), Table(terms)], "The instruments", about=terms)]
 
 
-def _model_table(result: InferenceResult) -> Rows:
-    """Return rows of text: how the update was made, and of what magnet."""
+def _model(result: InferenceResult) -> dict[str, str]:
+    """Return how the update was made, and of what magnet."""
     study, noise = result.study, result.noise
     sizes = dict.fromkeys(flux_density(float(end), 2) for end in (noise.sd.min(), noise.sd.max()))
     positions = study.noise.position_sd_m if study.noise else None
     moved = "" if not positions else (
         f"; sd of positions {', '.join(f'{1e3 * sd:.3g}' for sd in positions)} mm")
     blocks = result.measured_blocks
-    return listed({
+    return {
         "method of inference": result.kind, **magnet_rows(result.magnet),
         "finite-element method": study.solver.method,
         "unknown magnetizations, readings":
@@ -497,7 +499,7 @@ def _model_table(result: InferenceResult) -> Rows:
         "error of the finite elements": _solver_error(result),
         "superposition of the blocks":
             f"right to {ppm(PPM * float(result.response.superposition_error))} ppm of what "
-            "permeable blocks and iron add to their fields"})
+            "permeable blocks and iron add to their fields"}
 
 
 def _contraction(result: InferenceResult) -> Floats:
@@ -516,7 +518,7 @@ def _solver_error(result: InferenceResult) -> str:
 
 
 def _percent(value: float | None) -> str:
-    return NOTHING if value is None else f"{100 * value:.3g}\u00a0%"
+    return EMPTY_CELL if value is None else f"{100 * value:.3g}\u00a0%"
 
 
 def _figure_height(rings: int) -> float:
@@ -526,15 +528,9 @@ def _figure_height(rings: int) -> float:
 
 def _magnetization_change_figure(result: InferenceResult) -> Figure:
     """Draw the change of each magnetization along the easy axis, from nominal to posterior."""
-    nominal = result.by_block(result.response.nominal)
-    shift = result.by_block(result.posterior.mean - result.response.nominal)
-    length = np.linalg.norm(nominal, axis=1)
-    length[length == 0] = np.nan  # the place of a missing block is left blank
-    along = np.einsum("ij,ij->i", shift, nominal) / length**2
-    picture = 100 * result.magnet.by_ring(along)
+    picture = 100 * result.magnet.by_ring(along_easy_axes(result))  # blank for missing blocks
     rings, slots = picture.shape
-    figure = figure_of(_figure_height(rings))
-    axis = figure.subplots()
+    figure, axis = chart(_figure_height(rings), grid=False)
     limit = float(np.nanmax(np.abs(picture), initial=0.0)) or 1.0
     image = draw_by_slot(axis, picture, cmap="RdBu_r", vmin=-limit, vmax=limit)
     axis.add_patch(Rectangle((0.5, 0.5), slots, rings, fill=False))
@@ -557,12 +553,10 @@ def _contraction_in_words(result: InferenceResult, contraction: Floats) -> str:
 
 def _contraction_figure(result: InferenceResult) -> Figure:
     """Draw the contraction of each block: as bars for a single ring, else by ring and slot."""
-    percent = 100 * result.magnet.by_ring(
-        result.contraction)
+    percent = 100 * result.magnet.by_ring(result.contraction)
     rings = len(percent)
     slots = np.arange(1, percent.shape[1] + 1)
-    figure = figure_of(3 if rings == 1 else _figure_height(rings))
-    axis = figure.subplots()
+    figure, axis = chart(3 if rings == 1 else _figure_height(rings), grid=False)
     axis.set(xlabel="slot", xticks=slots[::max(1, len(slots) // 24)])
     if rings == 1:
         there = ~np.isnan(percent[0])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.result import HELD_OUT, HELD_OUT_MAP, InferenceResult, far_in_words
 from halbach_fe.report.answer import STATE_NOISE, Answer
 from halbach_fe.report.multipoles import MultipoleTable, main_field_in_words
@@ -19,6 +19,7 @@ from halbach_fe.report.words import (
     place_of,
     rms,
     with_error,
+    with_unit,
 )
 from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.types import COMPONENTS
@@ -187,9 +188,8 @@ def _sd_of_place(result: InferenceResult, number: int) -> Floats:
                  if one.name == result.maps[number]), None)
     if pose is None:
         return np.zeros(3)
-    x, y, z = result.field.places[number] - pose.middle_m
-    arms = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
-    return np.asarray(np.sqrt(np.square(pose.middle_sd_m) + arms**2 @ np.square(pose.turn_sd_rad)))
+    return np.hypot(pose.middle_sd_m, moved_by_turns(
+        result.field.places[number] - pose.middle_m, np.array(pose.turn_sd_rad)))
 
 
 def _numbers(values: Floats, form: str) -> str:
@@ -217,7 +217,7 @@ def _prediction(result: InferenceResult) -> str:
             f"The 95 % band holds {fraction(held)} of them.")
 
 
-def _tested(result: InferenceResult) -> tuple[str | None, NDArray[np.bool_]]:
+def _tested(result: InferenceResult) -> tuple[str | None, Bools]:
     """Return the part of the readings that the update has not seen, and a mask (readings,) of it;
     None and all readings if it has seen all.
     """
@@ -256,12 +256,22 @@ def easy_axes(result: InferenceResult) -> tuple[Ints, Floats, Floats]:
     return there, nominal[there] / size[there, None], size[there]
 
 
+def along_easy_axes(result: InferenceResult) -> Floats:
+    """Return the changes (blocks,) from nominal along the easy axes, relative to the nominal
+    magnetizations; NaN for missing blocks.
+    """
+    there, axes, size = easy_axes(result)
+    found = np.full(len(result.magnet.blocks), np.nan)
+    found[there] = np.einsum("ij,ij->i", result.by_block(
+        result.posterior.mean - result.response.nominal)[there], axes) / size
+    return found
+
+
 def _blocks(result: InferenceResult, start: str = (
         "Along their easy axes the blocks deviate from the study")) -> str:
     """Say how the magnetizations along the easy axes deviate from the nominal ones."""
     there, axes, size = easy_axes(result)
-    mean = np.einsum("ij,ij->i", result.by_block(
-        result.posterior.mean - result.response.nominal)[there], axes) / size
+    mean = along_easy_axes(result)[there]
     worst = int(np.argmax(np.abs(mean)))
     row = np.zeros((1, len(result.posterior.mean)))
     result.by_block(row[0])[there[worst]] = axes[worst] / size[worst]
@@ -273,9 +283,9 @@ def _blocks(result: InferenceResult, start: str = (
                 f"{start} by {sign}{decimals(100 * mean[worst], 2)}\u00a0%.")
     if mean[worst] < -1:
         return (f"{start}, which is reversed: magnetized the other way round, with "
-                f"{with_error(-100 * (1 + mean[worst]), 100 * sd)}\u00a0% of its strength.")
+                f"{with_unit(-(1 + mean[worst]), sd, '%')} of its strength.")
     return (f"{start} by {'+' if mean[worst] > 0 else ''}"
-            f"{with_error(100 * mean[worst], 100 * sd)}\u00a0%.")
+            f"{with_unit(mean[worst], sd, '%')}.")
 
 
 def _field(size: float) -> str:

@@ -17,8 +17,9 @@ from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
-from halbach_fe.geometry.outline import Edge, outline_contains
+from halbach_fe.geometry.outline import Edge, at_heights, outline_contains
 from halbach_fe.inference.result import InferenceResult
+from halbach_fe.report.inference_answer import along_easy_axes, easy_axes
 from halbach_fe.report.page import IRON, MEASURED, SECOND, Plain
 from halbach_fe.report.words import flux_density, place_of
 from halbach_fe.solver.exact_block_field import field_of
@@ -190,8 +191,8 @@ class ViewPoints:
         Title of the colour scale.
     words : str
         Text that appears when the pointer is over a point; %{customdata} stands for its value.
-    limits : tuple of float
-        Ends of the colour scale, which are magnitudes.
+    limits : tuple of float, or None
+        Ends of the colour scale, which are magnitudes; by default those of the values.
     """
 
     positions: Floats
@@ -199,24 +200,28 @@ class ViewPoints:
     name: str
     title: str
     words: str
-    limits: tuple[float, float]
+    limits: tuple[float, float] | None = None
 
 
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
     """Return points (n, 3) in m that are coloured by the magnitude of a field B (n, 3) in T."""
-    magnitude = np.linalg.norm(flux_density, axis=1)
-    magnitude *= 1e3
-    return ViewPoints(positions, magnitude, "points", "|B| in mT", "|B| = %{customdata:.5g} mT",
-                      (float(magnitude.min()), float(magnitude.max())))
+    return ViewPoints(positions, 1e3 * np.linalg.norm(flux_density, axis=1), "points",
+                      "|B| in mT", "|B| = %{customdata:.5g} mT")
 
 
 def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
     """Return the view of a nominal magnet and the points of a map, `MOST_POINTS` at most."""
-    magnetization = np.array([block.magnetization[:magnet.dimension] for block in magnet.blocks])
     count = len(points.positions)
     drawn = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
-    return magnet_view(magnet, BlockValues(magnetization), replace(
-        points, positions=points.positions[drawn], values=points.values[drawn]))
+    return magnet_view(
+        magnet, BlockValues(magnet.nominal_magnetization.reshape(len(magnet.blocks), -1)), replace(
+            points, positions=points.positions[drawn], values=points.values[drawn],
+            limits=_limits(points)))
+
+
+def _limits(points: ViewPoints) -> tuple[float, float]:
+    """Return the ends of the colour scale of points."""
+    return points.limits or (float(points.values.min()), float(points.values.max()))
 
 
 def view_of_inference(
@@ -226,20 +231,15 @@ def view_of_inference(
 
     ``named`` are ring and slot of blocks whose numbers are written beside them.
     """
-    nominal = result.by_block(result.response.nominal)
-    length = np.linalg.norm(nominal, axis=1)
-    there = length > 0  # the change of a missing block is shown as 0
-    length[~there] = 1.0
-    easy = nominal / length[:, None]
-    mean = result.by_block(result.posterior.mean)
-    number = np.arange(len(easy) + 1)
-    along = sparse.csr_array(sparse.bsr_array((easy[:, None], number[:-1], number)))
-    along.resize(len(easy), len(result.posterior.mean))  # variations in blocks do not count
-    change = 100 * np.einsum("ij,ij->i", mean - nominal, easy) / length
-    sd = 100 * result.posterior.sd_of(along) / length
-    values = BlockValues(mean, Colours(change, "posterior change<br>along the easy axis in %", [
-        f"{percent:+.2f} ± {error:.2f} % along the easy axis" if magnetized else "missing"
-        for percent, error, magnetized in zip(change, sd, there, strict=True)]))
+    there, axes, size = easy_axes(result)
+    along = sparse.csr_array(sparse.bsr_array((axes[:, None], there, np.arange(len(there) + 1))))
+    along.resize(len(there), len(result.posterior.mean))  # variations in blocks do not count
+    sd = 100 * result.posterior.sd_of(along) / size
+    change, words = 100 * along_easy_axes(result), ["missing"] * len(result.magnet.blocks)
+    for number, error in zip(there.tolist(), sd, strict=True):
+        words[number] = f"{change[number]:+.2f} ± {error:.2f} % along the easy axis"
+    values = BlockValues(result.by_block(result.posterior.mean), Colours(
+        np.nan_to_num(change), "posterior change<br>along the easy axis in %", words))
     scores = result.standardized(result.prediction_posterior)
     points = (residual_points(result.observation.positions, scores)
               if any(result.observation.components) else None)
@@ -309,7 +309,7 @@ def magnet_view(
                         *_arrow_traces(blocks, values, [corners for corners, _ in bodies])])
     for number, body in enumerate(magnet.iron):  # one entry of the legend for all of them
         figure.add_trace(_iron_trace(body, _prism_height(magnet)).update(showlegend=not number))
-    if found := [block for block in magnet.blocks if (block.ring, block.slot) in named]:
+    if found := [block for block in magnet.blocks if block.place in named]:
         figure.add_trace(_named_trace(found, max(
             float(np.nanmax(np.hypot(trace.x, trace.y))) for trace in figure.data
             if trace.x is not None and len(trace.x))))
@@ -511,8 +511,7 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     ahead = (ring + 1) % count
     sides = np.vstack([np.column_stack([ring, ahead, ahead + count]),
                        np.column_stack([ring, ahead + count, ring + count])])
-    corners = np.vstack([np.column_stack([flat, np.full(count, z)]) for z in (low, high)])
-    return block.from_frame(corners), np.vstack([face, face + count, sides])
+    return block.from_frame(at_heights(flat, low, high)), np.vstack([face, face + count, sides])
 
 
 def _triangles(outline: tuple[Edge, ...], flat: Floats) -> Ints:
@@ -540,7 +539,7 @@ def _arrow_traces(
     """Return arrows of the magnetization on the upper faces of the blocks with these corners."""
     # Largest number of blocks whose arrows have heads; more would make the page slow.
     most_cones = 2000
-    middles = np.array([[*(block.middle + block.displacement_m)[:2], own[:, 2].max()]
+    middles = np.array([[*block.mounted_middle[:2], own[:, 2].max()]
                         for block, own in zip(blocks, corners, strict=True)])
     vectors = np.zeros((len(blocks), 3))
     vectors[:, :values.magnetization.shape[1]] = values.magnetization
@@ -576,7 +575,7 @@ def _iron_trace(body: IronSolid, height: float) -> go.Surface | go.Mesh3d:
 def _points_trace(points: ViewPoints) -> go.Scatter3d:
     """Return the points of the map as markers."""
     x, y, z = points.positions.T
-    low, high = points.limits
+    low, high = _limits(points)
     return go.Scatter3d(
         x=x, y=y, z=z, mode="markers", name=points.name, customdata=points.values,
         hovertemplate=f"(%{{x:.1f}}, %{{y:.1f}}, %{{z:.1f}}) mm<br>{points.words}<extra></extra>",

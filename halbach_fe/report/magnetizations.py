@@ -19,10 +19,10 @@ from halbach_fe.report.page import (
     Page,
     Section,
     Table,
-    figure_of,
+    charts,
     legend_above,
 )
-from halbach_fe.report.words import decimals, fraction, rms
+from halbach_fe.report.words import best_known, capital, decimals, fraction, rms
 from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.study.types import COMPONENTS
 
@@ -53,7 +53,7 @@ def answer(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats) -> Answ
     Error bars hold if the rms of error over standard deviation is within three of its standard
     deviations of 1.
     """
-    (before, *_), (name, best) = known.values(), list(known.items())[-1]
+    (before, *_), (name, best) = known.values(), best_known(known)
     size = float(np.sqrt(np.mean(truth**2) * magnet.dimension))
     _, left, ratio = error_summary(best, truth).values()
     first = error_summary(before, truth)["rms_error_A_per_m"]
@@ -61,7 +61,7 @@ def answer(magnet: Magnet, known: Mapping[str, Gaussian], truth: Floats) -> Answ
     sound = abs(ratio - 1) <= 3 * spread
     return Answer(
         "How near are the inferred magnetizations to the true ones?",
-        f"{name[0].upper()}{name[1:]}: {1e-3 * left:.2g} kA/m rms in each component, "
+        f"{capital(name)}: {1e-3 * left:.2g} kA/m rms in each component, "
         f"{fraction(left / size)} of a block's magnetization. Before the readings it was "
         f"{1e-3 * first:.2g} kA/m.",
         ("Yes: the" if sound else "No: the") + f" errors are {decimals(ratio, 2)} times the stated "
@@ -101,7 +101,7 @@ def page(
                for key, value in (figures or {}).items()]
     return Page("magnetizations", what, magnet.study, answer(magnet, known, truth), {}, [
         Section([Table(rows, "numbers")]),
-        Section([Table(further, "numbers")] if further else [], "Further numbers")], rows=rows,
+        Section([Table(further, "numbers")], "Further numbers", about=further)], rows=rows,
         figures={"magnetizations.png": (
             partial(_magnetizations_figure, magnet, known, truth, ring), f"Deviation of the "
             f"magnetizations of ring {ring} from nominal: truth, {', '.join(known)}; bars are "
@@ -115,25 +115,19 @@ def _magnetizations_figure(
     size = magnet.dimension
     first, slots = sum(magnet.blocks_by_ring[:ring - 1]), magnet.blocks_by_ring[ring - 1]
     part = slice(first * size, (first + slots) * size)
-    blocks = magnet.blocks[first:first + slots]
-    nominal = np.concatenate([block.magnetization[:size] for block in blocks])
-    figure = figure_of(1 + 2.4 * size)
-    axes = figure.subplots(size, 1, sharex=True)
+    nominal = magnet.nominal_magnetization[part]
+    figure, axes = charts(1 + 2.4 * size, size, sharex=True)
     places = np.arange(1, slots + 1)
     shifts = 0.3 * np.linspace(-0.5, 0.5, len(known))
-    for axis, component in zip(axes, range(size), strict=True):
-        def in_kiloamperes_per_m(values: Floats, component: int = component) -> Floats:
-            return np.asarray(1e-3 * values[component::size])
-
+    for number, axis in enumerate(axes):
         for (name, distribution), colour, shift in zip(
                 known.items(), (PRIOR, POSTERIOR, SECOND), shifts, strict=False):
-            axis.errorbar(places + shift, in_kiloamperes_per_m(distribution.mean[part] - nominal),
-                          in_kiloamperes_per_m(distribution.sd[part]), color=colour, fmt="o", ms=4,
+            axis.errorbar(places + shift, 1e-3 * (distribution.mean[part] - nominal)[number::size],
+                          1e-3 * distribution.sd[part][number::size], color=colour, fmt="o", ms=4,
                           capsize=2, label=name)
-        axis.plot(places, in_kiloamperes_per_m(truth[part] - nominal), "_", color=MEASURED, ms=14,
+        axis.plot(places, 1e-3 * (truth[part] - nominal)[number::size], "_", color=MEASURED, ms=14,
                   mew=2, label="truth", zorder=3)
-        axis.set_ylabel(f"ΔM{COMPONENTS[component]} in kA/m")
-        axis.grid(alpha=0.3)
+        axis.set_ylabel(f"ΔM{COMPONENTS[number]} in kA/m")
     legend_above(figure, axes[0], columns=4)
     axes[-1].set_xlabel("slot")
     axes[-1].set_xticks(places)

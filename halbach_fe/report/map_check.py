@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
+from halbach_fe.core.numbers import first_of
 from halbach_fe.measurement.field_map import points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import (
     SCATTERED_M,
@@ -44,12 +45,14 @@ from halbach_fe.report.page import (
 from halbach_fe.report.point_maps import draw, panels
 from halbach_fe.report.words import (
     by_axis,
+    capital,
     decimals,
     flux_density,
     in_a_row,
     point_mm,
     relative,
     with_error,
+    with_unit,
 )
 from halbach_fe.study.types import COMPONENTS
 
@@ -176,7 +179,7 @@ def total_page(data: xr.Dataset, check: TotalCheck) -> Page:
         files = {"oriented_map.csv": partial(write_map, maps["oriented_map"])}
     found = total_sentences(check)
     return Page("check", TITLE, None, total_answer(check), check.plain() | _hashes(maps),
-                [Section([Items(found)] if found else [])], remarks=found, files=files)
+                [Section([Items(found)])], remarks=found, files=files)
 
 
 def _on_a_stage(check: MapCheck) -> bool:
@@ -227,8 +230,7 @@ def _noise(check: MapCheck, keys: bool = False) -> str:
 def _length(size: float, sd: float = 0.0) -> str:
     """Return a length in m, and its standard deviation, in µm, or in mm from 1 mm on."""
     unit, factor = ("mm", 1e3) if size >= 1e-3 else ("µm", 1e6)
-    text = with_error(factor * size, factor * sd) if sd else decimals(factor * size, 2)
-    return f"{text}\u00a0{unit}"
+    return with_unit(size, sd, unit) if sd else f"{decimals(factor * size, 2)}\u00a0{unit}"
 
 
 def _range(low: float, high: float) -> str:
@@ -302,8 +304,7 @@ OPEN_SIGN = (
 def _numbers(rows: Sequence[int]) -> str:
     """Return the numbers of some rows, the first ones of many."""
     rows_named = 10  # number of broken rows that are listed by number
-    more = f" and {len(rows) - rows_named} more" if len(rows) > rows_named else ""
-    return f"{', '.join(map(str, rows[:rows_named]))}{more}"
+    return first_of([*map(str, rows)], rows_named)
 
 
 BROKEN = {"zero": "all components are zero",
@@ -469,19 +470,19 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
         found.append(doubt)
     return Page(
         "check", TITLE, None, answer(check), check_summary(data, check), [
-            Section([*([Items(found)] if found else []), Text(
+            Section([Items(found), Text(
                 f"{check.readings} readings at {check.points} points, "
                 f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "
                 "compared with the field of sources outside the mapped region. A map by itself "
                 "cannot show a common factor or sign of all components, a uniform offset, a shift "
                 "of the whole map, or a position axis that counts backwards.", "small")]),
-            Section([Table(rows, "numbers"), *(Text(text, "small") for text in [
-                weighted_note(check)] if text)], "What remains"),
+            Section([Table(rows, "numbers"), Text(weighted_note(check), "small")],
+                    "What remains"),
             Section(["Distances of the sensors are along the axes of the stage, and turns of the "
                      "probe are against them; all belong to the components as they were found "
                      "above.", Table(instrument)] if instrument else
                     ["This map determines no error of the probe."], "The instrument"),
-            Section([Text(said, "small")] if said else [], "What was not asked or left out", True)],
+            Section([Text(said, "small")], "What was not asked or left out", True, said)],
         {"The instrument, by the map alone": instrument}, rows, {
             "check_maps.png": (
                 partial(_maps, points, np.asarray(data["B_T"].values), check), "The map: every "
@@ -570,7 +571,7 @@ def joined_answer(joined: JoinedMaps) -> Answer:
     said = "; ".join(
         f"the middle of {pose.name} is {point_mm(pose.shift_m, pose.shift_sd_m)}\u00a0mm from "
         f"where it would be if its stage were that of {first}" for pose in joined.poses)
-    said = (f"{said[0].upper()}{said[1:]}." if joined.agree else
+    said = (f"{capital(said)}." if joined.agree else
             f"If they are of one field, {said}.")
     worst = max(joined.overlaps, key=lambda one: one.chi2)
     turned, undetermined = [pose.name for pose in joined.poses if pose.is_turned], _open(joined)
@@ -648,7 +649,7 @@ def joined_page(maps: Mapping[str, xr.Dataset], joined: JoinedMaps) -> Page:
     summary = joined.plain() | _hashes(maps) | {"joined_sha256": readings_sha256(joined.data)}
     return Page(
         "check", "Field maps, joined", None, joined_answer(joined), summary, [
-            Section([*([Items(found)] if found else []), Text(
+            Section([Items(found), Text(
                 "No magnet is assumed. One field of sources outside all maps was fitted to them "
                 "together with their relative poses; each map was checked by itself before.",
                 "small")]),

@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.api import MultipoleTables
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.files import atomic
 from halbach_fe.core.numbers import in_a_row
-from halbach_fe.measurement.tables import write_csv
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
 from halbach_fe.report.page import (
     POSTERIOR,
@@ -27,11 +25,20 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
-    figure_of,
+    charts,
+    csv_file,
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import decimals, faults_in_words, probability, with_error
+from halbach_fe.report.words import (
+    best_known,
+    capital,
+    decimals,
+    faults_in_words,
+    probability,
+    with_error,
+    with_unit,
+)
 from halbach_fe.response.multipoles import (
     DEFAULT_ORDERS,
     MultipoleModel,
@@ -92,8 +99,7 @@ def multipole_figure(
     magnets: Mapping[str, Multipoles], limit: float | None, unit: str = "units of 1e-4",
 ) -> Figure:
     """Draw b_n and a_n of magnets by name, with error bars of two standard deviations."""
-    figure = figure_of(3.8)
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = charts(3.8, 1, 2, sharey=True)
     orders = next(iter(magnets.values())).orders
     place = np.arange(len(orders))
     # horizontal distance between the markers of different magnets at the same order
@@ -109,15 +115,14 @@ def multipole_figure(
             axis.axhline(sign * (limit or 0.0), color=PUBLISHED, lw=0.8, ls="--",
                          label="limit of |c_n|" if sign > 0 else None)
         axis.set_xticks(place, [f"{letter}$_{{{order}}}$" for order in orders])
-        axis.grid(alpha=0.3)
     axes[0].set_ylabel(unit)
     if limit is not None or len(magnets) > 1 or "" not in magnets:
         legend_above(figure, axes[1], columns=4)
     return figure
 
 
-def write_multipole_csv(study: Study, tables: Sequence[MultipoleTable], path: Path) -> None:
-    """Write multipoles.csv, with a row per magnet, reference and order."""
+def multipole_csv(study: Study, tables: Sequence[MultipoleTable]) -> Callable[[Path], None]:
+    """Return how multipoles.csv is written, with a row per magnet, reference and order."""
     rows = [{"magnet": name, "where": _location(model), "radius_m": model.radius,
              "z_m": np.nan if model.z is None else model.z, "n": row["n"], "b_units": row["b"],
              "b_sd_units": row["b_sd"], "a_units": row["a"], "a_sd_units": row["a_sd"],
@@ -125,16 +130,15 @@ def write_multipole_csv(study: Study, tables: Sequence[MultipoleTable], path: Pa
             for model, magnets in tables for name, known in magnets.items()
             for row in known.table()]
     radii = dict.fromkeys(model.radius for model, _ in tables)
-    with atomic(path) as temporary:
-        write_csv({key: [row[key] for row in rows] for key in rows[0]}, {
-            "study": study.name, "convention": CONVENTION
-            + "; local ones are the Fourier coefficients of B_r on the circle, sum A_n cos(n phi) "
-            "+ B_n sin(n phi)" * any(_location(model) == "local" for model, _ in tables),
-            "reference_radius_m": ", ".join(f"{radius:g}" for radius in radii),
-            "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
-            "which the nominal one is normal",
-            "axes_turned_by_rad": ", ".join(dict.fromkeys(
-                f"{model.turn:.9g}" for model, _ in tables))}, temporary)
+    return csv_file({key: [row[key] for row in rows] for key in rows[0]}, {
+        "study": study.name, "convention": CONVENTION
+        + "; local ones are the Fourier coefficients of B_r on the circle, sum A_n cos(n phi) "
+        "+ B_n sin(n phi)" * any(_location(model) == "local" for model, _ in tables),
+        "reference_radius_m": ", ".join(f"{radius:g}" for radius in radii),
+        "units": f"1e-4 of the main multipole, of order {tables[0][0].main}, along axes in "
+        "which the nominal one is normal",
+        "axes_turned_by_rad": ", ".join(dict.fromkeys(
+            f"{model.turn:.9g}" for model, _ in tables))})
 
 
 def _location(model: MultipoleModel) -> str:
@@ -157,7 +161,7 @@ def main_field_in_words(tables: Sequence[MultipoleTable]) -> str:
     if not tables:
         return ""
     model, magnets = middle_circle(tables)
-    known = list(magnets.values())[-1]
+    _, known = best_known(magnets)
     circle = f"r = {1e3 * model.radius:.4g}\u00a0mm"
     local = model.z is not None
     where = (f"On the circle {circle} at z = {1e3 * model.z:.4g}\u00a0mm" if model.z is not None
@@ -223,10 +227,10 @@ def answer(
     said = " ".join(_largest(table, limit, alone=len(tables) == 1) for table in tables)
     question = "Which unwanted multipoles does the field have?"
     said += only_of_orders(tables[0][0])
-    lacking = [lacks_main(list(magnets.values())[-1]) for _, magnets in tables]
+    lacking = [lacks_main(best_known(magnets)[1]) for _, magnets in tables]
     if all(lacking):
         return of_no_main(question, said, "Only as absolute numbers", "multipoles STUDY",
-                          list(tables[0][1].values())[-1])
+                          best_known(tables[0][1])[1])
     if any(lacking):
         said += " Where there is no main multipole, units of 1e-4 of it mean nothing."
     if not measured:
@@ -260,7 +264,7 @@ def at_z(model: object) -> str:
 
 def multipole_rows(magnets: Mapping[str, Multipoles]) -> Rows:
     """Return the rows of `text_table`, with |c_n| of the last magnet, which the answer states."""
-    name, known = list(magnets.items())[-1]
+    name, known = best_known(magnets)
     rows = text_table(**magnets)
     return [row | {f"|c_n| {name}": (
         "main" if "main" in row.values() else with_error(float(size), float(sd)))}
@@ -335,7 +339,7 @@ def lacks_main(known: Multipoles) -> bool:
 def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
     """Describe the last magnet of a table, which is the best known of them, in sentences."""
     model, magnets = table
-    known = list(magnets.values())[-1]
+    _, known = best_known(magnets)
     spread = _size_sd(known)
     worst = int(np.argmax(np.hypot(known.sizes, spread)))  # of nominal magnets all means are small
     sd = float(spread[worst])
@@ -344,8 +348,7 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
         spread = _size_sd(others)
         worst = int(np.argmax(np.hypot(others.sizes, spread)))
         size, own = (1e3 * float(each[worst]) for each in (others.sizes, spread))
-        place = place_of(model)
-        return (f"{place[0].upper()}{place[1:]}: there is no main multipole, of order "
+        return (f"{capital(place_of(model))}: there is no main multipole, of order "
                 f"{model.main}, but for errors of the blocks, {main_in_words(model, known)}. "
                 f"The largest other one, of order {known.orders[worst]}, is "
                 f"{with_error(size, own)}\u00a0µ{model.unit} itself.")
@@ -353,7 +356,7 @@ def _largest(table: MultipoleTable, limit: float | None, alone: bool) -> str:
         "Of the field integrated along z, " if model.integrated else f"On {place_of(model)}, ")
     start = f"{where}the largest unwanted multipole " + (
         "is that" if known.sizes[worst] > sd else "is not known: it may be that")
-    text = (f"{start[0].upper()}{start[1:]} of order {known.orders[worst]} with "
+    text = (f"{capital(start)} of order {known.orders[worst]} with "
             f"{with_error(float(known.sizes[worst]), sd)} units, which are 1e-4 of the main one, "
             f"{main_in_words(model, known)}.")
     if limit is not None:
@@ -373,7 +376,7 @@ def place_of(model: MultipoleModel) -> str:
 
 def main_in_words(model: MultipoleModel, known: Multipoles) -> str:
     """Return the main multipole and its standard deviation in mT, or mT m if integrated."""
-    return f"{with_error(1e3 * known.main, 1e3 * known.main_sd)}\u00a0m{model.unit}"
+    return with_unit(known.main, known.main_sd, f"m{model.unit}")
 
 
 def page(found: MultipoleTables) -> Page:
@@ -383,7 +386,7 @@ def page(found: MultipoleTables) -> Page:
     tables: dict[str, Rows] = {}
     for model, magnets in found.tables:
         limit, unit, file = found.limit, "units of 1e-4", f"multipoles_{_location(model)}.png"
-        if lacks := lacks_main(list(magnets.values())[-1]):
+        if lacks := lacks_main(best_known(magnets)[1]):
             limit, unit = None, f"m{model.unit}"
             magnets = {name: known.absolute for name, known in magnets.items()}
         where = ("integrated along z" if model.integrated else
@@ -399,6 +402,6 @@ def page(found: MultipoleTables) -> Page:
         "multipoles", "multipoles", study,
         answer(found.tables, found.limit, found.disagreement, study),
         _summary(study, found.tables, found.limit),
-        [*sections, Section([*found.left_out, *linearized(study)])], tables, figures=figures,
+        [*sections, Section([*found.left_out, linearized(study)])], tables, figures=figures,
         shown=tuple(figures),
-        files={"multipoles.csv": partial(write_multipole_csv, study, found.tables)})
+        files={"multipoles.csv": multipole_csv(study, found.tables)})

@@ -34,13 +34,14 @@ from tomlkit.items import Array, Trivia, Whitespace
 
 import halbach_fe
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
 from halbach_fe.core.result_folder import result_folder
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
+from halbach_fe.geometry.outline import along_edges, at_heights
 from halbach_fe.measurement.campaign import with_paths_from
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.measurement.tables import write_csv
@@ -53,7 +54,7 @@ from halbach_fe.report.answer import (
     inputs_of_command,
     write_record,
 )
-from halbach_fe.report.words import faults_in_words
+from halbach_fe.report.words import faults_in_words, listed
 from halbach_fe.study.model import Study, is_nonlinear
 from halbach_fe.study.reader import read_study
 from halbach_fe.study.study_file import study_text, write_edited
@@ -62,6 +63,7 @@ from halbach_fe.study.study_file import study_text, write_edited
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 SECOND, THIRD = "#009E73", "#CC79A7"
 IRON = "#56B4E9"
+OF_COMPONENTS = (POSTERIOR, PRIOR, SECOND)
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
@@ -79,6 +81,9 @@ own_style = style.context("default")
 """Decorator of functions that draw figures, in matplotlib's style instead of the user's, which may
 need LaTeX, or a font that is not there."""
 
+
+LISTED = 12
+"""Number of rows that a page or the terminal lists of many: the largest ones, or the first."""
 
 Rows = list[dict[str, str]]
 """Rows of text, each by the names of its columns."""
@@ -133,11 +138,14 @@ class Section:
     """Texts, tables and figures of a page in their order."""
 
     parts: Sequence[str | Text | Items | Table | Drawn | View | Callable[[], Markup]]
-    """A plain string is a paragraph; a function returns HTML that only the page has."""
+    """A plain string is a paragraph; a function returns HTML that only the page has. What has no
+    text is not shown."""
     title: str = ""
     """What stands above them; empty if nothing does."""
     folded: bool | None = None
     """Whether the section is folded until it is clicked on; None if it cannot be folded."""
+    about: object = True
+    """Rows, or whatever else it is about: without any, the page does not have the section."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +179,7 @@ class Page:
     folders: Mapping[str, Page] = field(default_factory=dict)
     """Pages of parts of the result, each in a folder of its own beside the page, by its name."""
     remarks: Sequence[str] = ()
-    """Sentences that the terminal says before its tables."""
+    """Sentences that the terminal says before its tables; empty ones are left out."""
     stored: bool = True
     """Whether the summary is a file, too."""
     stem: str = ""
@@ -197,6 +205,12 @@ class Page:
         placed = {part.file for section in self.sections for part in section.parts
                   if isinstance(part, Drawn)}
         return [name for name in self.figures if name not in placed]
+
+
+def last_sections(figures: Figures, model: Mapping[str, str]) -> list[Section]:
+    """Return the pictures but that below the answer, and what model the results are of."""
+    return [Section([*map(Drawn, [*figures][1:])], "Pictures"),
+            Section([Table(listed(model))], "Model")]
 
 
 PAGES = {
@@ -293,9 +307,9 @@ def write_changed_study(
     write_edited(path, file.read_text(encoding="utf-8-sig"), [(before, COMPLETE_NOTE), *steps])
 
 
-def linearized(study: Study) -> list[str]:
-    """Return the sentence about a nonlinear iron, if there is one."""
-    return (["The iron is linearized about the nominal magnet."] if is_nonlinear(study) else [])
+def linearized(study: Study) -> str:
+    """Return the sentence about a nonlinear iron; empty without one."""
+    return "The iron is linearized about the nominal magnet." if is_nonlinear(study) else ""
 
 
 def save(
@@ -391,6 +405,8 @@ def _templates() -> jinja2.Environment:
     environment.filters |= {"units_kept": units_kept, "marked": _marked}
     environment.tests |= {kind.__name__.lower(): lambda part, kind=kind: isinstance(part, kind)
                           for kind in (Text, Items, Table, Drawn, View)}
+    environment.tests["empty"] = lambda part: not (
+        part[0] if isinstance(part, Text | Items) else part)
     return environment
 
 
@@ -427,12 +443,28 @@ def figure_of(height_in: float, width_in: float = WIDEST_IN) -> Figure:
     return Figure(figsize=(min(width_in, WIDEST_IN), height_in), layout="constrained")
 
 
-def chart(height_in: float, width_in: float = WIDEST_IN) -> tuple[Figure, Axes]:
-    """Return a figure with a single grid, and its axes."""
+def chart(
+    height_in: float, width_in: float = WIDEST_IN, grid: bool = True
+) -> tuple[Figure, Axes]:
+    """Return a figure and its only axes, with a grid or without."""
     figure = figure_of(height_in, width_in)
     axis = figure.subplots()
-    axis.grid(alpha=0.3)
+    if grid:
+        axis.grid(alpha=0.3)
     return figure, axis
+
+
+def charts(
+    height_in: float, rows: int = 1, columns: int = 1, **layout: Any
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure and its axes with grids, row by row; ``layout`` is that of
+    `Figure.subplots`.
+    """
+    figure = figure_of(height_in)
+    axes = figure.subplots(rows, columns, squeeze=False, **layout).ravel().tolist()
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    return figure, axes
 
 
 def legend_above(
@@ -450,13 +482,10 @@ def legend_above(
 
 def magnet_panels(what: str) -> tuple[Figure, Axes, Axes]:
     """Return a figure, and its axes for points along the magnet, over ``what``, and across it."""
-    figure = figure_of(3.6)
-    along, across = figure.subplots(1, 2, width_ratios=(2, 1))
+    figure, (along, across) = charts(3.6, 1, 2, width_ratios=(2, 1))
     along.set(xlabel="z in the magnet in mm", ylabel=what)
     across.set(xlabel="x in the magnet in mm", ylabel="y in the magnet in mm")
     across.set_aspect("equal", adjustable="datalim")
-    for axis in (along, across):
-        axis.grid(alpha=0.3)
     return figure, along, across
 
 
@@ -465,21 +494,6 @@ def draw_by_slot(axis: Axes, values: Floats, **colours: Any) -> AxesImage:
     rings, slots = values.shape
     return axis.imshow(values, aspect="auto", origin="lower",
                        extent=(0.5, slots + 0.5, 0.5, rings + 0.5), **colours)
-
-
-def stacked_axes(
-    rows: int, ratios: Sequence[float] | None = None, shared: bool = True
-) -> tuple[Figure, list[Axes]]:
-    """Return a figure, and its axes in rows; ``ratios`` are heights.
-
-    ``shared`` tells whether they share the x axis.
-    """
-    figure = figure_of(2.4 + 1.7 * rows)
-    axes = figure.subplots(rows, 1, sharex=shared, squeeze=False,
-                           gridspec_kw={"height_ratios": ratios or [1] * rows})
-    for axis in axes[:, 0]:
-        axis.grid(alpha=0.3)
-    return figure, list(axes[:, 0])
 
 
 def label_logarithmic(axis: Axis) -> None:
@@ -531,26 +545,22 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
     # numbered: those of an inner layer have the same slots.
     outermost = 0.9
     most_numbered = 40  # largest number of blocks in a cross-section whose slots are numbered
-    t = np.linspace(0, 1, 9)
     height = magnet.blocks[0].middle[2]  # of the first ring: layers around it are drawn too
     shown = [block for block in magnet.blocks if magnet.dimension == 2 or abs(
         block.middle[2] - height) <= (block.z_max - block.z_min) / 2 - 1e-9]
     reach = max((1e3 * float(np.hypot(*block.middle[:2])) for block in shown), default=0.0)
     numbered = reach > 0 and len(shown) <= most_numbered
-    outlines = []
-    for block in shown:
-        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
-        outlines.append(1e3 * block.from_frame(np.column_stack([edges, 0 * edges[:, 0]]))[:, :2])
+    outlines = [1e3 * block.from_frame(at_heights(along_edges(block.outline, 9), 0.0))[:, :2]
+                for block in shown]
     if len(shown) > MOST_POINTING:
         axis.plot(*np.vstack([part for outline in outlines for part in (
             outline, [[np.nan, np.nan]])]).T, color=colour, lw=0.3)
         shown = []
     for block, outline in zip(shown, outlines, strict=False):
         axis.plot(*outline.T, color=colour, lw=0.6)
-        middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
-        length = 0.3 * float(np.ptp(outline, axis=0).min())
-        axis.annotate("", middle + length * np.array(block.easy_axis[:2]),
-                      middle - length * np.array(block.easy_axis[:2]),
+        middle = box_middle(outline)
+        arrow = 0.3 * float(np.ptp(outline, axis=0).min()) * np.array(block.easy_axis[:2])
+        axis.annotate("", tuple(middle + arrow), tuple(middle - arrow),
                       arrowprops={"arrowstyle": "->", "color": colour, "lw": 0.8})
         distance = float(np.hypot(*middle))
         if numbered and distance > outermost * reach:
@@ -561,8 +571,9 @@ def draw_cross_section(axis: Axes, magnet: Magnet, colour: str = "#777777") -> N
             if beyond:
                 axis.margins(0.12)
             axis.annotate(
-                str(block.slot), outwards * (edge if beyond else 0.25 * distance + 0.75 * edge),
-                outwards * (SMALL if beyond else 0), textcoords="offset points",
+                str(block.slot),
+                tuple(outwards * (edge if beyond else 0.25 * distance + 0.75 * edge)),
+                tuple(outwards * (SMALL if beyond else 0)), textcoords="offset points",
                 ha="center", va="center", fontsize=SMALL, color=colour)
     for body in magnet.iron:
         if body.sphere or not body.in_place:  # its shadow
@@ -585,10 +596,9 @@ def _inner_radii(magnet: Magnet) -> list[float]:
     """
     if len(magnet.blocks) > MOST_MEASURED:
         return [inner for _, (inner, _) in magnet.ring_sections]
-    t, found = np.linspace(0, 1, 33), dict[int, float]()
+    found = dict[int, float]()
     for block in magnet.blocks:
-        edges = np.vstack([edge.at(t)[0] for edge in block.outline])
-        x, y, _ = block.from_frame(np.column_stack([edges, 0 * edges[:, 0]])).T
+        x, y, _ = block.from_frame(at_heights(along_edges(block.outline, 33), 0.0)).T
         found[block.ring] = min(float(np.hypot(x, y).min()), found.get(block.ring, np.inf))
     return list(found.values())
 

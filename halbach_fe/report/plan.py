@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of
 from halbach_fe.design.measurement_plan import MeasurementPlan
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.instrument_terms import prior_sd
@@ -33,9 +33,10 @@ from halbach_fe.report.page import (
     figure_of,
     label_logarithmic,
     legend_above,
+    linearized,
 )
 from halbach_fe.report.words import counted, fraction, ppm, rms
-from halbach_fe.study.model import Study, is_nonlinear
+from halbach_fe.study.model import Study
 
 NEARLY = 1.2
 """Uncertainty relative to that of all positions at which fewer of them nearly suffice."""
@@ -83,72 +84,96 @@ def _of_study(plan: MeasurementPlan) -> float:
 
 def answer(plan: MeasurementPlan) -> Answer:
     """Say how much the plan tells beside the study's positions, and what to do next."""
-    # Uncertainty relative to the prior's from which on the readings tell little of single blocks.
-    vague = 0.7
-    points, same, nearly = len(plan.points), plan.same_information, _nearly(plan)
-    everything = points == len(plan.candidates)
-    enough = (f"the first {nearly} of {points} positions nearly suffice, as the uncertainty "
-              f"{'of patterns of blocks ' if plan.deviation is None else ''}that they leave is at "
-              f"most {NEARLY:g} times that of all"
-              if 1 < nearly < points else "")  # a single one only shows that none tells much
-    said = (f"At the {counted(points, 'position')} of plan.csv. " if not everything else
-            f"In the order of plan.csv{f': {enough}' if enough else ''}. These are all the "
-            f"candidates{', the positions of the study' if _is_the_study(plan) else ''}, and the "
-            "plan only orders them. ")
-    if plan.deviation is None:
-        left, of_study = _patterns(plan)
-        # uncertainty relative to that of as many of the study's positions from which on a plan is
-        # hardly better
-        little = 0.97
-        beside = "" if _is_the_study(plan) else (
-            f"; with as many of the study's own positions to {fraction(of_study)}"
-            f"{'' if left < little * of_study else ', which is hardly more'}")
-        blocks = rms(plan.planned_sd) / rms(plan.prior_sd)
-        better = "What blocks that deviate together do to the field is known better: the"
-        said += (f"After {'all of ' if everything else ''}them the uncertainty of a block's "
-                 f"magnetization falls to {fraction(blocks)} of what it is before (rms over the "
-                 "blocks). "
-                 f"{better if left < blocks else 'The'} uncertainty of "
-                 f"{'such a pattern' if left < blocks else 'patterns of blocks'}, by which the "
-                 f"positions are chosen, falls to {fraction(left)} (geometric mean){beside}. ")
-        if left > vague:
-            said += ("So such a map tells little of the single blocks, at whatever positions of "
-                     "these it is measured. Measure the blocks before assembly, or the field "
-                     "nearer to them. ")
-    else:
-        said += (f"The deviation of |B| from its mean at a point of {plan.deviation.region.text} "
-                 f"is known to {ppm(plan.deviation.prior)} ppm rms before, and to "
-                 f"{ppm(plan.deviation.planned[-1])} after {'all of ' if everything else ''}them"
-                 + ("" if _is_the_study(plan) else
-                    f" (after as many of the study's positions to {ppm(_of_study(plan))})") + ". ")
-    if not everything:
-        of_all = (fraction(float(_pattern_sd(plan, plan.baseline_gain)[-1]))
-                  if plan.deviation is None else f"{ppm(plan.deviation.baseline[-1])} ppm rms")
-        said += (f"{counted(same, 'position')} of the plan tell as much as all "
-                 f"{len(plan.baseline)} of the study." if same else
-                 f"All {len(plan.baseline)} positions of the study together tell more than these "
-                 f"{points}: they leave {of_all}.")
-    return Answer(
-        "Where should the magnet be measured?", said.strip(),
+    study = plan.magnet.study
+    said = [_which(plan), *(_left_of_patterns(plan) if plan.deviation is None
+                            else [_left_of_deviation(plan)]), _beside_all_of_the_study(plan)]
+    trust = [
         "Yes, as far as the study's prior and noise are right; what the readings will be makes no "
         "difference to these numbers. Positions that are chosen one after another, as these are, "
-        "tell nearly as much as the best choice of all at once."
-        + _of_the_instrument(plan.magnet.study)
-        + (" The iron is linearized about the nominal magnet." if is_nonlinear(plan.magnet.study)
-           else ""),
-        "Measure in this order, as far as there is time, and update the blocks. (Set plan.points "
-        "for a shorter plan, or plan.candidates for other places.)" if everything else
-        "Measure there, and update the blocks." if same else
-        "Measure there, and update the blocks. Ask for more positions (--points) to learn as much "
-        "as from all of the study's.",
-        "halbach-fe infer STUDY --measurements MAP -o DIR")
+        "tell nearly as much as the best choice of all at once.",
+        _of_the_instrument(study), linearized(study)]
+    step = ("Measure in this order, as far as there is time, and update the blocks. (Set "
+            "plan.points for a shorter plan, or plan.candidates for other places.)"
+            if _has_all(plan) else "Measure there, and update the blocks."
+            if plan.same_information else
+            "Measure there, and update the blocks. Ask for more positions (--points) to learn as "
+            "much as from all of the study's.")
+    return Answer("Where should the magnet be measured?", " ".join(filter(None, said)),
+                  " ".join(filter(None, trust)), step,
+                  "halbach-fe infer STUDY --measurements MAP -o DIR")
+
+
+def _has_all(plan: MeasurementPlan) -> bool:
+    """Tell whether the plan has all candidates, which it then only orders."""
+    return len(plan.points) == len(plan.candidates)
+
+
+def _which(plan: MeasurementPlan) -> str:
+    """Say which positions the plan has, and how many of them nearly suffice."""
+    points, nearly = len(plan.points), _nearly(plan)
+    if not _has_all(plan):
+        return f"At the {counted(points, 'position')} of plan.csv."
+    enough = "" if not 1 < nearly < points else (  # a single one only shows that none tells much
+        f": the first {nearly} of {points} positions nearly suffice, as the uncertainty "
+        f"{'of patterns of blocks ' if plan.deviation is None else ''}that they leave is at most "
+        f"{NEARLY:g} times that of all")
+    return (f"In the order of plan.csv{enough}. These are all the candidates"
+            f"{', the positions of the study' if _is_the_study(plan) else ''}, and the plan only "
+            "orders them.")
+
+
+def _left_of_patterns(plan: MeasurementPlan) -> list[str]:
+    """Say what the readings leave unknown of single blocks, and of patterns of blocks."""
+    # Uncertainty relative to the prior's from which on the readings tell little of single blocks,
+    # and relative to that of as many of the study's positions from which on a plan is hardly better
+    vague, little = 0.7, 0.97
+    left, of_study = _patterns(plan)
+    blocks = rms(plan.planned_sd) / rms(plan.prior_sd)
+    beside = "" if _is_the_study(plan) else (
+        f"; with as many of the study's own positions to {fraction(of_study)}"
+        f"{'' if left < little * of_study else ', which is hardly more'}")
+    together, pattern = (
+        ("What blocks that deviate together do to the field is known better: the",
+         "such a pattern") if left < blocks else ("The", "patterns of blocks"))
+    return [
+        f"After {'all of ' if _has_all(plan) else ''}them the uncertainty of a block's "
+        f"magnetization falls to {fraction(blocks)} of what it is before (rms over the blocks).",
+        f"{together} uncertainty of {pattern}, by which the positions are chosen, falls to "
+        f"{fraction(left)} (geometric mean){beside}.",
+        "So such a map tells little of the single blocks, at whatever positions of these it is "
+        "measured. Measure the blocks before assembly, or the field nearer to them."
+        if left > vague else ""]
+
+
+def _left_of_deviation(plan: MeasurementPlan) -> str:
+    """Say what the readings leave unknown of the deviation of |B| in the study's region."""
+    assert plan.deviation is not None
+    beside = "" if _is_the_study(plan) else (
+        f" (after as many of the study's positions to {ppm(_of_study(plan))})")
+    return (f"The deviation of |B| from its mean at a point of {plan.deviation.region.text} is "
+            f"known to {ppm(plan.deviation.prior)} ppm rms before, and to "
+            f"{ppm(plan.deviation.planned[-1])} after {'all of ' if _has_all(plan) else ''}them"
+            f"{beside}.")
+
+
+def _beside_all_of_the_study(plan: MeasurementPlan) -> str:
+    """Compare a choice of positions with all positions of the study; empty if it chose none."""
+    if _has_all(plan):
+        return ""
+    if same := plan.same_information:
+        return (f"{counted(same, 'position')} of the plan tell as much as all "
+                f"{len(plan.baseline)} of the study.")
+    of_all = (fraction(float(_pattern_sd(plan, plan.baseline_gain)[-1]))
+              if plan.deviation is None else f"{ppm(plan.deviation.baseline[-1])} ppm rms")
+    return (f"All {len(plan.baseline)} positions of the study together tell more than these "
+            f"{len(plan.points)}: they leave {of_all}.")
 
 
 def _of_the_instrument(study: Study) -> str:
     """Say that the plan takes the instrument as exact, if the study does not."""
     known = [study.instrument_sd, *(one.instrument_sd for one in study.maps if one.instrument_sd)]
     return "" if not any(prior_sd(one).any() for one in known) else (
-        " They take the instrument as exact: what [instrument_sd] leaves open, such as a gain that "
+        "They take the instrument as exact: what [instrument_sd] leaves open, such as a gain that "
         "all readings share, is not in them, and leaves more of the blocks' common strength.")
 
 
@@ -283,7 +308,7 @@ def _positions_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
              ylabel="y in mm")
     for axis in others:
         shown = _draw_points(axis, plan, lambda points: np.column_stack(
-            [1e3 * points[:, 2], np.degrees(np.arctan2(points[:, 1], points[:, 0]))]))
+            [1e3 * points[:, 2], np.degrees(azimuths_of(points))]))
         axis.set(xlabel="z in mm", ylabel="angle in degrees")
     figure.colorbar(shown, label="order of choice", ax=[left, *others])
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)
@@ -330,8 +355,7 @@ def _left_figure(plan: MeasurementPlan) -> Figure:
 
 def _block_sd_figure(magnet: Magnet, plan: MeasurementPlan) -> Figure:
     """Draw the ratio of posterior to prior standard deviations, by slot."""
-    figure = figure_of(4)
-    axis = figure.subplots()
+    figure, axis = chart(4, grid=False)
     slots = np.array([block.slot for block in magnet.blocks])
     places = np.arange(1, max(magnet.blocks_by_ring) + 1)
 

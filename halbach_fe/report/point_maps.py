@@ -12,10 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
 from halbach_fe.inference.result import (
     COVERAGE_Z,
     HELD_OUT,
@@ -32,9 +31,9 @@ from halbach_fe.report.page import (
     PRIOR,
     PUBLISHED,
     chart,
+    charts,
     figure_of,
     legend_above,
-    stacked_axes,
 )
 
 SAME = 1e-3
@@ -82,7 +81,7 @@ def curve(points: Floats) -> tuple[Floats, str] | None:
         if abs(along[number]) > 1 - SAME:
             return 1e3 * points[:, number], f"{'xyz'[number]} in mm"
         return 1e3 * (centred @ along), "distance along the line in mm"
-    radii = np.hypot(points[:, 0], points[:, 1])
+    radii = radii_of(points)
     if np.ptp(points[:, 2]) <= SAME * radii.max() and np.ptp(radii) <= SAME * radii.max():
         return _angle(points), "angle in degrees"
     return None
@@ -94,7 +93,7 @@ def panels(points: Floats) -> list[Panel]:
     few_radii = 3  # largest number of radii for which points count as circles about the axis
     every, z = np.arange(len(points)), 1e3 * points[:, 2]
     size = float(np.ptp(points, axis=0).max())
-    radii = np.hypot(points[:, 0], points[:, 1])
+    radii = radii_of(points)
     if np.ptp(points[:, 2]) <= SAME * size:
         return [_slice(points, every, 2)]
     from_middle = np.linalg.norm(points - _centre(points), axis=1)
@@ -142,7 +141,7 @@ def _different(values: Floats, apart: float) -> tuple[Floats, Ints]:
 
 def _angle(points: Floats) -> Floats:
     """Return the angles (n,) of points (n, 3) about z, from 0 to 360 degrees."""
-    angle = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    angle = np.degrees(azimuths_of(points)) % 360
     return np.asarray(np.where(angle > 360 - SAME, 0.0, angle), np.float64)  # -1e-17 is 0
 
 
@@ -337,7 +336,7 @@ def prediction_profile_figure(result: InferenceResult, name: str | None = None) 
     """Draw readings and predictions along the main line, and the residuals of the posterior."""
     line = main_line(result, name)
     index = line.index
-    figure, (top, bottom) = stacked_axes(2, [2, 1])
+    figure, (top, bottom) = charts(5.8, 2, sharex=True, height_ratios=[2, 1])
     measured = result.readings[index]
     top.plot(line.place, 1e3 * result.prediction_prior.mean[index], color=PRIOR,
              label="predicted before the update", lw=1.2)
@@ -409,7 +408,7 @@ def standardized_residuals_figure(result: InferenceResult) -> Figure:
     """Draw the standardized residuals of all readings for prior and posterior."""
     crowd = 3000  # number of readings from which smaller, transparent markers are used
     place, label = axis_of_readings(result)
-    figure, axes = stacked_axes(2)
+    figure, axes = charts(5.8, 2, sharex=True)
     for axis, (name, prediction, colour) in zip(axes, predictions(result), strict=True):
         scores = result.standardized(prediction)
         for part, mask in parts_of(result, np.arange(len(scores))):
@@ -465,7 +464,7 @@ def predictions(result: InferenceResult) -> list[tuple[str, Prediction, str]]:
             ("posterior", result.prediction_posterior, POSTERIOR)]
 
 
-def parts_of(result: InferenceResult, index: Ints) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+def parts_of(result: InferenceResult, index: Ints) -> Iterator[tuple[str, Bools]]:
     """Yield each part of the readings that is present, and the mask of its readings."""
     parts = np.array(result.parts)[index]
     for part in MARKERS:

@@ -10,7 +10,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 from scipy import special
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
+from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.core.untrusted import write_hdf5
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.block_prior import DIRECTIONS, NOT_NORMAL, MeasuredPrior, TypeSamples
@@ -24,9 +25,9 @@ from halbach_fe.report.page import (
     Section,
     Table,
     Text,
-    figure_of,
+    charts,
 )
-from halbach_fe.report.words import counted, fraction, p_value, rms, with_error
+from halbach_fe.report.words import counted, fraction, p_value, rms, with_unit
 
 UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 """Factors that convert relative deviations to percent (along the magnetization) and to degrees
@@ -34,8 +35,6 @@ UNITS = (100.0, np.degrees(1.0), np.degrees(1.0))
 
 PARTS = ("in length", "in direction, in the plane of the ring", "in direction, towards z")
 """Parts of the deviation of a magnetization from the nominal one."""
-
-NOTHING = "–"
 
 
 def type_table(prior: MeasuredPrior) -> Rows:
@@ -50,7 +49,7 @@ def type_table(prior: MeasuredPrior) -> Rows:
              DIRECTIONS, ("%", "°", "°"), _mean_of_type(samples),
              ["" if np.isnan(sd) else f" ± {sd:.2f}" for sd in _sd_of_type(samples)],
              strict=False)},
-         **{f"p {name}": NOTHING if np.isnan(p) else p_value(p)
+         **{f"p {name}": EMPTY_CELL if np.isnan(p) else p_value(p)
             for name, p in zip(DIRECTIONS, samples.p, strict=False) if tested}}
         for samples in prior.types]
 
@@ -121,7 +120,7 @@ def _axes(nominal: Floats) -> Floats:
         return np.stack([along, np.column_stack([-along[:, 1], along[:, 0]])], axis=1)
     # part of a magnetization in the plane of the ring below which it is along z
     along_z = 1e-9
-    flat = np.hypot(along[:, 0], along[:, 1])[:, None] > along_z
+    flat = radii_of(along)[:, None] > along_z
     across = np.where(flat, np.column_stack([-along[:, 1], along[:, 0], 0 * along[:, 0]]),
                       [0.0, 1.0, 0.0])
     across = across / np.linalg.norm(across, axis=1)[:, None]
@@ -139,7 +138,7 @@ def answer(prior: MeasuredPrior) -> Answer:
     common = float(prior.gaussian.sd_of(weights[None])[0])
     side = "stronger" if strength > 0 else "weaker"
     said = (f"On average the {counted(prior.count, 'measured block')} are "
-            f"{with_error(100 * abs(strength), 100 * common)}\u00a0% {side} than the study says. "
+            f"{with_unit(abs(strength), common, '%')} {side} than the study says. "
             "In length and direction together they deviate from it by "
             f"{fraction(shift)} rms, and each is now known to {fraction(spread)}"
             + (", most of which is the calibration of the coil, which all blocks share"
@@ -263,16 +262,15 @@ def _standardized(samples: Floats) -> Floats:
 def _deviations_figure(prior: MeasuredPrior) -> Figure:
     """Draw the deviations of all blocks, in the order of their types."""
     deviations = np.vstack([samples.deviations for samples in prior.types])
-    figure = figure_of(1 + 1.8 * deviations.shape[1])
-    axes = figure.subplots(deviations.shape[1], 1, sharex=True, squeeze=False)[:, 0]
+    count = deviations.shape[1]
+    figure, axes = charts(1 + 1.8 * count, count, sharex=True)
     for axis, name, unit, factor, values in zip(axes, DIRECTIONS, ("%", "°", "°"), UNITS,
                                                 deviations.T, strict=False):
         axis.axhline(0, color=PUBLISHED, lw=0.8)
         axis.plot(np.arange(1, len(values) + 1), factor * values, "o", color=MEASURED, ms=4)
         axis.set_ylabel(f"{name} in {unit}")
-        axis.grid(alpha=0.3)
     axes[-1].set_xlabel("block, by type")
-    axes[-1].xaxis.get_major_locator().set_params(integer=True)
+    axes[-1].locator_params("x", integer=True)
     return figure
 
 
@@ -284,8 +282,7 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
     # Number of simulated normal samples from which the band of the figure is taken.
     simulations = 1000
     groups = [samples.deviations for samples in prior.types if len(samples.deviations) > 2]
-    figure = figure_of(3.9)
-    axes = figure.subplots(1, prior.types[0].deviations.shape[1], sharey=True, squeeze=False)[0]
+    figure, axes = charts(3.9, 1, prior.types[0].deviations.shape[1], sharey=True)
     count = sum(len(group) for group in groups)
     expected = special.ndtri((np.arange(count) + 0.5) / count)
     generator = np.random.default_rng(1)
@@ -299,6 +296,5 @@ def _standardized_deviations_figure(prior: MeasuredPrior) -> Figure:
         axis.plot(expected, band[[0, 2]].T, color=PUBLISHED, lw=0.8, ls="--")
         axis.plot(expected, values, ".", color=MEASURED, ms=4)
         axis.set(title=name, xlabel="normal quantile")
-        axis.grid(alpha=0.3)
     axes[0].set_ylabel("standardized deviation")
     return figure

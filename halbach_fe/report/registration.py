@@ -13,6 +13,7 @@ from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.geometry.symmetry import block_images
+from halbach_fe.inference.campaign_registration import moved_by_turns
 from halbach_fe.inference.pose_result import Registration
 from halbach_fe.inference.registration import (
     EQUAL_LOG_EVIDENCE,
@@ -66,7 +67,8 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     point_mm,
-    with_error,
+    with_unit,
+    within_a_sentence,
 )
 from halbach_fe.report.words import probability as in_per_cent
 from halbach_fe.study.measurement import Instrument
@@ -135,18 +137,18 @@ def answer(
     least_bad = f" for B{best.component}" if best.component else ""
     alike = sum(_fit_alike(best, each) or is_symmetric_to(best, each) for each in rivals(found))
     if alike:
-        said += (f" {counted(alike, 'other pose')} of the map {'is' if alike == 1 else 'are'} as "
+        said += (f" {counted(alike, 'other pose of the map is', 'other poses of the map are')} as "
                  "likely.")
     trust = [*_other_poses(found), *_reversed(best, assumed), _fit(best, before)]
     stated = assumed or Instrument()
     if best.explains and not best.at_rest:
-        said = f"That is not found yet. The best answer so far: {said[0].lower()}{said[1:]}"
+        said = f"That is not found yet. The best answer so far: {within_a_sentence(said)}"
     if best.explains:
         said = _component(found) + said
         trust.insert(0, _verdict(found, name))
     else:
         said = (f"This magnet does not explain the map. The least bad answer{least_bad}: "
-                f"{said[0].lower()}{said[1:]}")
+                f"{within_a_sentence(said)}")
         trust.insert(0, (
             f"No. Even in the best pose and with updated blocks chi² is {decimals(best.chi2)} per "
             "reading, where about 1 is expected: the map is of another magnet, its noise is larger "
@@ -171,8 +173,8 @@ def _apart(best: Registration, name: str) -> str:
     said = []
     for one in best.apart:
         where, axis = one.name.split("_")
-        unit, factor = UNITS[one.unit]
-        said.append(f"{with_error(factor * one.value, factor * one.prior_sd)}\u00a0{unit} {where} "
+        unit, _ = UNITS[one.unit]
+        said.append(f"{with_unit(one.value, one.prior_sd, unit)} {where} "
                     f"{axis} of the stage ({decimals(one.distance, 2)} standard deviations)")
     return (f"No. The magnet's model wants map {name} {in_a_row(said)} from where its overlap with "
             f"the other maps has it. {MOVES_A_SECTION}")
@@ -346,12 +348,10 @@ def magnet_on_stage(best: Registration) -> tuple[Floats, Floats]:
     scale = 1 + np.array([instrument.radius_scale, instrument.radius_scale, instrument.z_scale])
     sensor = np.mean(instrument.sensor_position_m, axis=0)
     centre = (-turn.T @ instrument.translation_m - sensor) / scale
-    x, y, z = best.middle_m
-    arms = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]])
-    variance = best.translation_sd_m**2 + arms**2 @ best.rotation_sd_rad**2
+    sd = np.hypot(best.translation_sd_m, moved_by_turns(best.middle_m, best.rotation_sd_rad))
     axes = np.array([COMPONENTS.index(axis[-1]) for axis in instrument.position_axes])
     signs = np.array([-1.0 if axis.startswith("-") else 1.0 for axis in instrument.position_axes])
-    return signs * centre[axes], np.sqrt(turn.T**2 @ variance / scale**2)[axes]
+    return signs * centre[axes], np.sqrt(turn.T**2 @ sd**2 / scale**2)[axes]
 
 
 def _other_poses(found: Sequence[Registration]) -> list[str]:
@@ -359,8 +359,8 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
     probability, said = stated_odds(found), []
     alike, unlike = [], []
     if left := found[0].left_out:
-        said.append(f"Of the {len(found) + left} poses that the search found, {len(found)} "
-                    f"{'was' if len(found) == 1 else 'were'} fitted; the others may be as likely.")
+        said.append(f"Of the {len(found) + left} poses that the search found, "
+                    f"{counted(len(found), 'was', 'were')} fitted; the others may be as likely.")
     if not found[0].explains:
         alike = rivals(found)
     for each, value in zip(found[1:], probability[1:], strict=True):
@@ -369,15 +369,14 @@ def _other_poses(found: Sequence[Registration]) -> list[str]:
                 alike.append(each)
             else:
                 unlike.append(f"{100 * value:.0f}\u00a0%")
-    others, one = counted(len(alike), "other pose"), len(alike) == 1
     if alike and all(is_symmetric_to(found[0], each) for each in alike):
         said.append(
-            f"{others} {'predicts' if one else 'predict'} the same readings, because the nominal "
-            "magnet is the same after the turn from one pose to the other: no reading can tell "
-            "them apart." + (USE_ANY if is_sound(found[0]) else ""))
+            f"{counted(len(alike), 'other pose predicts', 'other poses predict')} the same "
+            "readings, because the nominal magnet is the same after the turn from one pose to the "
+            "other: no reading can tell them apart." + (USE_ANY if is_sound(found[0]) else ""))
     elif alike:
-        said.append(f"{others} {'fits' if one else 'fit'} these readings equally well: decide by "
-                    "how the map was measured which one is real.")
+        said.append(f"{counted(len(alike), 'other pose fits', 'other poses fit')} these readings "
+                    "equally well: decide by how the map was measured which one is real.")
     if unlike and found[0].explains and found[0].at_rest:
         least = (", which is taken because its axes are turned least: decide by how the map was "
                  "measured" if probability[0] < probability.max() else "")
@@ -516,9 +515,7 @@ def probe_table(best: Registration) -> Rows:
     instrument, sd = best.instrument, best.probe
 
     def row(what: str, value: float, bar: float, unit: str) -> dict[str, str]:
-        factor = 100 if unit == "%" else 1e3
-        return {"of the probe": what,
-                "value": f"{with_error(factor * value, factor * bar)}\u00a0{unit}"}
+        return {"of the probe": what, "value": with_unit(value, bar, unit)}
 
     def sensor(name: str, number: int) -> Rows:
         return [row(f"gain of {name}", instrument.gain[number], sd.gain, "%"),
@@ -606,7 +603,7 @@ def page(
                 "chi² per reading is that of the updated blocks; about 1 is expected. Odds compare "
                 "poses that explain the map; there are none if none does, or if poses were left "
                 "out.", "small")], "Poses"),
-            Section([Table(doubts)] if doubts else [], "Far from what was known before"),
+            Section([Table(doubts)], "Far from what was known before", about=doubts),
             Section(["The pose is where the middle of the map lies in the magnet, and how the map "
                      "is turned about the axes of the magnet, once its own axes were put along "
                      "those above.", Table(

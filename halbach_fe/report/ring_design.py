@@ -29,7 +29,6 @@ from halbach_fe.report.page import (
     attributes,
     chart,
     csv_file,
-    figure_of,
     legend_above,
 )
 from halbach_fe.report.words import PERCENT_FROM, counted, in_a_row, ppm, relative
@@ -78,8 +77,8 @@ def at_limits(found: Designed) -> str:
         for word, end in (("smallest", min(layer.radii_m)), ("largest", max(layer.radii_m))):
             count = int(np.isclose(radii, end).sum())
             if count and len(layer.radii_m) > 1:
-                said.append(f"{counted(count, 'ring')} {'has' if count == 1 else 'have'} the "
-                            f"{word} radius{of} that [design] allows, {1e3 * end:.6g}\u00a0mm")
+                said.append(f"{counted(count, 'ring has', 'rings have')} the {word} "
+                            f"radius{of} that [design] allows, {1e3 * end:.6g}\u00a0mm")
     return f" {in_a_row(said)}: radii beyond that may be better." if said else ""
 
 
@@ -162,8 +161,7 @@ def side_figure(found: Designed) -> Figure:
     rings = found.study.array.ring
     length = max(ring.z_m or 0.0 for ring in rings) - min(ring.z_m or 0.0 for ring in rings)
     shape = length / max(ring.outer_radius_m or length for ring in rings)
-    figure = figure_of(3.6, max(1.5 + 3.0 * shape, 5.0))
-    axis = figure.subplots()
+    figure, axis = chart(3.6, max(1.5 + 3.0 * shape, 5.0), grid=False)
     for ring in rings:
         assert ring.z_m is not None  # those of a design are not stacked
         assert ring.ring_length_m is not None

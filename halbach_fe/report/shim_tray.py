@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
 from halbach_fe.report.page import (
+    LISTED,
     PUBLISHED,
     Drawn,
     Page,
@@ -22,18 +23,15 @@ from halbach_fe.report.page import (
     Section,
     Table,
     attributes,
+    chart,
     columns_by_axis,
     csv_file,
-    figure_of,
 )
-from halbach_fe.report.words import ppm
+from halbach_fe.report.words import ppm, within_a_sentence
 from halbach_fe.response.homogeneity import Homogeneity
 
 STUDY_FILE = "study.filled.toml"
 """Name of the study that has the magnets of the tray."""
-
-LISTED = 12
-"""Number of places in the table of the terminal; the page and shim_tray.csv have all of them."""
 
 FEW = 1.2
 """Factor below which the deviations are called hardly smaller."""
@@ -43,47 +41,31 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 
 def answer(found: FilledTray) -> Answer:
     """Say what the tray does, with how many magnets, and what to do next."""
-    said = _answer(found)
-    return (of_a_conflict(said.question, said.said, found.disagreement) if found.disagreement
-            else said)
-
-
-def _answer(found: FilledTray) -> Answer:
-    """Return the answer of an update that agrees with its map."""
-    if not found.filled:
-        return _told(found)
-    (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
-    numbers = (("rms deviation without and with the tray",
-                f"{ppm(before)} → {ppm(after)}\u00a0ppm"),)
-    useless = f"Do not fill this tray: {len(found.filled)} of its magnets hardly help."
-    return replace(_told(found), numbers=numbers, gist=useless if before < FEW * after else
-                   f"Fill the tray with {len(found.filled)} magnets in {len(found.places_m)} "
-                   "places.")
-
-
-def _told(found: FilledTray) -> Answer:
-    """Return the same without its numbers in large type."""
-    region = found.model.region.text
-    question = f"Which magnets in the tray make the field in {region} homogeneous?"
+    question = f"Which magnets in the tray make the field in {found.model.region.text} homogeneous?"
     harmonics = "halbach-fe homogeneity STUDY --posterior POSTERIOR -o DIR"
-    if not found.filled:
-        return Answer(
-            question, "Leave the tray empty: none of its magnets makes the field more homogeneous "
-            f"than {ppm(found.before.rms_range_ppm[1])} ppm rms.", _ranges(found),
-            "Put smaller magnets or more places into [shim_tray], or look for what the deviation "
-            "comes from: its harmonics tell.", harmonics)
     (_, before, _), (_, after, _) = found.before.rms_range_ppm, found.after.rms_range_ppm
     low, _, high = map(ppm, found.after.rms_range_ppm)
-    text = (f"With {len(found.filled)} magnets in the {len(found.places_m)} places of the tray, "
-            f"the field deviates by {ppm(after)} ppm rms (95 %: {low} to {high}), without them by "
-            f"{ppm(before)}.")
-    if all(not count for count in found.left.values()):
+    count, places = len(found.filled), len(found.places_m)
+    text = (f"With {count} magnets in the {places} places of the tray, the field deviates by "
+            f"{ppm(after)} ppm rms (95 %: {low} to {high}), without them by {ppm(before)}.")
+    if not count:
+        text = ("Leave the tray empty: none of its magnets makes the field more homogeneous than "
+                f"{ppm(before)} ppm rms.")
+    elif not any(found.left.values()):
         text += " The whole inventory is used: more magnets may do better."
+    useless = before < FEW * after
+    if count and useless:
+        text = f"Do not fill this tray: {within_a_sentence(text)} That is hardly less."
+    if found.disagreement:
+        return of_a_conflict(question, text, found.disagreement)
+    if not count:
+        return Answer(question, text, _ranges(found), "Put smaller magnets or more places into "
+                      "[shim_tray], or look for what the deviation comes from: its harmonics tell.",
+                      harmonics)
     step, trust = (f"Fill the tray from shim_tray.csv, then measure again and update {STUDY_FILE}, "
                    "which has the tray's magnets as free blocks."), ""
     command = f"halbach-fe infer DIR/{STUDY_FILE} --measurements NEW_MAP -o DIR"
-    if before < FEW * after:
-        text = f"Do not fill this tray: {text[0].lower()}{text[1:]} That is hardly less."
+    if useless:
         step, command = (
             ("The deviation is that of the design, and too large for a tray: search for a "
              "better arrangement of the blocks first.", "halbach-fe design STUDY -o DIR")
@@ -96,7 +78,12 @@ def _told(found: FilledTray) -> Answer:
         step = (f"Fill the tray from shim_tray.csv, measure again with it, update {STUDY_FILE}, "
                 "which has its magnets as free blocks, and fill a second one in places that are "
                 "still free.")
-    return Answer(question, text, f"{trust}{_ranges(found)}", step, command)
+    return Answer(
+        question, text, f"{trust}{_ranges(found)}", step, command,
+        gist=f"Do not fill this tray: {count} of its magnets hardly help." if useless else
+        f"Fill the tray with {count} magnets in {places} places.",
+        numbers=(("rms deviation without and with the tray",
+                  f"{ppm(before)} → {ppm(after)}\u00a0ppm"),))
 
 
 def _ranges(found: FilledTray) -> str:
@@ -158,12 +145,11 @@ def _tray_figure(found: FilledTray) -> Figure:
     larger angles.
     """
     columns, rows = (len(np.unique(values.round(6))) for values in (
-        np.arctan2(found.places_m[:, 1], found.places_m[:, 0]), found.places_m[:, 2]))
-    figure = figure_of(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)))
-    axis = figure.subplots()
+        azimuths_of(found.places_m), found.places_m[:, 2]))
+    figure, axis = chart(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)), grid=False)
 
     def unrolled(places: Floats) -> tuple[Floats, Floats]:
-        return np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360, 1e3 * places[:, 2]
+        return np.degrees(azimuths_of(places)) % 360, 1e3 * places[:, 2]
 
     axis.plot(*unrolled(found.places_m), "o", ms=12, mfc="none", mec=PUBLISHED, lw=0.5,
               label="place")

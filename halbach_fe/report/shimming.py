@@ -39,11 +39,10 @@ from halbach_fe.report.page import (
     Text,
     chart,
     draw_cross_section,
-    figure_of,
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_error
+from halbach_fe.report.words import counted, in_a_row, place_of, ppm, probability, with_unit
 from halbach_fe.response.multipoles import MultipoleModel, plain, text_table
 
 T = TypeVar("T")
@@ -359,7 +358,7 @@ def page(shim: Shim) -> Page:
     move_title = "Moves that would be made" if against else "Moves"
     aim, moves = aim_of(shim.model), _move_table(shim)
     rows = values_table(shim.model, _compared(shim, *(shim.fields or (shim.before, shim.after))))
-    sections = [Section([_convention(shim), Table(rows, aim.table), *linearized(shim.study)],
+    sections = [Section([_convention(shim), Table(rows, aim.table), linearized(shim.study)],
                         aim.title)]
     values = "the unwanted multipoles" if shim.fields is None else "the deviation of |B|"
     figures = {} if shim.fields else {"shim_multipoles.png": (
@@ -367,8 +366,8 @@ def page(shim: Shim) -> Page:
         f"Unwanted multipoles{' before and after the moves' if shim.steps else ''}, normal (left) "
         "and skew (right); bars are two standard deviations")}
     if shim.steps:
-        sections.insert(0, Section([*([Text(against, "warning")] if against else []),
-                                    _of_the_moves(shim), Table(moves)], move_title))
+        sections.insert(0, Section([
+            Text(against, "warning"), _of_the_moves(shim), Table(moves)], move_title))
         figures |= {
             "shim_moves.png": (
                 partial(_moves_figure, shim), f"{move_title}, with their numbers in the table"),
@@ -410,7 +409,7 @@ def _convention(shim: Shim) -> str:
     when = {name: f" {name}" if shim.steps else "" for name in known}
     main = ", ".join(f"{main_in_words(shim.model, each)}{when[name]}"
                      for name, each in known.items())
-    roll = ", ".join(f"{with_error(1e3 * each.roll, 1e3 * each.roll_sd)} mrad{when[name]}"
+    roll = ", ".join(f"{with_unit(each.roll, each.roll_sd, 'mrad')}{when[name]}"
                      for name, each in known.items())
     return (f"{reference_text(shim.model, shim.study)} ± is the standard deviation, "
             f"including the error of the solver. Main multipole: {main}. It "
@@ -420,8 +419,7 @@ def _convention(shim: Shim) -> str:
 def _moves_figure(shim: Shim) -> Figure:
     """Draw the moves in the cross-section, or for several rings in a grid of rings and slots."""
     flat = len(shim.magnet.blocks_by_ring) == 1
-    figure = figure_of(6, 6) if flat else figure_of(4.6)
-    axis = figure.subplots()
+    figure, axis = chart(6, 6, grid=False) if flat else chart(4.6, grid=False)
     if flat:
         draw_cross_section(axis, shim.magnet)
         where = 1e3 * np.array([block.middle[:2] for block in shim.magnet.blocks])

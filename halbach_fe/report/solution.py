@@ -16,25 +16,23 @@ from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magne
 from halbach_fe.report.multipoles import (
     MultipoleTable,
     main_field_in_words,
+    multipole_csv,
     sections_of_circles,
-    write_multipole_csv,
 )
 from halbach_fe.report.page import (
     MEASURED,
-    POSTERIOR,
-    PRIOR,
-    SECOND,
-    Drawn,
+    OF_COMPONENTS,
     Figures,
     Page,
     Rows,
     Section,
     Table,
     View,
+    charts,
     geometry_figure,
     label_logarithmic,
+    last_sections,
     legend_above,
-    stacked_axes,
 )
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import (
@@ -43,7 +41,6 @@ from halbach_fe.report.words import (
     decimals,
     flux_density,
     is_fourier,
-    listed,
     magnet_rows,
     relative,
 )
@@ -51,8 +48,6 @@ from halbach_fe.response.multipoles import solved_circles
 from halbach_fe.response.solution import Solution, write_solution
 from halbach_fe.solver.routes import finer_in_words
 from halbach_fe.study.types import COMPONENTS
-
-COLOURS = (POSTERIOR, PRIOR, SECOND)
 
 ROUGH = 1e-3
 """Error of the solver relative to the field above which a solution is not to be used."""
@@ -142,7 +137,7 @@ def page(solution: Solution) -> Page:
         "field_map.h5": lambda path: write_solution(solution, path.parent),
         **dict.fromkeys(("field_map.csv", "field_map.vtu", "readings.csv"))}
     if multipoles:
-        files["multipoles.csv"] = partial(write_multipole_csv, study, multipoles)
+        files["multipoles.csv"] = multipole_csv(study, multipoles)
     view = View(lambda: view_of_nominal_magnet(magnet, field_points(
         solution.points, solution.flux_density)), "the study's positions by the magnitude of the "
         "field")
@@ -154,8 +149,7 @@ def page(solution: Solution) -> Page:
                 "order n would contain order m − n too; that part is subtracted, as the blocks "
                 "make it in vacuum.", "" if not solution.errors.any() else
                 " ± is the standard deviation that the solver's error allows."),
-            Section([*map(Drawn, [*figures][1:])], "Pictures"),
-            Section([Table(listed(magnet_rows(magnet)))], "Model")],
+            *last_sections(figures, magnet_rows(magnet))],
         {"The field at the study's positions": rows,
          "Outside of the magnet": stray_rows(solution.stray_field)},
         figures=figures, shown=("field.png",), files=files, stored=False, stem="report",
@@ -204,9 +198,10 @@ def field_figure(solution: Solution) -> Figure:
     bars = ((np.array([float(name[1:]) for name in solution.observation.labels]), "harmonic")
             if fourier else curve(solution.observation.positions))
     below = bars if solution.errors.any() else None  # blocks in vacuum have none
-    figure, (top, *others) = stacked_axes(2 if below else 1, [2, 1] if below else [1], not fourier)
+    figure, (top, *others) = charts(5.8, 2, height_ratios=[2, 1], sharex=not fourier) if (
+        below) else charts(4.1)
     order = np.argsort(place, kind="stable")
-    for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], COLOURS,
+    for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], OF_COMPONENTS,
                                          solution.flux_density.T, strict=False):
         top.plot(place[order], 1e3 * column[order], ".-", ms=4, lw=0.8, color=colour,
                  label=f"B{component}")

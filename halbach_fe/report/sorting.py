@@ -34,9 +34,9 @@ from halbach_fe.report.page import (
     Section,
     Table,
     begin_at_zero,
+    chart,
     columns_by_axis,
     csv_file,
-    figure_of,
     legend_above,
 )
 from halbach_fe.report.shimming import aim_of, values_summary, values_table
@@ -135,13 +135,13 @@ def _answer(found: SortedBlocks) -> Answer:
     sizes = "" if found.fields is None else " ({} instead of {} peak to peak)".format(
         *(ppm(each.peak_to_peak_ppm) for each in found.fields))
     question = "Which block goes into which slot?"
-    left = ("" if not found.left_over else f" {counted(found.left_over, 'block')} "
-            f"{'is' if found.left_over == 1 else 'are'} left over.")
+    left = ("" if not found.left_over else
+            f" {counted(found.left_over, 'block is', 'blocks are')} left over.")
     if not isinstance(found.model, DeviationModel) and lacks_main(found.numbered):
         return of_no_main(question, f"Not known: {what} {text(own)} {unit}.", "Not in these units",
                           "sort STUDY BLOCKS", found.numbered)
-    turned = ("" if not found.turned else f" {counted(found.turned, 'block')} "
-              f"{'is' if found.turned == 1 else 'are'} turned in the slot, as sort.csv says.")
+    turned = "" if not found.turned else (
+        f" {counted(found.turned, 'block is', 'blocks are')} turned in the slot, as sort.csv says.")
     if found.has_choice and not _chose(found):
         return Answer(
             question, f"It does not matter: {what} {text(best)} {unit} in every order that is "
@@ -241,13 +241,13 @@ def page(found: SortedBlocks) -> Page:
         Section([by_serial, Table(places)], "Which block goes where",
                 folded=len(places) > 12),
         Section([_convention(found), Table(rows, aim.table)], aim.title),
-        *([Section([
+        Section([
             "Each is put into its slot as it was measured, and then turned about its own axes. "
             "The moments in blocks.sorted.csv are those of the turned blocks, and its columns "
             "turn_x_deg, turn_y_deg and turn_z_deg have the turns: `halbach-fe cad` says them in "
             "the plan to assemble.",
-            Table(_turn_table(found))], "Blocks that are turned in their slots")]
-          if turned else [])], {aim.title: rows}, figures=figures, files=files)
+            Table(_turn_table(found))], "Blocks that are turned in their slots", about=turned)],
+        {aim.title: rows}, figures=figures, files=files)
 
 
 def _convention(found: SortedBlocks) -> str:
@@ -263,8 +263,7 @@ def _convention(found: SortedBlocks) -> str:
 
 def _random_orders_figure(found: SortedBlocks) -> Figure:
     """Draw the histogram of the rms of random orders."""
-    figure = figure_of(3.6)
-    axis = figure.subplots()
+    figure, axis = chart(3.6, grid=False)
     axis.hist(found.random, 50, color=PUBLISHED, label="random orders")
     axis.axvline(found.numbered.rms_of_mean, color=PRIOR, lw=2, ls="--", label=found.own_order)
     axis.axvline(found.best.rms_of_mean, color=POSTERIOR, lw=2, label="sorted")

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from functools import partial
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -37,11 +38,11 @@ from halbach_fe.report.page import (
     attributes,
     begin_at_zero,
     chart,
-    figure_of,
+    charts,
     legend_above,
     linearized,
 )
-from halbach_fe.report.words import decimals, ppm, share_in_words, whole
+from halbach_fe.report.words import decimals, ppm, share_in_words, whole, within_a_sentence
 from halbach_fe.response.multipoles import plain
 from halbach_fe.study.inference import Prior
 from halbach_fe.study.model import Study
@@ -113,7 +114,7 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     ordered = float(found.known.sizes.max())
     if ordered > OF_THE_DESIGN * half:
         made = _made_by_tolerances(found)
-        said = (f"{made}{said[0].lower() if made else said[0]}{said[1:]} That is the magnet as "
+        said = (f"{made}{within_a_sentence(said) if made else said} That is the magnet as "
                 f"designed ({decimals(ordered)} units with blocks as ordered), to which their "
                 "tolerances add little.")
     said += only_of_orders(found.model)
@@ -125,18 +126,23 @@ def answer(found: Tolerance | HomogeneityTolerance) -> Answer:
     if lacks_main(found.known):
         return of_no_main(question, said, "Not in these units", "tolerance STUDY",
                           found.known)
-    step = (_sorting(found) if found.table_doubts or share is None or share < ENOUGH else
-            ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
-             "halbach-fe infer STUDY --measurements MAP -o DIR"))
     return Answer(question, said, f"{_trust(found)} {whole(len(found.sizes))} magnets were drawn.",
-                  *step, sound=not found.table_doubts)
+                  *_next_step(found), sound=not found.table_doubts)
 
 
-def _sorting(found: Tolerance | HomogeneityTolerance) -> tuple[str, str]:
-    """Return the next step, and its command, if the blocks make a part of the errors."""
+def _next_step(found: Tolerance | HomogeneityTolerance, of_design: str = "") -> tuple[str, str]:
+    """Return the next step, and its command; ``of_design`` is the step if the design, not the
+    blocks, makes most of the errors.
+    """
     if found.table_doubts:
         return ("Answer what is asked of the table of blocks, correct it or the study, and ask "
                 "again.", f"halbach-fe tolerance STUDY --blocks BLOCKS{at_z(found.model)} -o DIR")
+    if found.share is not None and found.share >= ENOUGH:
+        return ("The tolerances suffice: build the magnet, measure it, and update its blocks.",
+                "halbach-fe infer STUDY --measurements MAP -o DIR")
+    if of_design:
+        return (of_design, "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
+                "halbach-fe sort STUDY BLOCKS -o DIR")
     if all(len(blocks) == 1 for blocks in types_of(build_magnet(found.study)).values()):
         return ("Every slot is a type of its own, so that no blocks can change places: state in "
                 "prior.types which slots take the same ones, then sort measured blocks.",
@@ -183,7 +189,7 @@ def page(found: Tolerance | HomogeneityTolerance) -> Page:
             "include the error of the solver, quantiles do not. “95 % below” is the size that "
             "|c_n| stays below in 95 % of them. Main multipole: "
             f"{main_in_words(found.model, found.known)}.",
-            Table(rows, "numbers"), *linearized(found.study)])],
+            Table(rows, "numbers"), linearized(found.study)])],
         {"Multipoles |c_n| in units of 1e-4": rows},
         figures={
             "tolerance_sizes.png": (
@@ -201,7 +207,7 @@ def _homogeneity_page(found: HomogeneityTolerance) -> Page:
         "tolerance", "homogeneity to expect from the tolerances", found.study, answer(found),
         _homogeneity_summary(found), [
             Section([_drawn(found.study, str(len(found.rms_ppm)))]),
-            Section([SIZES, Table(rows, "turned"), *linearized(found.study)],
+            Section([SIZES, Table(rows, "turned"), linearized(found.study)],
                     f"The field in {region}")],
         {f"Deviations of |B| in {region}": rows},
         figures={"tolerance_ppm.png": (
@@ -236,8 +242,7 @@ def _size_quantiles_figure(found: Tolerance) -> Figure:
 def _largest_multipole_figure(found: Tolerance) -> Figure:
     """Draw the distribution function of the largest |c_n|."""
     figure, axis = chart(3.6)
-    largest = np.sort(found.sizes.max(axis=1))
-    axis.plot(largest, np.arange(1, len(largest) + 1) / len(largest), color=POSTERIOR)
+    _draw_shares(axis, found.sizes.max(axis=1))
     if found.limit is not None:
         axis.axvline(found.limit, color=PRIOR, ls="--", label="limit")
         legend_above(figure, axis)
@@ -246,6 +251,11 @@ def _largest_multipole_figure(found: Tolerance) -> Figure:
     begin_at_zero(axis)
     axis.ticklabel_format(axis="x", useOffset=False)
     return figure
+
+
+def _draw_shares(axis: Axes, values: Floats) -> None:
+    """Draw the share of magnets with at most each of some values (draws,)."""
+    axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
 
 
 def _homogeneity_summary(found: HomogeneityTolerance) -> Plain:
@@ -290,22 +300,15 @@ def _homogeneity_answer(found: HomogeneityTolerance) -> Answer:
     if share is not None and found.limit is not None:
         said = (f"{share_in_words(share, found.share_sd)} of the magnets "
                 f"are within {ppm(found.limit)} ppm rms. {said}")
-    enough = share is not None and share >= ENOUGH
-    step = (("The tolerances suffice: build the magnet, measure it, and update its blocks.",
-             "halbach-fe infer STUDY --measurements MAP -o DIR") if enough else
-            ("Look for a better design first: perfect blocks would leave "
-             f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured "
-             "blocks can use their errors against it, but takes only a part of it away.",
-             "halbach-fe design STUDY -o DIR" if obstacle(found.study) is None else
-             "halbach-fe sort STUDY BLOCKS -o DIR")
-            if found.ordered.rms_ppm > OF_THE_DESIGN * half else _sorting(found))
-    if found.table_doubts:
-        step = _sorting(found)
+    of_design = "" if found.ordered.rms_ppm <= OF_THE_DESIGN * half else (
+        "Look for a better design first: perfect blocks would leave "
+        f"{100 * found.ordered.rms_ppm / half:.3g} % of this deviation. Sorting measured blocks "
+        "can use their errors against it, but takes only a part of it away.")
     text, small = solver_error_text(found.model, half)
     return Answer(
         "How homogeneous is the field that the tolerances of the blocks leave?", said,
-        f"{_trust(found)} {whole(len(found.rms_ppm))} magnets were drawn. {text}", *step,
-        sound=small and not found.table_doubts)
+        f"{_trust(found)} {whole(len(found.rms_ppm))} magnets were drawn. {text}",
+        *_next_step(found, of_design), sound=small and not found.table_doubts)
 
 
 NOMINAL = ("Shapes and places count as nominal: what their tolerances make comes on top of these "
@@ -324,15 +327,13 @@ def tolerances_in_words(prior: Prior) -> str:
 
 def _deviation_figure(found: HomogeneityTolerance) -> Figure:
     """Draw the distribution functions of the rms and of the peak-to-peak deviation."""
-    figure = figure_of(3.6)
-    left, right = figure.subplots(1, 2, sharey=True)
+    figure, (left, right) = charts(3.6, 1, 2, sharey=True)
     for axis, values, ordered, name in (
             (left, found.rms_ppm, found.ordered.rms_ppm, "rms"),
             (right, found.peak_to_peak_ppm, found.ordered.peak_to_peak_ppm, "peak to peak")):
-        axis.plot(np.sort(values), np.arange(1, len(values) + 1) / len(values), color=POSTERIOR)
+        _draw_shares(axis, values)
         axis.axvline(ordered, color=PUBLISHED, lw=1.2, ls=":", label="all blocks as ordered")
         axis.set(xlabel=f"{name} deviation in ppm", ylim=(0, 1.02))
-        axis.grid(alpha=0.3)
         axis.xaxis.set_major_locator(MaxNLocator(4))  # numbers of five digits side by side
     left.set_ylabel("share of magnets")
     if found.limit is not None:

@@ -17,7 +17,6 @@ from halbach_fe.report.page import (
     PUBLISHED,
     SECOND,
     THIRD,
-    Drawn,
     Page,
     Rows,
     Section,
@@ -25,13 +24,13 @@ from halbach_fe.report.page import (
     Text,
     View,
     axis_of_points,
+    chart,
     columns_by_axis,
     csv_file,
-    figure_of,
     geometry_figure,
     label_logarithmic,
+    last_sections,
     legend_above,
-    stacked_axes,
 )
 from halbach_fe.report.words import (
     ROUNDING,
@@ -39,7 +38,6 @@ from halbach_fe.report.words import (
     flux_density,
     in_a_row,
     is_fourier,
-    listed,
     magnet_rows,
     ppm,
     relative,
@@ -202,26 +200,23 @@ def page(found: Verification) -> Page:
         f"{'the iron, ' if magnet.iron else ''}and the study's positions")
     fourier = (" Fourier: the same for the Fourier coefficients of B_r on the study's circles."
                if rows and "Fourier in ppm" in rows[0] else "")
-    changes = [Section([Table(rows, "numbers"), Text(
+    changes = Section([Table(rows, "numbers"), Text(
         f"Of the nominal magnet at the study's {len(found.points)} positions. Pointwise: the "
         f"largest change of B, in ppm of the largest field at these positions, {main_field}."
         f"{fourier} {error_basis(found)}", "small")],
-        "Changes of the model, and how much they change the field")] if rows else []
+        "Changes of the model, and how much they change the field", about=rows)
     model = {"route": found.route.replace("_", " "), "method": magnet.study.solver.method,
              "elements at the magnet": f"{1e3 * found.element_size_m:.3g} mm; finer by a factor of "
              f"{REFINEMENT}, coarser by it and by its square", **magnet_rows(magnet)}
-    size = 1e6 * change
     view = View(lambda: view_of_nominal_magnet(
         magnet, field_points(found.points, found.field) if not change.any() else ViewPoints(
-            found.points, size, "positions", "change by a<br>finer mesh in µT",
-            "a finer mesh changes B by %{customdata:.3g} µT",
-            (float(size.min()), float(size.max())))),
+            found.points, 1e6 * change, "positions", "change by a<br>finer mesh in µT",
+            "a finer mesh changes B by %{customdata:.3g} µT")),
         "positions of the study by the change of B that a finer mesh makes" if rows else
         "positions of the study by the magnitude of the field")
     return Page(
         "verify", "verification of the computed field", magnet.study, answer(found), found.plain(),
-        [*changes, Section([view]), Section([*map(Drawn, [*figures][1:])], "Pictures"),
-         Section([Table(listed(model))], "Model")],
+        [changes, Section([view]), *last_sections(figures, model)],
         {f"Changes of B in ppm of {main_field}, route {model['route']}": rows}, figures=figures,
         files={"verification.csv": csv_file(
             columns_by_axis("{}_m", found.points) | {
@@ -232,8 +227,7 @@ def page(found: Verification) -> Page:
 
 def _convergence_figure(found: Verification) -> Figure:
     """Draw the change by the next finer mesh, relative to the largest field, by element size."""
-    figure = figure_of(4.6)
-    axis = figure.subplots()
+    figure, axis = chart(4.6, grid=False)
     size = 1e3 * found.element_size_m
     sizes = (size * np.array([REFINEMENT**2, REFINEMENT, 1.0]))[_coarsest(found):]
     steps = 1e6 * np.array([difference.pointwise
@@ -262,7 +256,7 @@ def _convergence_figure(found: Verification) -> Figure:
 
 def _change_figure(found: Verification) -> Figure:
     """Draw the change of B at every position, for each change of the model."""
-    figure, (axis,) = stacked_axes(1)
+    figure, axis = chart(4.1)
     place, label = axis_of_points(found.points)
     for difference, change, colour, marker in zip(
             found.differences, found.changes, COLOURS, MARKERS, strict=False):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from typing import TypeVar
 
 import numpy as np
 
 from halbach_fe.core.arrays import Floats
-from halbach_fe.core.numbers import EMPTY_CELL
+from halbach_fe.core.numbers import EMPTY_CELL, first_of
 from halbach_fe.core.numbers import decimals as decimals
 from halbach_fe.core.numbers import in_a_row as in_a_row
 from halbach_fe.geometry.blocks import MagnetBlock, block_in_words
@@ -18,6 +19,8 @@ from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.geometry.symmetry import as_meant, is_as_meant
 from halbach_fe.study.model import Study, iron_of
 from halbach_fe.study.types import COMPONENTS
+
+T = TypeVar("T")
 
 ROUNDING = 1e-11
 """Fraction of a field below which its error is the rounding of the computer."""
@@ -61,6 +64,14 @@ def with_error(value: float, sd: float) -> str:
     places = int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))
     rounded = round(value, places) + 0.0  # without a sign where it is 0
     return f"{rounded:.{places}f}\u00a0±\u00a0{sd:.{places}f}"
+
+
+def with_unit(value: float, sd: float, unit: str) -> str:
+    """Return a number in SI and its standard deviation in a unit: per cent, or one of a thousandth
+    (mm, mT m) or a millionth (µT) if it begins with m or µ.
+    """
+    scale = {"%": 100.0, "m": 1e3, "µ": 1e6}.get(unit[0], 1.0)
+    return f"{with_error(scale * value, scale * sd)}\u00a0{unit}"
 
 
 def by_axis(name: str, values: Iterable[float], sd: Iterable[float]) -> dict[str, str]:
@@ -130,11 +141,11 @@ def share_in_words(share: float, sd: float | None) -> str:
     """
     if share in (0.0, 1.0):
         return "All" if share else "None"
-    return f"{with_error(100 * share, 100 * (sd or 0.0))}\u00a0%"
+    return with_unit(share, sd or 0.0, "%")
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return a number and its noun: 1 move, 2 moves."""
+    """Return a number and its noun, perhaps with its verb: 1 move, 2 moves; 1 is, 2 are."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
@@ -161,12 +172,12 @@ def faults_in_words(study: Study) -> str:
     magnet = build_magnet(study)
     found: dict[str, list[str]] = {}
     for block, meant in zip(magnet.blocks, as_meant(magnet).blocks, strict=True):
-        if (block.ring, block.slot) not in places or (
+        if block.place not in places or (
                 block.remanence and is_as_meant(block, meant, math.radians(as_ordered_deg))):
             continue
         kind = ("missing" if not block.remanence else "reversed" if block.remanence < 0 else
                 "made for another place"
-                if block.mounted_from not in (None, (block.ring, block.slot)) else
+                if block.mounted_from not in (None, block.place) else
                 "put in the wrong way")
         found.setdefault(kind, []).append(block_in_words(block.ring, block.slot))
     # largest number of blocks that a line names
@@ -184,6 +195,11 @@ def place_of(block: MagnetBlock) -> str:
 def fraction(value: float) -> str:
     """Format a fraction in percent, with one decimal."""
     return f"{100 * value:.1f}\u00a0%"
+
+
+def best_known(by_name: Mapping[str, T]) -> tuple[str, T]:
+    """Return the last of some magnets, which is the best known one, and its name."""
+    return list(by_name.items())[-1]
 
 
 def listed(values: Mapping[str, str]) -> list[dict[str, str]]:
@@ -261,7 +277,6 @@ def iron_description(magnet: Magnet) -> str:
             f", z {1e3 * body.z_min:g} to {1e3 * body.z_max:g} mm")
         bodies.append(f"{kind}, r {1e3 * body.inner_radius:g} to "
                       f"{1e3 * body.outer_radius:g} mm{length}")
-    more = f" and {len(bodies) - 4} more" if len(bodies) > 4 else ""
     if any(body.own_material for body in getattr(iron, "bodies", ())):
         material = "iron of several materials"
     elif iron.curve is None:
@@ -270,7 +285,12 @@ def iron_description(magnet: Magnet) -> str:
         material = f"magnetization curve ({iron.curve.kind.replace('_', '–').title()})"
         if iron.curve.kind == "steel":
             material = f"steel {iron.curve.name}"
-    return f"{material}; {'; '.join(bodies[:4])}{more}"
+    return f"{material}; {first_of(bodies, 4, '; ')}"
+
+
+def capital(text: str) -> str:
+    """Return a text whose first letter is large, as that of a sentence."""
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def within_a_sentence(text: str) -> str:

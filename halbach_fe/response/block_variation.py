@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sparse
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, radii_of
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -180,7 +180,7 @@ def _select_cells(cells: Cells, chosen: slice) -> Cells:
 
 def _cylinder(block: MagnetBlock, places: Floats) -> Floats:
     """Return points (n, 3) in m in the bore near a block whose parts are at places (m, 3) in m."""
-    radius = np.hypot(places[:, 0], places[:, 1])
+    radius = radii_of(places)
     angle = np.arctan2(*(places.mean(axis=0)[[1, 0]]))
     low, high = places[:, 2].min(), places[:, 2].max()
     reach = (high - low) / 2

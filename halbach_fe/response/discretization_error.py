@@ -6,7 +6,6 @@ All errors are those of the full nominal array, because the errors of the blocks
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from math import ceil
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from halbach_fe.core.arrays import Floats, of_length
 from halbach_fe.core.notebook import ShownInNotebook
+from halbach_fe.core.pace import Say, quiet
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation, fourier_analysis
@@ -281,7 +281,7 @@ class Verification(ShownInNotebook):
 
 @alone
 def verify(
-    magnet: Magnet, session: Session = NOT_KEPT, say: Callable[[str], None] = lambda _: None
+    magnet: Magnet, session: Session = NOT_KEPT, say: Say = quiet
 ) -> Verification:
     """Estimate the error of the solved field of the nominal magnet.
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson, simpson
 
-from halbach_fe.core.arrays import Floats, plain
+from halbach_fe.core.arrays import Bools, Floats, plain
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import MU_0, check_number
 from halbach_fe.geometry.blocks import present_blocks
@@ -360,7 +360,7 @@ class _Beside:
         step = np.full(len(lines.points), relative * magnet.radius)
         halvings = 8
 
-        def blocked(factors: tuple[int, ...], numbers: NDArray[np.intp]) -> NDArray[np.bool_]:
+        def blocked(factors: tuple[int, ...], numbers: NDArray[np.intp]) -> Bools:
             found = np.zeros(len(numbers), bool)
             for factor in factors:
                 shift = factor * step[numbers, None, None] * lines.axes[0]
@@ -507,60 +507,73 @@ def _through_blocks(
     StudyError
         If blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
     """
-    blocks, count = magnet.blocks, len(magnetizations.mean)
-    flat = magnet.dimension == 2
-    uniform = (count == magnet.dimension * len(blocks)
-               and all(len(block.parts) == 1 for block in blocks))
-    if not uniform or magnet.has_losses or not (flat or applies(magnet)):
+    blocks = magnet.blocks
+    in_iron = number >= len(blocks)
+    _check_inside(magnet, len(magnetizations.mean), int(in_iron.sum()))
+    check_plane(magnet, points, OF_LINES)
+    points = points.copy()
+    points[number < 0] = check_points(magnet, points[number < 0], OF_LINES)
+    if magnet.dimension == 2:
+        return _through_cross_section(magnet, points, number, magnetizations, session)
+    solved = None if magnet.is_vacuum else solve_separate(magnet, session)
+    nominal, weak = _nominal_strength(magnet, points, number, solved)
+    tensors = np.array([block.recoil_tensor for block in blocks])
+    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
+                              magnetizations.root]).reshape(len(blocks), 3, -1)
+    remanence = MU_0 * tensors @ change
+    strength = np.zeros((*points.shape, change.shape[2]))
+    for block, field in enumerate(unit_fields(blocks, points[~in_iron])):
+        strength[~in_iron] += field @ remanence[block]
+    if solved is not None and solved.iron is not None:
+        _add_answer(strength, solved.iron, magnet, remanence, points, in_iron)
+    weak += np.abs(tensors - np.eye(3)).max(initial=0.0) * np.abs(strength[..., 0])
+    strength[..., 0] += nominal
+    polarization, error = np.zeros_like(strength), weak.copy()
+    remanence[..., 0] += np.array([block.polarization for block in blocks])
+    for body in set(number[number >= 0].tolist()):
+        here = number == body
+        if body >= len(blocks):
+            polarization[here], times = _induced(magnet.iron[body - len(blocks)], strength[here])
+            error[here] *= times
+        else:
+            tensor = tensors[body]
+            polarization[here] = remanence[body] + (tensor - np.eye(3)) @ strength[here]
+            error[here] = error[here] @ np.abs(tensor)
+    return strength + polarization, polarization, (error, weak)
+
+
+def _check_inside(magnet: Magnet, parameters: int, in_iron: int) -> None:
+    """Raise a StudyError if the field inside the blocks, or at so many points in iron, is not known
+    here.
+    """
+    uniform = (parameters == magnet.dimension * len(magnet.blocks)
+               and all(len(block.parts) == 1 for block in magnet.blocks))
+    if not uniform or magnet.has_losses or not (magnet.dimension == 2 or applies(magnet)):
         raise StudyError(must_be(
             "points inside blocks", magnet.name, "of a magnet of uniform blocks without "
             "irreversible losses, and in 3D of the method reaction", "another magnet",
             "End the line before the blocks."))
-    outside, in_iron = number < 0, number >= len(blocks)
-    if in_iron.any() and magnet.external != External() and not external_acts(magnet):
+    if in_iron and magnet.external != External() and not external_acts(magnet):
         raise StudyError(must_be(
             "points inside iron", magnet.name, "of a study without `external`, to which this iron "
-            "does not answer here", f"{in_iron.sum()} such points",
+            "does not answer here", f"{in_iron} such points",
             "Leave `external` out, or end the line before the iron."))
-    check_plane(magnet, points, OF_LINES)
-    points = points.copy()
-    points[outside] = check_points(magnet, points[outside], OF_LINES)
-    if flat:
-        return _through_cross_section(magnet, points, number, magnetizations, session)
-    solved = None if magnet.is_vacuum else solve_separate(magnet, session)
+
+
+def _nominal_strength(
+    magnet: Magnet, points: Floats, number: NDArray[np.intp], solved: SeparateReaction | None
+) -> tuple[Floats, Floats]:
+    """Return mu_0 H (n, 3) in T of the nominal magnet, and its bars; see `_through_blocks`."""
+    in_iron = number >= len(magnet.blocks)
     free = np.flatnonzero(~in_iron)
     strength, error = np.zeros_like(points), np.zeros_like(points)
-    strength[free] = external_field(magnet, points[free]) + field_of(blocks, points[free])
+    strength[free] = external_field(magnet, points[free]) + field_of(magnet.blocks, points[free])
     if solved is not None:
         reaction, error[free] = _reaction(magnet, points[free], number[free], solved)
         strength[free] += reaction
         if solved.iron is not None and in_iron.any():
             strength[in_iron], error[in_iron] = solved.iron.inside(points[in_iron])
-    tensors = np.array([block.recoil_tensor for block in blocks])
-    change = np.column_stack([magnetizations.mean - magnet.nominal_magnetization,
-                              magnetizations.root]).reshape(len(blocks), 3, -1)
-    remanence = MU_0 * tensors @ change
-    of_change = np.zeros((*points.shape, change.shape[2]))
-    for block, field in enumerate(unit_fields(blocks, points[free])):
-        of_change[free] += field @ remanence[block]
-    if solved is not None and solved.iron is not None:
-        _add_answer(of_change, solved.iron, magnet, remanence, points, in_iron)
-    error += np.abs(tensors - np.eye(3)).max(initial=0.0) * np.abs(of_change[..., 0])
-    of_change[..., 0] += strength
-    polarization = np.zeros_like(of_change)
-    nominal = np.array([block.polarization for block in blocks])
-    remanence[..., 0] += nominal
-    weak = error.copy()
-    for body in set(number[in_iron]):
-        here = number == body
-        polarization[here], times = _induced(magnet.iron[body - len(blocks)], of_change[here])
-        error[here] *= times
-    for block in set(number[~outside & ~in_iron]):
-        here = number == block
-        chi = tensors[block] - np.eye(3)
-        polarization[here] = remanence[block] + chi @ of_change[here]
-        error[here] = error[here] @ np.abs(tensors[block])
-    return of_change + polarization, polarization, (error, weak)
+    return strength, error
 
 
 def _through_cross_section(
@@ -624,7 +637,7 @@ def _linearized(factor: Floats, slope: Floats, field: Floats) -> Floats:
 
 def _add_answer(
     of_change: Floats, iron: IronReaction | BodiesReaction, magnet: Magnet, remanence: Floats,
-    points: Floats, in_iron: NDArray[np.bool_]
+    points: Floats, in_iron: Bools
 ) -> None:
     """Add to mu_0 H (n, 3, q) in T of deviations what iron answers to them.
 

@@ -23,10 +23,9 @@ from math import factorial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import lpmv, roots_jacobi
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats, azimuths_of
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.numbers import check_number
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -187,7 +186,7 @@ class Region:
                 "cylinder": f"a cylinder of {2 * x:g} mm diameter and {2 * z:g} mm length",
                 }[self.shape] + where
 
-    def contains(self, points: Floats) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Return which of the points (n, 3) in m are in the region."""
         x, y, z = ((points - self.centre_m) / self.half_axes_m).T
         if self.shape == "cylinder":
@@ -497,7 +496,7 @@ class HomogeneityModel:
     region: Region
     points: Floats
     sampling: Sampling
-    in_air: NDArray[np.bool_]
+    in_air: Bools
     response: Response
     degrees: int
 
@@ -708,7 +707,7 @@ def real_harmonics(
     sphere of a radius, relative to that of the amplitudes.
     """
     points, weights = sphere_points(surface_degree)
-    phi = np.arctan2(points[:, 1], points[:, 0])
+    phi = azimuths_of(points)
     terms, rows = [], []
     for degree in range(1, degrees + 1):
         for order in range(degree + 1):

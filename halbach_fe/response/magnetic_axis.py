@@ -28,7 +28,7 @@ from itertools import product
 import numpy as np
 from scipy import optimize
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, unit_circle
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import flux_density_at
@@ -106,7 +106,7 @@ def magnetic_axis(
     heights = np.zeros(1) if flat else np.linspace(-reach, reach, HEIGHTS)
     count = 2 * (order + 2)
     angles = 2 * np.pi * np.arange(count) / count
-    circle = radius * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    circle = radius * unit_circle(angles)
     around = (circle + heights[:, None, None] * [0, 0, 1.0]).reshape(-1, 3)
     # radius of the sphere on which a dipole's field is expanded, relative to that of the bore
     sphere = bore / 4 * _ON_SPHERE

@@ -30,12 +30,13 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.integrate import quad_vec
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.coils import points_in_winding
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
+from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
 from halbach_fe.response.block_variation import Deviations
@@ -488,9 +489,9 @@ def _aliases(
     # relative difference of radii up to which points are on one circle, and angle in rad up to
     # which points on it are one
     same_radius, same_angle = 2e-6, 1e-6
-    here = points[np.isclose(np.hypot(points[:, 0], points[:, 1]), radius, rtol=same_radius)
+    here = points[np.isclose(radii_of(points), radius, rtol=same_radius)
                   & np.isclose(points[:, 2], z, atol=SAME_HEIGHT_M)]
-    own = len(np.unique(np.round(np.arctan2(here[:, 1], here[:, 0]) / same_angle)))
+    own = len(np.unique(np.round(azimuths_of(here) / same_angle)))
     # orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
     # first; where circles are near the blocks or outside of the bore, the second is their decay
     alias_left, slowest_decay = 1e-6, 0.95
@@ -498,7 +499,7 @@ def _aliases(
     needed = orders + int(np.ceil(np.log(alias_left) / np.log(decay)))
     times = max(1, int(np.ceil(needed / own)))
     angle = np.arctan2(here[0, 1], here[0, 0]) + 2 * np.pi * np.arange(times * own) / (times * own)
-    direction = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    direction = unit_circle(angle)
     places = radius * direction
     places[:, 2] = z
     columns = deviations.columns(places).reshape(len(places), 3, -1)
@@ -725,18 +726,18 @@ def _integrals_of_coils(
                          for number, coil in enumerate(external.coils, start=1)),
                        *((f"dipoles[{number}]", np.array([one.position_m]))
                          for number, one in enumerate(external.dipoles, start=1))):
-        if (nearest := np.hypot(each[:, 0], each[:, 1]).min()) < radius:
+        if (nearest := radii_of(each).min()) < radius:
             raise StudyError(must_be(
                 f"`external.{name}`", f"study {magnet.name}", "outside the circle, at whatever z, "
                 f"for multipoles that are integrated along z: farther than {radius:g} m from the "
                 "axis", f"{nearest:.4g} m", "Ask on a circle at one place: --at-z-m Z, in Python "
                 "MultipoleReference(z_m=Z)."))
     alone = magnet.with_(external=external)
-    angle = np.arctan2(circle[:, 1], circle[:, 0])
+    angle = azimuths_of(circle)
     wave = np.exp(-1j * np.outer(np.arange(highest), angle)) / len(angle)
 
     def harmonics(z: float) -> Floats:
-        field = external_field(alone, np.column_stack([circle[:, :2], np.full(len(circle), z)]))
+        field = external_field(alone, at_heights(circle[:, :2], z))
         found = wave @ (field[:, 1] + 1j * field[:, 0])
         return np.concatenate([found.real, found.imag])
 

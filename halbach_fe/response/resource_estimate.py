@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 from halbach_fe.core.errors import MeasurementError, PointsOutsideError
 from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.blocks import present_blocks
@@ -284,7 +284,7 @@ def decisive_points(magnet: Magnet, points: Floats) -> Observation:
     """
     decisive = [
         np.argmax(mode_decay(magnet, points)) if magnet.dimension == 3 else 0,
-        np.argmax(np.hypot(points[:, 0], points[:, 1])), np.argmax(np.abs(points[:, 2]))]
+        np.argmax(radii_of(points)), np.argmax(np.abs(points[:, 2]))]
     if is_axisymmetric(magnet):
         places = unique_points(meridian_points(magnet, points))[1]
         decisive += np.unique(places, return_index=True)[1][:len(magnet.blocks_by_ring)].tolist()

@@ -43,7 +43,7 @@ import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 from scipy.sparse.csgraph import connected_components
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, azimuths_of, radii_of
 from halbach_fe.core.errors import NotConvergedError
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.symmetry import unique_points
@@ -380,7 +380,7 @@ def _inside(
 def highest_mode_at(bodies: Sequence[IronSolid], points: Floats) -> int | None:
     """Return the highest mode that iron produces at points (n, 3) in m; None for all modes."""
     inner = min(body.inner_radius for body in bodies)
-    radius = float(np.hypot(points[:, 0], points[:, 1]).max(initial=0.0))
+    radius = float(radii_of(points).max(initial=0.0))
     if radius >= 0.999 * inner:
         return None
     # modes are left out at points in a bore where (r / inner radius)^m is smaller
@@ -404,7 +404,7 @@ def _evaluate(
     """
     mesh = modes.mesh
     check_inside(name, mesh.radius, mesh.half_length, points)
-    r, phi = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
+    r, phi = radii_of(points), azimuths_of(points)
     # points nearer to the axis than this fraction of the grid's first line are moved there, since
     # psi/r is a limit on the axis
     axis_radius = 1e-6

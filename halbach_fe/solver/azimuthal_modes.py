@@ -32,7 +32,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import pro
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -99,7 +99,7 @@ def is_axisymmetric(magnet: Magnet) -> bool:
     return bool(alike.all())
 
 
-def few_modes_suffice(magnet: Magnet, points: Floats) -> NDArray[np.bool_]:
+def few_modes_suffice(magnet: Magnet, points: Floats) -> Bools:
     """Tell at which points (n, 3) in m at most 64 modes matter, if the route applies."""
     if not is_axisymmetric(magnet):
         return np.zeros(len(points), bool)
@@ -122,7 +122,7 @@ def mode_decay(magnet: Magnet, points: Floats) -> Floats:
     (H. S. Cohl and J. E. Tohline, Astrophys. J. 527 (1999) 86). It falls by exp(-arcosh x) from one
     mode to the next: by r/s inside the circle in its plane. The nearest circle of each ring counts.
     """
-    r = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
+    r = np.maximum(radii_of(points), 1e-9)
     decay = np.zeros(len(points))
     for (low, high), (inner, outer) in magnet.ring_sections:
         distance = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0)
@@ -213,7 +213,7 @@ of single blocks: what they add to those in vacuum or, for the method ``direct``
 
 def meridian_points(magnet: Magnet, points: Floats) -> Floats:
     """Return (r, z, 0) of points (n, 3) in m; those beside the axis are moved onto it."""
-    r = np.hypot(points[:, 0], points[:, 1])
+    r = radii_of(points)
     r[r < AXIS_RADIUS * magnet.bore_radius] = 0.0
     return np.column_stack([r, points[:, 2], 0 * r])
 
@@ -482,7 +482,7 @@ def read_run(case: ModesCase, folder: Path, modes: int, sources: int, printed: i
     return result.reshape(modes, sources, *result.shape[1:])
 
 
-def _limit_on_axis(m: int, gradient: Floats, on_axis: NDArray[np.bool_]) -> None:
+def _limit_on_axis(m: int, gradient: Floats, on_axis: Bools) -> None:
     """Replace d psi/dr, psi/r, d psi/dz (..., points, 3) on the axis by their limits, in place.
 
     Near the axis psi_m is proportional to r^m. The functions of the elements are not, so that their
@@ -519,7 +519,7 @@ def _superpose(
     ndarray, shape (1 + 3 len(blocks), n, 3), in T
         As `solve_modes` returns it.
     """
-    phi = np.arctan2(points[:, 1], points[:, 0])
+    phi = azimuths_of(points)
     everything = case.magnet.blocks
     result = np.zeros((1 + 3 * len(blocks), len(points), 3))
     for part in NOMINAL:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.coils import closed_polygon, closest, distance, turn_corners
@@ -175,7 +175,7 @@ def current_elements(coil: AnyCoil) -> tuple[Floats, Floats]:
         shares, turns = _filaments(coil, 12)
     else:
         angle = np.linspace(0, 2 * np.pi, round(1 / longest) + 1)
-        circle = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+        circle = unit_circle(angle)
         # a polygon of the same area
         circle *= np.sqrt(angle[1] / np.sin(angle[1]))
         rules = [_gauss(side, 4) for side in coil.section_m]

@@ -21,6 +21,7 @@ from typing import Any
 
 from halbach_fe.core.errors import GetDPError, HalbachError, SchedulerError
 from halbach_fe.core.optional_packages import import_extra
+from halbach_fe.core.pace import Say, quiet
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.getdp import GetDP, Job
 
@@ -134,7 +135,7 @@ class Cluster:
 
 @contextmanager
 def connected(
-    address: str, say: Callable[[str], None] = lambda text: None
+    address: str, say: Say = quiet
 ) -> Iterator[Cluster]:
     """Connect to a Dask scheduler, and disconnect at the end of the context.
 

@@ -35,7 +35,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of
 from halbach_fe.core.threads import in_threads, share_out
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of, rotation_about_z
 from halbach_fe.geometry.magnet import Magnet
@@ -255,7 +255,7 @@ def _equidistant_angles(points: Floats) -> int:
     """Return at how many equidistant angles points (angles k, 3) on circles lie; 1 for others."""
     if len(points) < 2:
         return 1
-    radius = np.hypot(points[:, 0], points[:, 1])
+    radius = radii_of(points)
     # distance, relative to the largest coordinate, below which points are the same: some rounding
     # errors
     rounding = 1e-13
@@ -319,7 +319,7 @@ def block_gradients(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[F
     The radial and azimuthal derivatives are central differences, or one-sided ones where a step
     would lead into the block. Those along z follow from curl B = 0 and div B = 0.
     """
-    angle = np.arctan2(points[:, 1], points[:, 0])
+    angle = azimuths_of(points)
     zero = np.zeros(len(points))
     radial = np.column_stack([np.cos(angle), np.sin(angle), zero])
     azimuthal = np.column_stack([-np.sin(angle), np.cos(angle), zero])

@@ -29,7 +29,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import GetDPError, PointsOutsideError
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import Unknowns
@@ -279,7 +279,7 @@ def _barycentric(reference: Floats) -> tuple[Floats, Floats]:
 
 def _invert(
     nodes: Floats, points: Floats, slack: float
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Invert the map from reference coordinates to space by Newton's method.
 
     Parameters
@@ -510,7 +510,7 @@ def grid_operators(
         joined(along_r, slope_r, at_z), joined(along_z, at_r, slope_z)]
 
 
-def _grid(mesh: VerifiedMesh) -> tuple[tuple[Floats, Floats], Ints, NDArray[np.bool_]]:
+def _grid(mesh: VerifiedMesh) -> tuple[tuple[Floats, Floats], Ints, Bools]:
     """Return the grid lines (r, z) in m, the node at each crossing, and which cells are not air."""
     places = np.round(mesh.points[:, :2], SAME_LINE)
     r, z = (np.unique(places[:, axis]) for axis in range(2))
@@ -551,8 +551,8 @@ def _cells_around(lines: Floats, first: Ints) -> tuple[Ints, Ints]:
 
 
 def _are_air(
-    material: NDArray[np.bool_], of_r: tuple[Ints, Ints], of_z: tuple[Ints, Ints]
-) -> NDArray[np.bool_]:
+    material: Bools, of_r: tuple[Ints, Ints], of_z: tuple[Ints, Ints]
+) -> Bools:
     """Tell of which ranges of cells along r and z, from the first to before the last, are air."""
     count = np.zeros((material.shape[0] + 1, material.shape[1] + 1), int)
     count[1:, 1:] = material.cumsum(axis=0).cumsum(axis=1)

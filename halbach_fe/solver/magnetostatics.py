@@ -40,7 +40,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import pro
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, radii_of
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import PointsOutsideError
 from halbach_fe.core.files import make_folder
@@ -617,7 +617,7 @@ def check_inside(name: str, radius_m: float, half_length_m: float, points: Float
     ------
     PointsOutsideError
     """
-    radius = np.hypot(points[:, 0], points[:, 1])
+    radius = radii_of(points)
     outside = (radius > radius_m) | (np.abs(points[:, 2]) > half_length_m)
     if outside.any():
         x, y, z = points[np.argmax(outside)]

@@ -15,10 +15,9 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-from numpy.typing import NDArray
 
 from halbach_fe.core import untrusted
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeshError, OutputError, must_be
 from halbach_fe.core.threads import available_memory
 from halbach_fe.geometry.domain import Regions, boundary_half_length, boundary_radius
@@ -101,8 +100,8 @@ class VerifiedMesh:
     points: Floats
     cells: Ints
     cell_type: str
-    in_air: NDArray[np.bool_]
-    in_iron: NDArray[np.bool_]
+    in_air: Bools
+    in_iron: Bools
     tags: Ints
     inner: Entities
     axis: Entities

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, azimuths_of, radii_of
 
 Complexes = NDArray[np.complex128]
 
@@ -142,8 +142,8 @@ def layered_bore_field(
             radii += [iron[1]]
             permeability = [1.0, recoil_permeability, iron[2], 1.0]
     r = np.array(radii) / inner_radius
-    rho = np.hypot(points[:, 0], points[:, 1]) / inner_radius
-    theta = np.arctan2(points[:, 1], points[:, 0])
+    rho = radii_of(points) / inner_radius
+    theta = azimuths_of(points)
     field = np.zeros(len(points), complex)  # B_r + i B_theta
     for k in range(1, terms + 1):
         a = _bore_coefficient(sectors, r, permeability, k)

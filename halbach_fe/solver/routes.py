@@ -17,7 +17,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from halbach_fe.core.arrays import Floats, Ints, plain
+from halbach_fe.core.arrays import Floats, Ints, plain, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.domain import boundary_half_length, boundary_radius
@@ -553,7 +553,7 @@ def check_points(
             warnings.warn(remark, HalbachWarning, stacklevel=2)
     if mesh is None:
         return points
-    directions = [(np.hypot(points[:, 0], points[:, 1]), magnet.radius,
+    directions = [(radii_of(points), magnet.radius,
              boundary_radius(magnet, mesh))]
     if magnet.dimension == 3:
         directions.append((np.abs(points[:, 2]), magnet.half_length,

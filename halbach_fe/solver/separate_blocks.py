@@ -141,7 +141,7 @@ def solve_separate(
     if not systems:
         return SeparateReaction((), _solve_iron(magnet, remanent, session, estimate))
     iron = _solve_iron(magnet, remanent, session.within("turns"), rough=True)
-    middles = np.array([block.middle + block.displacement_m for block in blocks])
+    middles = np.array([block.mounted_middle for block in blocks])
     scale = max(abs(block.remanence) for block in blocks)
     before = iron.field(middles)
     # largest change of the iron's field in the blocks at which the alternation ends, relative to

@@ -14,13 +14,12 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 
-Rows = slice | Ints | NDArray[np.bool_]
+Rows = slice | Ints | Bools
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.special as special
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.stats.gaussian import Gaussian, block_diagonal_root, stacked_root
 
 
@@ -195,7 +195,7 @@ BINS = 10
 def ranks(
     prior: Gaussian, simulate: Simulator, sampler: Sampler, repeats: int,
     generator: np.random.Generator,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = quiet,
 ) -> tuple[Ints, int]:
     """Simulate ``repeats`` inferences and rank the true parameters among posterior draws.
 
@@ -276,7 +276,7 @@ class Bin:
 
 
 def frequencies(
-    stated: Floats, happened: NDArray[np.bool_], edges: Sequence[float]
+    stated: Floats, happened: Bools, edges: Sequence[float]
 ) -> tuple[Bin, ...]:
     """Return how often statements were true, for bins of their probability.
 

@@ -12,10 +12,9 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.numbers import in_a_row
 from halbach_fe.study.grades import Material, columns_with_grades
 from halbach_fe.study.types import (
@@ -243,12 +242,12 @@ class FreeBlocks(StudyModel):
         self._refuse((components > 0) & (components < len(REMANENCE_VECTOR)),
                      f"needs all of {', '.join(REMANENCE_VECTOR)}")
 
-    def given(self, column: str) -> NDArray[np.bool_]:
+    def given(self, column: str) -> Bools:
         """Tell which blocks have a value in a column, (n,)."""
         values = getattr(self, column) or (None,) * len(self)
         return np.array([value is not None for value in values])
 
-    def _refuse(self, wrong: NDArray[np.bool_], reason: str) -> None:
+    def _refuse(self, wrong: Bools, reason: str) -> None:
         """Raise RowError for the first block that is wrong, with the reason why."""
         if wrong.any():
             number = int(np.argmax(wrong))

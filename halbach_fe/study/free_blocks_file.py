@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from halbach_fe.core import untrusted
-from halbach_fe.core.errors import OutputError, StudyError, must_be
+from halbach_fe.core.errors import OutputError, StudyError, must_be, not_utf8
 from halbach_fe.core.files import workbook_in, workbook_sentence, write_text
 from halbach_fe.core.numbers import (
     MAX_CELL,
@@ -183,9 +183,7 @@ def _csv(raw: bytes, where: str) -> _Content:
     try:
         text = raw.decode("utf-8-sig")  # spreadsheets write a byte order mark
     except UnicodeDecodeError as error:
-        raise StudyError(must_be("encoding", where, "UTF-8",
-                                 f"byte 0x{raw[error.start]:02x} at {error.start}",
-                                 "Save it as UTF-8 text.")) from None
+        raise StudyError(not_utf8(where, error)) from None
     lines = numbered_lines(text)
     _check_count(len(lines) - 1, where)
     if (separator := other_separator(lines[0][1])) is not None:

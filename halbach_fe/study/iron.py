@@ -12,7 +12,7 @@ import scipy.sparse as sparse
 from pydantic import Field, model_validator
 from scipy.sparse.csgraph import connected_components
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, face_vectors, polygon_area
 from halbach_fe.study import materials
 from halbach_fe.study.types import (
     COMPONENTS,
@@ -281,8 +281,7 @@ class IronHole(StudyModel):
             return np.asarray(np.column_stack([self.x_m + self.radius_m * np.cos(angle),
                                                self.y_m + self.radius_m * np.sin(angle)]))
         corners = np.array(self.outline_m)
-        x, y = corners.T
-        return corners if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0 else corners[::-1]
+        return corners if polygon_area(corners) < 0 else corners[::-1]
 
     def mirrored(self, sign: Floats) -> IronHole:
         """Return the hole with its x and y times signs (2,)."""
@@ -433,8 +432,7 @@ def closed_surface(triangles: Floats) -> Floats:
         If the surface is open, some triangles are turned over, or it is that of several bodies.
     """
     size = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
-    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    if not (np.linalg.norm(across, axis=1) > 1e-12 * size**2).all():
+    if not (np.linalg.norm(face_vectors(triangles), axis=1) > 1e-12 * size**2).all():
         raise ValueError("every triangle must have an area; remove those without")
     same = 1e-6  # distance of corners that are one, relative to the size: STL has seven digits
     number = np.unique((triangles / (same * size)).round().reshape(-1, 3), axis=0,

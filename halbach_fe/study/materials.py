@@ -17,10 +17,9 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.files import workbook_in
 from halbach_fe.core.numbers import MU_0 as MU_0
 from halbach_fe.core.numbers import numbered_lines, parse_number
@@ -268,7 +267,7 @@ def check_table(field: Floats, flux_density: Floats) -> tuple[Floats, Floats]:
     return np.append(0.0, h), np.append(0.0, b)
 
 
-def _check_points(bad: NDArray[np.bool_], h: Floats, b: Floats, problem: str) -> None:
+def _check_points(bad: Bools, h: Floats, b: Floats, problem: str) -> None:
     """Raise ValueError for the first of the points that are marked as bad."""
     if bad.any():
         first = int(np.argmax(bad))

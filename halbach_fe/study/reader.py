@@ -17,7 +17,14 @@ import numpy as np
 from pydantic import ValidationError
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.errors import MAX_QUOTED, HalbachWarning, StudyError, must_be, printable
+from halbach_fe.core.errors import (
+    MAX_QUOTED,
+    HalbachWarning,
+    StudyError,
+    must_be,
+    not_utf8,
+    printable,
+)
 from halbach_fe.core.files import as_path
 from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
@@ -69,10 +76,7 @@ def read_study(path: str | Path) -> Study:
     try:
         text = raw.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
-        raise StudyError(
-            must_be("encoding", where, "UTF-8", f"byte 0x{raw[error.start]:02x} at {error.start}",
-                    "Save it as UTF-8 text.")
-        ) from None
+        raise StudyError(not_utf8(where, error)) from None
     try:
         document = tomllib.loads(text)
     except RecursionError:

@@ -9,7 +9,6 @@ from types import NoneType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -20,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import sentences
 
@@ -74,7 +73,7 @@ Component = Literal["x", "y", "z"]
 COMPONENTS: tuple[Component, ...] = ("x", "y", "z")
 
 
-def look_like_mm(points: Floats, reach_m: float = USUAL_REACH_M) -> NDArray[np.bool_]:
+def look_like_mm(points: Floats, reach_m: float = USUAL_REACH_M) -> Bools:
     """Tell of points (n, 3), read in m, which are rather in mm, for a magnet of a reach in m.
 
     The limit is half-way by factors between 1 m and 1 mm: beyond it, a thousandth of the distance
@@ -213,7 +212,7 @@ MAX_PAIRS = 2_000_000
 """Number of pairs of edges that are compared at once."""
 
 
-def crossing(polygons: Floats) -> NDArray[np.bool_]:
+def crossing(polygons: Floats) -> Bools:
     """Tell which of the polygons (n, corners, 2) have edges that cross, or no area, (n,)."""
     count = polygons.shape[1]
     first, second = np.triu_indices(count, 1)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.arrays import unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study.array import Array, Block, BlockException
 from halbach_fe.study.free_blocks import FreeBlocks
@@ -174,7 +175,7 @@ def _magnetized(
             easy = body.carried_from(nominal[made_for]).apply(nominal[made_for].easy_axis)
         if exception.magnetization_angle_deg is not None:
             direction = np.radians(exception.magnetization_angle_deg) - body.angle
-            easy = np.array([np.cos(direction), np.sin(direction), 0.0])
+            easy = unit_circle(direction)
         if exception.remanence_T is not None:
             strength = exception.remanence_T
         if exception.recoil_permeability is not None:

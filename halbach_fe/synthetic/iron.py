@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import materials
 from halbach_fe.study.iron import Iron, IronMaterial
@@ -95,7 +94,7 @@ class Tube(IronShape):
     half_length: float
     middle: float = 0.0
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""
         x, y, z = self.in_own_axes(points).T
         radius = np.hypot(x, y)
@@ -121,7 +120,7 @@ class Pole(IronShape):
     half_length: float
     middle: float = 0.0
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""
         return PolygonBody(self.outline, 2 * self.half_length).holds(
             self.in_own_axes(points) - [0, 0, self.middle])
@@ -133,7 +132,7 @@ class Ball(IronShape):
 
     radius: float
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""
         return np.asarray(np.linalg.norm(points - self.origin, axis=1) <= self.radius)
 

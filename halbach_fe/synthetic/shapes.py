@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats, radii_of
 
 Fractions = tuple[float, float]
 Vector = tuple[float, float, float]
@@ -103,7 +103,7 @@ class SectorBody:
         points = np.stack([r * np.cos(a) - self.middle, r * np.sin(a), z], axis=-1)
         return points.reshape(-1, 3), self.volume * volume.ravel() / volume.sum()
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m, in the shape's axes, are inside or on the surface."""
         x, y, z = points.T
         x = x + self.middle
@@ -194,7 +194,7 @@ class PrismBody:
         points = np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
         return points.reshape(-1, 3), self.volume * volume.ravel() / volume.sum()
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m, in the shape's axes, are inside or on the surface."""
         corners = self.part()
         inside = np.abs(points[:, 2]) <= self.length / 2
@@ -286,7 +286,7 @@ class PolygonBody:
                 volumes.append(area * share * self.length)
         return np.vstack(points), np.concatenate(volumes)
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m, in the shape's axes, are inside or on the surface.
 
         The sum of the angles that the edges subtend is a full turn inside (the winding number).
@@ -333,9 +333,9 @@ class CylinderBody:
         points = np.stack([r * np.cos(a), r * np.sin(a), z], axis=-1)
         return points.reshape(-1, 3), self.volume * volume.ravel() / volume.sum()
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m, in the shape's axes, are inside or on the surface."""
-        return (np.hypot(points[:, 0], points[:, 1]) <= self.radius) & (
+        return (radii_of(points) <= self.radius) & (
             np.abs(points[:, 2]) <= self.length / 2)
 
 

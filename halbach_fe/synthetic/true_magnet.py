@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Bools, Floats
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.study.materials import MU_0
@@ -197,7 +196,7 @@ class Body:
         own = self.orientation.inv().apply(magnetization)
         return replace(self, remanence=vector(MU_0 * self.permeability @ own))
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside or on the surface."""
         near = np.linalg.norm(points - self.position, axis=1) <= self.shape.reach * (1 + 1e-9)
         near[near] = self.shape.holds(self.in_shape(points[near]))
@@ -324,7 +323,7 @@ class TrueMagnet:
             body.with_magnetization(magnetization)
             for body, magnetization in zip(self.bodies, full, strict=True)))
 
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
+    def holds(self, points: Floats) -> Bools:
         """Tell which points (n, 3) in m are inside a block or the iron."""
         inside = np.zeros(len(points), bool)
         for body in self.all_bodies:

@@ -19,8 +19,8 @@ from halbach_fe.report.page import (
     Page,
     Section,
     Table,
+    chart,
     legend_above,
-    stacked_axes,
 )
 from halbach_fe.report.point_maps import MARKERS, main_line, parts_of, predictions
 
@@ -48,8 +48,7 @@ class PublishedErrors:
 def relative_error_figure(result: InferenceResult, published: PublishedErrors) -> Figure:
     """Draw the relative error |measured - predicted| / |measured| along the main line."""
     line = main_line(result)
-    figure, (axis,) = stacked_axes(1)
-    figure.set_figheight(4.5)
+    figure, axis = chart(4.5)
     for name, errors, style in (("prior", published.prior, ":"),
                                 ("posterior", published.posterior, "-")):
         axis.semilogy(1e3 * published.z, errors, style, color=PUBLISHED, lw=1,

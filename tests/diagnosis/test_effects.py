@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from halbach_fe.core.errors import StudyError
-from halbach_fe.diagnosis.effects import catalogue
+from halbach_fe.diagnosis.effects import blocks, catalogue
 from halbach_fe.diagnosis.effects.base import Place
 from halbach_fe.diagnosis.linearization import amplitude_scale
 from halbach_fe.diagnosis.nominal_fields import NominalFields
@@ -364,3 +364,13 @@ def test_what_is_multiplied_is_known_per_unit_of_what_the_study_says(fraction):
         slope = in_model("iron_permeability", IN_IRON, iron,
                          lambda study: study.iron.relative_permeability + 0 * POINTS)
         np.testing.assert_allclose(slope, 30.0 + 0 * slope, rtol=1e-9)
+
+
+@pytest.mark.parametrize("listed", [lambda effects: [*effects, effects[0]],
+                                    lambda effects: [*effects, "no effect"]])
+def test_lists_of_effects_have_each_name_once(monkeypatch, listed):
+    """A second effect of a name would take the place of the first. Control: lists as they are."""
+    assert catalogue()
+    monkeypatch.setattr(blocks, "EFFECTS", listed(blocks.EFFECTS))
+    with pytest.raises(StudyError, match=r"module blocks .* effects with names of their own"):
+        catalogue()

@@ -21,7 +21,17 @@ import halbach_fe as hf
 from halbach_fe.cli import common, main
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.answer import DPI, LEGIBLE_PX, Answer
-from halbach_fe.report.page import SMALL, own_style, save, simulated_files
+from halbach_fe.report.page import (
+    SMALL,
+    Items,
+    Page,
+    Section,
+    Text,
+    own_style,
+    save,
+    simulated_files,
+    write_page,
+)
 from tests.conftest import DIPOLE, ROOT, parse_study
 from tests.support.pages import page, write_any_page
 
@@ -189,3 +199,17 @@ def test_a_question_is_one_module(dipole, tmp_path, capsys, monkeypatch):
     assert json.loads((tmp_path / "cli" / "run.json").read_text())["command"] == "halbach-fe tally"
     with pytest.raises(hf.HalbachError, match="has returned; instead received a str"):
         hf.write_report("text", tmp_path / "none")
+
+
+def test_a_page_leaves_out_what_says_nothing(tmp_path):
+    """A section about no rows, and texts and lists without words. Control: others are there."""
+    sections = [Section(["said"], "Of a row", about=[1]), Section(["unsaid"], "Of none", about=[]),
+                Section(["", Text(""), Items([]), Items(["in a list"])], "Of words")]
+    path = tmp_path / "page.html"
+    write_page(path, Page("solve", "of sections", None, ANSWER, {}, sections), ())
+    body = path.read_text().partition("Of a row")[2]
+    assert "<p>said</p>" in body
+    assert "unsaid" not in body
+    assert "Of none" not in body
+    assert body.count("<ul>") == body.count("in a list") == 1
+    assert "<p></p>" not in body

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 
 from halbach_fe.core.errors import StudyError, must_be
@@ -23,17 +24,25 @@ def catalogue() -> tuple[Effect, ...]:
     Raises
     ------
     StudyError
-        If an entry point does not name effects, or repeats the name of another effect.
+        If what lists effects has anything else, or repeats the name of another effect.
     """
     found: dict[str, Effect] = {}
-    for module in pkgutil.iter_modules(__path__):
-        loaded = importlib.import_module(f"{__name__}.{module.name}")
-        found.update({effect.name: effect for effect in getattr(loaded, "EFFECTS", ())})
-    for entry in metadata.entry_points(group=GROUP):
-        for effect in entry.load():
+    for source, effects, hint in _lists():
+        for effect in effects:
             if not isinstance(effect, Effect) or effect.name in found:
-                raise StudyError(must_be(f"entry point {entry.name}", GROUP,
-                                         "a sequence of effects with names of their own",
-                                         f"{effect!r}", "Correct or remove that package."))
+                raise StudyError(must_be(source, GROUP, "a sequence of effects with names of their "
+                                         "own", f"{effect!r}", hint))
             found[effect.name] = effect
     return tuple(found[name] for name in sorted(found))
+
+
+def _lists() -> Iterator[tuple[str, Iterable[object], str]]:
+    """Yield what lists effects (modules here, entry points of other packages), its list, and what
+    to do if that is wrong.
+    """
+    for module in pkgutil.iter_modules(__path__):
+        loaded = importlib.import_module(f"{__name__}.{module.name}")
+        yield (f"module {module.name}", getattr(loaded, "EFFECTS", ()),
+               "Give the effect a name of its own.")
+    for entry in metadata.entry_points(group=GROUP):
+        yield f"entry point {entry.name}", entry.load(), "Correct or remove that package."

@@ -405,7 +405,7 @@ def each_block(study: Study) -> list[Place]:
 def place_of(block: MagnetBlock, other: MagnetBlock | None = None) -> Place:
     """Return the place of a block, or of two blocks of an effect that concerns both."""
     both = [block] if other is None else [block, other]
-    return Place(block.ring, block.slot, other=(other.ring, other.slot) if other else (0, 0),
+    return Place(block.ring, block.slot, other=other.place if other else (0, 0),
                  labels=tuple(one.name for one in both))
 
 

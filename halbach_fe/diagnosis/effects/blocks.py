@@ -108,7 +108,7 @@ class MagnetizationGradientEffect(Effect):
 
     def places(self, study: Study) -> Sequence[Place]:
         blocks = build_magnet(study).blocks
-        uneven = {(block.ring, block.slot) for block in blocks if can_be_uneven(block)}
+        uneven = {block.place for block in blocks if can_be_uneven(block)}
         each = [place for place in each_block(study) if (place.ring, place.slot) in uneven]
         return [Place(), *each] if len(uneven) == len(blocks) else each
 
@@ -235,7 +235,7 @@ def _exception(to: MagnetBlock, source: MagnetBlock, turn: Floats) -> BlockExcep
     rest = turn @ to.carried_from(source).T
     axes = rotation_matrix((0.0, 0.0, np.radians(to.angle_deg)))
     x, y, z = np.degrees(axes.T @ Rotation.from_matrix(rest).as_rotvec()).round(9).tolist()
-    came = None if to is source else (source.ring, source.slot)
+    came = None if to is source else source.place
     return BlockException(ring=to.ring, slot=to.slot, mounted_from=came, rotation_deg=(x, y, z),
                           **brought_along(to, source))
 

@@ -504,66 +504,90 @@ def _missing(
     declared: DeclaredFormat
 ) -> list[str]:
     """Return descriptions of the information that file and user do not state, except units."""
-    unknown = [column.text for column in columns if column.text and not column.quantity]
     if not any(column.quantity for column in columns):
-        few, many = len(columns) <= len(COMPONENTS), len(columns) > MOST_NAMES and not unknown
-        return [f"what its {len(columns)} columns "
-                f"{f'({_quoted(unknown)}) ' if unknown else ''}are "
-                "(--columns x,y,z,Bx,By,Bz, - to ignore a column"
-                + ("; of points on a line, as --columns z,Bz and --at x=0,y=0; if there are no "
-                   f"positions, --columns {','.join(names.FIELDS[:len(columns)])} and --positions "
-                   "TABLE" if few else "")
-                + ("; if every quantity has a row of its own, make it a column, in a spreadsheet "
-                   "by Paste Special, Transpose, or by numpy.transpose"
-                   if _is_transposed(table) else "")
-                + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
-                   if many or _is_matrix(table.values) else "")
-                + ")"] + [
-            f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
-                ("length", "positions", declared.length_unit or table.length_unit),
-                ("field", "B", declared.field_unit)) if not said]
-    if (hint := _of_field(used, columns)) is not None:
-        return [hint]
+        return _without_names(columns, table, declared)
     latitude = [column.text for column in columns if names.is_latitude(column)]
-    if latitude and not {"x", "y", "z", "theta"} & set(used):
-        return [f"the angle from the z axis: '{latitude[0]}' counts from the plane z = 0 (replace "
+    if (hint := _of_field(used, columns)) is None and latitude and not (
+            {"x", "y", "z", "theta"} & set(used)):
+        hint = (f"the angle from the z axis: '{latitude[0]}' counts from the plane z = 0 (replace "
                 "it by a column theta of 90 degrees less it, beside r and phi; a component along "
-                "growing latitude is -Btheta)"]
-    spherical = "theta" in used
-    wanted = ("r", "theta", "phi") if spherical else (
+                "growing latitude is -Btheta)")
+    wanted = ("r", "theta", "phi") if "theta" in used else (
         "r", "phi", "z") if {"r", "phi"} & set(used) else ("x", "y", "z")
     absent = [name for name in wanted if name not in used and name not in declared.at
               and f"d{name}" not in used]
-    if absent == ["phi"]:
-        return ["phi (--columns); if the field has rotational symmetry, state its "
-                "half-plane: x for r and Bx for Br in --columns, and --at y=0"]
-    missing: list[str] = []
-    if absent:
-        missing.append(f"{', '.join(absent)} ({_by_option(absent)}" + (
-            f", as nothing is known of {_quoted(unknown)}"
-            if unknown and not declared.columns else "") + ")")
+    if hint is None and absent == ["phi"]:
+        hint = ("phi (--columns); if the field has rotational symmetry, state its half-plane: x "
+                "for r and Bx for Br in --columns, and --at y=0")
+    if hint is not None:
+        return [hint]
+    unknown = _unknown(columns)
+    places = "" if not absent else f"{', '.join(absent)} ({_by_option(absent)}" + (
+        f", as nothing is known of {_quoted(unknown)}"
+        if unknown and not declared.columns else "") + ")"
+    anchor = "" if not table.anchor or declared.origin_m is not None else (
+        f"where {table.anchor} is along the magnet's axes (--origin-m=X,Y,Z)")
+    return [*filter(None, (places, _without_components(used, columns, declared),
+                           _without_other_polar_components(used), anchor))]
+
+
+def _unknown(columns: Sequence[ColumnName]) -> list[str]:
+    """Return the names of columns that say nothing."""
+    return [column.text for column in columns if column.text and not column.quantity]
+
+
+def _without_names(
+    columns: Sequence[ColumnName], table: ForeignTable, declared: DeclaredFormat
+) -> list[str]:
+    """Return what is missing in a file none of whose columns is known."""
+    unknown = _unknown(columns)
+    few, many = len(columns) <= len(COMPONENTS), len(columns) > MOST_NAMES and not unknown
+    return [f"what its {len(columns)} columns "
+            f"{f'({_quoted(unknown)}) ' if unknown else ''}are "
+            "(--columns x,y,z,Bx,By,Bz, - to ignore a column"
+            + ("; of points on a line, as --columns z,Bz and --at x=0,y=0; if there are no "
+               f"positions, --columns {','.join(names.FIELDS[:len(columns)])} and --positions "
+               "TABLE" if few else "")
+            + ("; if every quantity has a row of its own, make it a column, in a spreadsheet "
+               "by Paste Special, Transpose, or by numpy.transpose"
+               if _is_transposed(table) else "")
+            + ("; if it is a matrix over two axes, write a row x, y, B for each of its cells"
+               if many or _is_matrix(table.values) else "")
+            + ")"] + [
+        f"the unit of {what} ({OPTIONS[kind]})" for kind, what, said in (
+            ("length", "positions", declared.length_unit or table.length_unit),
+            ("field", "B", declared.field_unit)) if not said]
+
+
+def _without_components(
+    used: dict[str, int], columns: Sequence[ColumnName], declared: DeclaredFormat
+) -> str:
+    """Return what does not say which components of B were read; empty if all is known."""
     if "B" in used:
-        missing.append("which component B is (--component x, y or z), whether it is |B| "
-                       "(--component abs), or that nobody knows (--component unknown: halbach-fe "
-                       "register then tries all three)")
-    elif (unread := _unread_components(used, columns, declared)):
-        missing.append(unread)
-    elif not {*names.FIELDS, names.TOTAL} & set(used):
-        missing.append("which columns are Bx, By or Bz, Babs for |B|, or B for a component that "
-                       "nobody knows, with --component unknown (--columns"
-                       + (f", instead of {_quoted(unknown)}" if unknown else "")
-                       + (f"; {NMR}" if any("hz" in text.lower() for text in unknown) else "")
-                       + (f"; {PPM}" if any("ppm" in column.text.lower() for column in columns)
-                          else "")
-                       + ")")
-    whole = ["Br", *(["Btheta"] if spherical else []), "Bphi"]
+        return ("which component B is (--component x, y or z), whether it is |B| (--component "
+                "abs), or that nobody knows (--component unknown: halbach-fe register then tries "
+                "all three)")
+    if unread := _unread_components(used, columns, declared):
+        return unread
+    if {*names.FIELDS, names.TOTAL} & set(used):
+        return ""
+    unknown = _unknown(columns)
+    return ("which columns are Bx, By or Bz, Babs for |B|, or B for a component that nobody "
+            "knows, with --component unknown (--columns"
+            + (f", instead of {_quoted(unknown)}" if unknown else "")
+            + (f"; {NMR}" if any("hz" in text.lower() for text in unknown) else "")
+            + (f"; {PPM}" if any("ppm" in column.text.lower() for column in columns) else "")
+            + ")")
+
+
+def _without_other_polar_components(used: dict[str, int]) -> str:
+    """Return the components along r, theta and phi that are not there beside others of these."""
+    whole = ["Br", *(["Btheta"] if "theta" in used else []), "Bphi"]
     half = [name for name in whole if name not in used]
-    if half and half != whole:
-        rest = " and ".join(name for name in whole if name in used)
-        missing.append(f"{' and '.join(half)}, without which {rest} is no Bx or By (--columns)")
-    if table.anchor and declared.origin_m is None:
-        missing.append(f"where {table.anchor} is along the magnet's axes (--origin-m=X,Y,Z)")
-    return missing
+    if not half or half == whole:
+        return ""
+    rest = " and ".join(name for name in whole if name in used)
+    return f"{' and '.join(half)}, without which {rest} is no Bx or By (--columns)"
 
 
 def _unread_components(

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of
 from halbach_fe.geometry.blocks import MagnetBlock, frames_of
-from halbach_fe.geometry.outline import Edge, Outline
+from halbach_fe.geometry.outline import Edge, Outline, at_heights
 
 CHORD = np.pi / 6
 """Largest angle in rad of an arc that becomes a chord. A chord of 30 degrees leaves the arc by
@@ -55,7 +54,7 @@ class Cells:
     axes: Floats
     vertices: Floats
     half: Floats
-    cuboid: NDArray[np.bool_]
+    cuboid: Bools
     divisions: int = 2
 
     def __len__(self) -> int:
@@ -189,13 +188,13 @@ def _local_cells(block: MagnetBlock, per_side: int) -> tuple[Floats, ...]:
     # along a side of a cuboid; along a diagonal of others, which no triangle lacks: so the cells of
     # congruent sectors are equal in their frames
     first = np.where(cuboid[:, None], sides[:, 0], local[:, 2] - local[:, 0])
-    angle = np.arctan2(first[:, 1], first[:, 0])
+    angle = azimuths_of(first)
     turn = np.zeros((len(quads), 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
     turn[:, 1, 0], turn[:, 0, 1] = np.sin(angle), -np.sin(angle)
     turn[:, 2, 2] = 1.0
     local = np.einsum("nci,nij->ncj", local, turn[:, :2, :2])
-    places = np.concatenate([np.column_stack([middle, np.full(len(middle), z)]) for z in levels])
+    places = at_heights(middle, *levels)
     return (places, np.tile(turn, (layers, 1, 1)), np.tile(local, (layers, 1, 1)),
             np.full(len(places), height / layers / 2), np.tile(cuboid, layers))
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.threads import compiled
 from halbach_fe.solver.prism_kernel import NOTHING, Six, added, prism_field
 
-Flags = NDArray[np.bool_]
+Flags = Bools
 Singles = NDArray[np.float32]
 CellArrays = tuple[Floats, Floats, Floats, Floats, Flags]
 """Of all cells the centres, axes, vertices and half heights, and whether they are cuboids."""

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from halbach_fe.core.arrays import radii_of
 from halbach_fe.measurement.positions import between, points_from
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import Component
@@ -116,7 +117,7 @@ def site_of(study: Study, magnet: TrueMagnet) -> Site:
         min(min(body.along, body.across) for body in magnet.bodies),
         max(max(body.along, body.across) for body in magnet.bodies), magnet.iron is not None,
         ("x", "y") if observed.quantity == "fourier_coefficients" else observed.components,
-        float(np.hypot(points[:, 0], points[:, 1]).max()), float(points[:, 2].min()),
+        float(radii_of(points).max()), float(points[:, 2].min()),
         float(points[:, 2].max()), tuple((body.ring, body.slot) for body in magnet.bodies),
         array.is_uniform, all(body.shape.has_four_edges for body in magnet.bodies))
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from halbach_fe.core.arrays import unit_circle
 from halbach_fe.study.materials import MU_0
 from halbach_fe.synthetic.hidden_effects.effect_types import (
     Draw,
@@ -208,7 +209,7 @@ def halves_apart(magnet: TrueMagnet, site: Site, slot: float, apart: float, side
     own = [body for body in magnet.bodies if body.ring == 1]
     beside = next(body for body in own if body.slot == slot)
     direction = np.arctan2(*beside.centre[1::-1]) + np.pi / len(own) + np.pi / 2
-    normal = np.array([np.cos(direction), np.sin(direction), 0.0])
+    normal = unit_circle(direction)
     shift = apart * normal + sideways * np.cross([0, 0, 1], normal) + [0, 0, z]
     return _bodies(magnet, lambda body: _moved(
         body, vector(np.sign(normal @ body.centre) / 2 * shift)))
