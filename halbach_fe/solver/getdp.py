@@ -80,10 +80,11 @@ NEWTON_RESIDUAL = 1e-3
 """Largest accepted relative residual of the linear solve in such a step. It exceeds ``-ksp_rtol``,
 because PETSc's test applies to the preconditioned residual."""
 
-_ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
+_ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
 """Environment of a run in one process. Debian's GetDP is built with Open MPI, which would otherwise
 start a daemon for every run; the daemon can outlive a killed run, and costs 8 s on a machine whose
-own host name does not resolve."""
+own host name does not resolve. It would also try every network for messages that nobody sends: of
+0.5 s that a start took on a busy machine, half."""
 
 _TOGETHER = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
              "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none"}
