@@ -57,20 +57,19 @@ DIPOLE: dict[str, Any] = {
 StudyMaker = Callable[..., Study]
 
 LONGEST = [
-    "cli/test_all_keys.py", "docs/test_docs.py", "response/test_nonlinear.py",
-    "solver/test_oracles.py", "diagnosis/test_unlisted_causes.py", "synthetic/test_fields.py",
-    "cli/test_cli.py", "regression/test_field_maps.py", "solver/test_azimuthal_modes.py",
-    "inference/test_doubted_terms.py", "report/test_view.py", "diagnosis/test_diagnose.py",
-    "inference/test_infer.py", "synthetic/test_hidden_effects.py",
+    "cli/test_all_keys.py", "docs/test_docs.py", "diagnosis/test_diagnose.py",
+    "response/test_nonlinear.py", "solver/test_iron_bodies.py", "cli/test_killed.py",
+    "inference/test_doubted_terms.py", "measurement/test_map_join.py",
+    "measurement/test_map_check.py", "diagnosis/test_unlisted_causes.py", "report/test_view.py",
+    "diagnosis/test_iron_faults.py", "inference/test_infer.py", "solver/moments/test_solve.py",
+    "cli/test_cli.py", "synthetic/test_hidden_effects.py", "diagnosis/test_gross_errors.py",
+    "design/test_homogeneity_objective.py", "synthetic/test_fields.py",
+    "solver/test_azimuthal_modes.py", "solver/test_oracles.py", "response/test_homogeneity.py",
+    "synthetic/test_reaction.py", "solver/test_mpi.py", "solver/test_axisymmetric_iron.py",
+    "report/test_answers.py", "geometry/test_symmetry.py", "response/test_stray_field.py",
+    "inference/test_mcmc.py", "response/test_field_on_lines.py", "solver/test_getdp_cache.py",
     "inference/test_line_registration.py", "diagnosis/test_several_maps.py",
-    "geometry/test_symmetry.py", "cli/test_killed.py", "design/test_homogeneity_objective.py",
-    "diagnosis/test_gross_errors.py", "solver/test_axisymmetric_iron.py",
-    "solver/test_dask_cluster.py", "report/test_answers.py", "response/test_homogeneity.py",
-    "solver/test_magnetostatics.py", "response/test_discretization_error.py",
-    "inference/test_mcmc.py", "synthetic/test_reaction.py", "inference/test_registration.py",
-    "inference/test_campaign.py", "response/test_resource_estimate.py",
-    "response/test_mesh_convergence.py", "solver/test_getdp_cache.py", "api/test_examples.py",
-    "inference/test_block_prior.py", "diagnosis/test_iron_faults.py",
+    "solver/test_dask_cluster.py", "design/test_forces.py", "synthetic/test_simulate.py",
 ]
 """Files that take half a minute or more of processor time, the longest first."""
 

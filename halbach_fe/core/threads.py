@@ -41,6 +41,8 @@ def in_threads(work: Callable[[int, int], object], shares: list[tuple[int, int]]
 
 def share_out(count: int, parts: int = 16) -> list[tuple[int, int]]:
     """Return ranges of about the same size."""
+    if parts == 1:
+        return [(0, count)]
     limits = np.unique(np.linspace(0, count, parts + 1).astype(int)).tolist()
     return list(pairwise(limits))
 

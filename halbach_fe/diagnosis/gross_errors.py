@@ -41,8 +41,8 @@ from halbach_fe.diagnosis.map_conventions import (
     compose_axes,
     rank,
 )
-from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z
-from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.geometry.blocks import rotation_about_z
+from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.inference.block_prior import prior_from_blocks
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.field_map import points_of
@@ -229,7 +229,7 @@ class _Search:
         self.other = tuple(variant for variant in others if variant.turn_rad is None)
         self.observed = np.array([name in _observed(study) for name in COMPONENTS])
         self.present = int((~np.isnan(values) & self.observed).sum())
-        self.blocks: dict[ArrayVariant | None, tuple[MagnetBlock, ...]] = {}
+        self.magnets: dict[ArrayVariant | None, Magnet] = {}
         self.lengths, self.flux_densities = (1.0, *LENGTH_UNITS), (1.0, *FLUX_DENSITY_UNITS)
         self.computed: dict[MapConvention, _Nominal | None] = {}
 
@@ -537,7 +537,7 @@ class _Search:
         points, sensors = _probe_points(study.instrument, self.points), sensor_matrix(
             study.instrument).T
         whole, best = nominal.field(turn), NOT_COMPARED[1]
-        blocks = self.blocks[None if turned else convention.magnet]
+        blocks = self.magnets[None if turned else convention.magnet].blocks
         for block, unit in zip(blocks, unit_fields(blocks, points), strict=True):
             own = unit @ (rotation_about_z(turn) @ block.easy_axis) * block.remanence @ sensors
             for factor in wrong_block_factors if block.remanence else ():
@@ -626,10 +626,10 @@ class _Search:
         if source not in self.computed:
             try:
                 study = source.apply(self.study)
-                if source.magnet not in self.blocks:
-                    self.blocks[source.magnet] = build_magnet(study).blocks
+                if source.magnet not in self.magnets:
+                    self.magnets[source.magnet] = build_magnet(study)
                 self.computed[source] = _Nominal.of(
-                    study, self.blocks[source.magnet], self.points, self.iron)
+                    study.instrument, self.magnets[source.magnet], self.points, self.iron)
             except HalbachError:
                 self.computed[source] = None
         return self.computed[source]
@@ -658,14 +658,13 @@ class _Nominal:
 
     @classmethod
     def of(
-        cls, study: Study, blocks: Sequence[MagnetBlock], shown: Floats, iron: Field | None
+        cls, instrument: Instrument, magnet: Magnet, shown: Floats, iron: Field | None
     ) -> _Nominal | None:
         """Compute it at the points (n, 3) of a map's file; None if a point is inside material."""
         # Standard deviation of a block's magnetization along each axis, relative to its nominal
         # magnitude.
         block_magnetization_sd = 0.02
-        points = _probe_points(study.instrument, shown)
-        magnet = build_magnet(study)
+        points, blocks = _probe_points(instrument, shown), magnet.blocks
         if any(block.contains(points).any() for block in blocks) or (
                 iron is not None and any(body.contains(points).any() for body in magnet.iron)):
             return None
@@ -676,7 +675,7 @@ class _Nominal:
             field += unit @ block.polarization
             across += unit @ (np.array([-y, x, 0.0]) * block.remanence)
             variance += np.sum((block_magnetization_sd * block.remanence * unit) ** 2, axis=2)
-        sensors = sensor_matrix(study.instrument).T
+        sensors = sensor_matrix(instrument).T
         return cls(field @ sensors, across @ sensors, external @ sensors, variance)
 
     def field(self, turn: float) -> Floats:

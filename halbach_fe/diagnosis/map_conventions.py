@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import permutations, product
 
 import numpy as np
@@ -251,6 +251,7 @@ def _matrix(axes: Axes) -> Floats:
     return to_magnet_axes(axes, np.eye(3))
 
 
+@cache
 def compose_axes(first: Axes, second: Axes) -> Axes:
     """Return the axes that correct columns which were already converted by other axes."""
     rows = _matrix(first) @ _matrix(second)

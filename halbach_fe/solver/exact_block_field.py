@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
@@ -97,7 +98,8 @@ def unit_fields(blocks: Sequence[MagnetBlock], points: Floats) -> Iterator[Float
         some = blocks[first:first + most]
         found = np.empty((len(some), len(points), 6))
         for same in _alike(some):
-            fields, axes = _fields_of_alike([some[number] for number in same], points)
+            alike = _Alike.of([some[number] for number in same])
+            fields, axes = alike.fields(points), alike.axes
             turned = axes[:, None] @ basis @ axes[:, None].transpose(0, 1, 3, 2)
             found[same] = fields @ turned[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         yield from map(matrix_of, found)
@@ -136,6 +138,7 @@ def _outline_field(block: MagnetBlock, points: Floats) -> Floats:
     return out
 
 
+@lru_cache(maxsize=4096)
 def _rectangle(outline: Outline) -> tuple[Floats, Floats, float, float] | None:
     """Return middle (2,) and half sides (2,) in m of a rectangle, and cosine and sine of the angle
     from x to its first side; None if an outline is none.
@@ -165,15 +168,22 @@ def field_of(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
     its frame. At points inside a block the result lacks the block's own remanence, see
     `unit_field`.
     """
+    return _sum_of(_all_alike(blocks), points)
+
+
+def _sum_of(groups: Sequence[_Alike], points: Floats) -> Floats:
+    """Return `field_of` all blocks of groups."""
     total, most = np.zeros((len(points), 3)), 1 + _AT_ONCE // max(1, len(points))
-    for same in _alike(blocks):
-        for first in range(0, len(same), most):
-            some = [blocks[number] for number in same[first:first + most]]
-            fields, axes = _fields_of_alike(some, points)
-            remanences = np.array([block.polarization for block in some])
-            sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
-            total += np.einsum("bnk,bki->ni", fields, sums, optimize=True)
+    for group in groups:
+        for first in range(0, len(group.axes), most):
+            part = slice(first, first + most)
+            total += (group.fields(points, part) @ group.sums[part]).sum(axis=0)
     return total
+
+
+def _all_alike(blocks: Sequence[MagnetBlock]) -> list[_Alike]:
+    """Return blocks in groups of the same shape."""
+    return [_Alike.of([blocks[number] for number in same]) for same in _alike(blocks)]
 
 
 def _alike(blocks: Sequence[MagnetBlock]) -> list[list[int]]:
@@ -198,22 +208,43 @@ def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
     return tuple(turned.ravel().tolist()), tuple(edge.arc for edge in outline)
 
 
-def _fields_of_alike(
-    blocks: Sequence[MagnetBlock], points: Floats
-) -> tuple[Floats, Floats]:
-    """Return the field matrices (blocks, n, 6) of `_alike` blocks along their axes, and the axes
-    (blocks, 3, 3) as columns, turned so that all outlines are that of the first block.
+@dataclass(frozen=True)
+class _Alike:
+    """Blocks of the same shape, and what of their fields does not depend on the points.
+
+    Attributes
+    ----------
+    first : MagnetBlock
+    positions, axes : ndarray, shapes (blocks, 3) in m and (blocks, 3, 3)
+        Of frames, with the axes as columns, in which the outlines of all blocks are that of the
+        first one.
+    sums : ndarray, shape (blocks, 6, 3), in T
+        From the field matrices in such a frame to the field of the nominal remanence.
     """
-    if len(blocks) == 1:
-        return _local_field(blocks[0], points)[None], blocks[0].axes[None]
-    positions, axes = frames_of(blocks)
-    axes = axes @ np.array([rotation_about_z(np.radians(_turn_deg(block) - _turn_deg(blocks[0])))
-                            for block in blocks])
-    if np.isfinite(blocks[0].z_min):
-        z = np.array([block.z_min for block in blocks])
-        positions = positions + (z - z[0])[:, None] * axes[:, :, 2]
-    places = (points - positions[:, None]) @ axes
-    return _frame_field(blocks[0], places.reshape(-1, 3)).reshape(len(blocks), -1, 6), axes
+
+    first: MagnetBlock
+    positions: Floats
+    axes: Floats
+    sums: Floats
+
+    @classmethod
+    def of(cls, blocks: Sequence[MagnetBlock]) -> _Alike:
+        """Prepare `_alike` blocks."""
+        positions, axes = frames_of(blocks)
+        axes = axes @ np.array([
+            rotation_about_z(np.radians(_turn_deg(block) - _turn_deg(blocks[0])))
+            for block in blocks])
+        if np.isfinite(blocks[0].z_min):
+            z = np.array([block.z_min for block in blocks])
+            positions = positions + (z - z[0])[:, None] * axes[:, :, 2]
+        remanences = np.array([block.polarization for block in blocks])
+        sums = _sums(np.einsum("bik,bi->bk", axes, remanences)) @ axes.transpose(0, 2, 1)
+        return cls(blocks[0], positions, axes, sums)
+
+    def fields(self, points: Floats, part: slice = slice(None)) -> Floats:
+        """Return the field matrices (blocks, n, 6) of a part of the blocks along their axes."""
+        places = (points - self.positions[part, None]) @ self.axes[part]
+        return _frame_field(self.first, places.reshape(-1, 3)).reshape(len(places), -1, 6)
 
 
 def _sums(polarization: Floats) -> Floats:
@@ -227,28 +258,35 @@ def _sums(polarization: Floats) -> Floats:
         [zero, z, y]]), (0, 1), (-2, -1))
 
 
-def field_on_circles(blocks: Sequence[MagnetBlock], points: Floats) -> Floats:
-    """Return `field_of` in less time if the points lie on circles around z.
+class FieldOfBlocks:
+    """`field_of` blocks as a function: for many calls, and in less time on circles around z.
 
     Points (angles k, 3) at equidistant angles, angle by angle, are mapped onto each other by turns
     about z. Of blocks that such turns map onto each other, as those of a ring, one is evaluated.
     """
-    angles = _equidistant_angles(points)
-    if angles == 1:
-        return field_of(blocks, points)
-    total = np.zeros((angles, len(points) // angles, 3))
-    for members in _turned_blocks(blocks, points[[0, len(points) // 3, 2 * len(points) // 3]],
-                                  angles):
-        first = members[0][1]
-        local = _local_field(first, points)
-        for steps, block in members:
-            turn = rotation_about_z(2 * np.pi * steps / angles)
-            axes = first.axes
-            sums = _sums(axes.T @ turn.T @ block.polarization)
-            field = (local @ (sums @ axes.T @ turn.T)).reshape(total.shape)
-            total[steps:] += field[:angles - steps]
-            total[:steps] += field[angles - steps:]
-    return total.reshape(-1, 3)
+
+    def __init__(self, blocks: Sequence[MagnetBlock]) -> None:
+        self.blocks = blocks
+        self._groups = _all_alike(blocks)
+
+    def __call__(self, points: Floats) -> Floats:
+        """Return B (n, 3) in T at points (n, 3) in m."""
+        angles = _equidistant_angles(points)
+        if angles == 1:
+            return _sum_of(self._groups, points)
+        total = np.zeros((angles, len(points) // angles, 3))
+        for members in _turned_blocks(
+                self.blocks, points[[0, len(points) // 3, 2 * len(points) // 3]], angles):
+            first = members[0][1]
+            local = _local_field(first, points)
+            for steps, block in members:
+                turn = rotation_about_z(2 * np.pi * steps / angles)
+                axes = first.axes
+                sums = _sums(axes.T @ turn.T @ block.polarization)
+                field = (local @ (sums @ axes.T @ turn.T)).reshape(total.shape)
+                total[steps:] += field[:angles - steps]
+                total[:steps] += field[angles - steps:]
+        return total.reshape(-1, 3)
 
 
 def _equidistant_angles(points: Floats) -> int:

@@ -80,15 +80,18 @@ NEWTON_RESIDUAL = 1e-3
 """Largest accepted relative residual of the linear solve in such a step. It exceeds ``-ksp_rtol``,
 because PETSc's test applies to the preconditioned residual."""
 
-_ALONE = {"OMPI_MCA_ess_singleton_isolated": "1"}
+_ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
 """Environment of a run in one process. Debian's GetDP is built with Open MPI, which would otherwise
 start a daemon for every run; the daemon can outlive a killed run, and costs 8 s on a machine whose
-own host name does not resolve."""
+own host name does not resolve. It would also try every network for messages that nobody sends: of
+0.5 s that a start took on a busy machine, half."""
 
-_TOGETHER = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+_TOGETHER = {"OMPI_MCA_mpi_yield_when_idle": "1",
+             "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
              "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none"}
 """Environment of a run by `mpirun`. Containers often have no user but root, and the number of
-processes is the user's choice, even if it exceeds the cores that Open MPI counts."""
+processes is the user's choice, even if it exceeds the cores that Open MPI counts: one that waits
+for a message gives way, without which two processes on two busy cores took twice the time."""
 
 _PACKAGE = "pyonelab"
 """Package of PyPI that contains the static build of GetDP's makers, for Linux on x86-64."""

@@ -115,16 +115,22 @@ def elements_of(nodes: Floats, points: Floats) -> tuple[Ints, Ints, Floats, Ints
     Point, element and reference coordinates (d,) of every pair, and the points that none holds.
     """
     tree = KDTree(nodes.mean(axis=1))
+    # no element reaches beyond the box of its nodes by a third, however curved
+    low, high = nodes.min(axis=1), nodes.max(axis=1)
+    low, high = low - (high - low) / 3, high + (high - low) / 3
     hits: list[tuple[Ints, Ints, Floats]] = []
     missing = np.arange(len(points))
     for count, slack in ((min(n, len(nodes)), slack) for n, slack in SEARCHES):
         nearest = tree.query(points[missing], count)[1].reshape(len(missing), count)
-        held = np.zeros(len(missing), bool)
-        for chosen in nearest.T:
-            reference, inside = _invert(nodes[chosen], points[missing], slack)
-            hits.append((missing[inside], chosen[inside], reference[inside]))
-            held |= inside
-        missing = missing[~held]
+        held = np.zeros(len(points), bool)
+        for column in nearest.T:
+            at = points[missing]
+            near = ((at >= low[column]) & (at <= high[column])).all(axis=1)
+            chosen, tried = column[near], missing[near]
+            reference, inside = _invert(nodes[chosen], points[tried], slack)
+            hits.append((tried[inside], chosen[inside], reference[inside]))
+            held[tried[inside]] = True
+        missing = missing[~held[missing]]
         if not len(missing):
             break
     return (np.concatenate([row for row, _, _ in hits]),

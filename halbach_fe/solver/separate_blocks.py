@@ -29,7 +29,7 @@ from halbach_fe.solver.axisymmetric_iron import (
     highest_mode_at,
     solve_iron,
 )
-from halbach_fe.solver.exact_block_field import external_field, field_on_circles, unit_fields
+from halbach_fe.solver.exact_block_field import FieldOfBlocks, external_field, unit_fields
 from halbach_fe.solver.iron_modes import Resolution, check_bodies
 from halbach_fe.solver.session import RunSize, Session
 from halbach_fe.study.magnet import External
@@ -285,7 +285,7 @@ def field_in_vacuum(blocks: Sequence[MagnetBlock]) -> Field:
     if len(blocks) < MANY_BLOCKS or any(
             edge.arc for block in blocks for edge in block.outline) or any(
             block.gradient or block.corner_loss for block in blocks):
-        return partial(field_on_circles, blocks)
+        return FieldOfBlocks(blocks)
     from halbach_fe.solver.moments.interaction import Interaction  # import numba
     from halbach_fe.solver.moments.solve import System
 

@@ -22,7 +22,7 @@ def study_of(height_m: float = 0.035):
         "name": "cube-and-plate", "dimension": 3, "array": {"free_blocks": cube},
         "iron": {"relative_permeability": 50.0, "bodies": [
             {"kind": "box", "size_m": [0.03, 0.03, 0.01], "centre_m": [0.0, 0.0, height_m]}]},
-        "mesh": {"block_size_m": 0.01, "growth": 1.6},
+        "mesh": {"block_size_m": 0.01, "growth": 2.5},
         "observation": {"quantity": "flux_density", "positions": {
             "kind": "circles", "radius_m": 0.008, "angles": 8, "z_min_m": 0.015, "z_max_m": 0.024,
             "count": 4}},

@@ -38,9 +38,12 @@ def known_of(study):
 
 @pytest.fixture
 def page(browser, tmp_path):
-    """Open a part of a page; errors in it fail the test."""
+    """Open a part of a page; errors in it fail the test.
+
+    At half its width: WebGL by software takes as long as there are pixels.
+    """
     errors = []
-    context = browser.new_context(offline=True, viewport={"width": 1000, "height": 800})
+    context = browser.new_context(offline=True, viewport={"width": 500, "height": 400})
     context.set_default_timeout(PATIENCE_MS)
     page = context.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -84,7 +87,7 @@ def test_blocks_tell_their_numbers_and_can_be_hidden(page):
     known = known_of(study)
     shown = page(
         magnet_view(build_magnet(study), known, residual_points(np.zeros((1, 3)), np.array([2.5]))))
-    assert coloured(shown) > 20_000
+    assert coloured(shown) > 10_000
     found = words(shown)
     own = [one for one in found if "ring 1, slot" in one]
     assert len(own) > 1  # 3 of 9 points were over blocks
@@ -110,25 +113,26 @@ def test_the_field_and_residuals_are_shown_when_asked_for(page):
     assert hidden == ["residuals, up to 20\u00a0µT", "|B| in a plane"]
     before = coloured(shown)
     shown.evaluate("Plotly.restyle('magnet-view', {visible: true})")
-    assert coloured(shown) > before + 1000
+    assert coloured(shown) > before + 500
     texts = shown.evaluate("document.getElementById('magnet-view').data[0].text")
     assert len(texts) > 12
     assert len(set(texts)) == 12
 
 
-@pytest.mark.parametrize("width", [500, 1400])
-def test_names_hide_nothing(page, width):
+def test_names_hide_nothing(page):
     """They are below the picture of the magnet, on wide and on narrow screens."""
     study = study_of("quadrupole")
     shown = page(magnet_view(build_magnet(study), known_of(study)))
-    shown.set_viewport_size({"width": width, "height": 1000})
-    shown.wait_for_timeout(1000)
-    scene, names = (shown.locator(f"#magnet-view {one}").first.bounding_box()
-                    for one in (".gl-container canvas, .svg-container canvas", ".legend"))
-    assert names["height"] > 10
-    assert names["y"] >= scene["y"] + scene["height"] - 1  # a px of rounding
-    assert names["x"] >= 0
-    assert names["x"] + names["width"] <= width
+    for width in (1400, 500):
+        shown.set_viewport_size({"width": width, "height": 1000})
+        shown.wait_for_timeout(1000)
+        scene, names = (shown.locator(f"#magnet-view {one}").first.bounding_box()
+                        for one in (".gl-container canvas, .svg-container canvas", ".legend"))
+        assert 0.8 * width < scene["width"] <= width  # it has followed the screen
+        assert names["height"] > 10
+        assert names["y"] >= scene["y"] + scene["height"] - 1  # a px of rounding
+        assert names["x"] >= 0
+        assert names["x"] + names["width"] <= width
 
 
 def test_blocks_that_were_found_are_named():

@@ -14,7 +14,13 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.solver import magnetostatics
 from halbach_fe.solver.dofs import read_matrix, read_saved, read_solutions, read_unknowns
 from halbach_fe.solver.getdp_cache import Cache
-from halbach_fe.solver.interpolation import coordinates, locate, probes_of, shape_functions
+from halbach_fe.solver.interpolation import (
+    coordinates,
+    elements_of,
+    locate,
+    probes_of,
+    shape_functions,
+)
 from halbach_fe.solver.mesh import build_meridian, build_mesh, verify_mesh
 from halbach_fe.solver.routes import finite_element_part
 from halbach_fe.solver.session import Session
@@ -279,3 +285,28 @@ def test_points_are_found_where_they_are(short_dipole, dipole, tmp_path, generat
             locate(mesh, np.array([[100.0, 0, 0]]))
         with pytest.raises(PointsOutsideError):  # in a block
             locate(mesh, np.array([[0.15, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("kind", ["quad", "triangle6", "tetra10"])
+def test_points_of_curved_elements_are_found(kind, generator):
+    """Edges bulge by 6 % of their length, and by 0.6 % of an element beyond the box of its nodes.
+    Control: a third and more beyond that box no point is in it.
+    """
+    dimension = 3 if kind == "tetra10" else 2
+    corners = {"quad": [[-1, -1], [1, -1], [1, 1], [-1, 1]]}.get(
+        kind, np.vstack([np.zeros(dimension), np.eye(dimension)]).tolist())
+    if kind != "quad":
+        pairs = [(0, 1), (1, 2), (0, 2)] if dimension == 2 else [
+            (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
+        corners += [np.add(corners[a], corners[b]) / 2 for a, b in pairs]
+    for _ in range(20):
+        nodes = np.array([corners]) + generator.uniform(-0.06, 0.06, (1, len(corners), dimension))
+        inside = generator.dirichlet(np.ones(dimension + 1), 200)[:, 1:]
+        reference = 2 * generator.random((200, 2)) - 1 if kind == "quad" else inside
+        values, _ = shape_functions(kind, reference)
+        points = np.einsum("nk,kd->nd", values, nodes[0])
+        rows, _, found, missing = elements_of(nodes, points)
+        assert not len(missing)
+        np.testing.assert_allclose(found[np.argsort(rows)], reference, atol=1e-9)
+    low, high = nodes[0].min(axis=0), nodes[0].max(axis=0)
+    assert elements_of(nodes, (high + 0.34 * (high - low))[None])[3].size == 1

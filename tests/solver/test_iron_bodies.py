@@ -288,7 +288,7 @@ def test_a_box_is_extrapolated_towards_a_finer_mesh(session):
                        [0.0, 0.0, 0.03], [0.018, 0.0, 0.06]])
     coarse, fine = (solve_bodies(
         build_magnet(study_with(body, mesh={"block_size_m": 0.02, "growth": growth})), uniform,
-        session.within(name)) for name, growth in (("coarse", 1.7), ("fine", 1.4)))
+        session.within(name)) for name, growth in (("coarse", 1.9), ("fine", 1.5)))
     found, change = coarse.field_with_errors(points)
     bars = np.linalg.norm(change, axis=1)
     plain = iron_bodies._field_of(coarse.problem, coarse.polarization, points)

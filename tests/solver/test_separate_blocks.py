@@ -48,7 +48,8 @@ def test_iron_alone_is_nearly_the_change_by_iron(short_dipole, session):
     def magnet_with(permeability, **more):
         return build_magnet(short_dipole(
             array__recoil_permeability=permeability, array__outer_radius_m=0.14, array__rings=1,
-            array__block={"shape": "cuboid", "width_m": 0.03}, **more))
+            array__blocks_per_ring=8, array__block={"shape": "cuboid", "width_m": 0.03},
+            mesh__meridian_size_m=0.03, **more))
 
     ring = {"iron_ring": {"inner_radius_m": 0.15, "outer_radius_m": 0.16,
                           "relative_permeability": 1000.0}}
