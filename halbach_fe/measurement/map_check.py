@@ -124,6 +124,10 @@ MOST_UNSTEADY = 3
 """Number of parameters that are left out at most because the fit with them contradicts them; after
 three of the measured map of an MRI magnet it contradicted none."""
 
+SHOWN = 3.0
+"""Standard deviations from which another region of a map shows what is found in one. With those of
+`SIGNIFICANT`, 29 of 40 errors of probes near blocks and coils were found, with these 31."""
+
 SEEN = 2.0
 """Standard deviations of a part from which it can tell whether a parameter is there."""
 
@@ -1100,7 +1104,7 @@ def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
 def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
     """Tell whether no other region of the map contradicts a term, and another one shows it too."""
     told = [other for other in others if other.determined]
-    return any(other.found for other in others) and all(
+    return any(other.predictive and abs(other.value) > SHOWN * other.sd for other in told) and all(
         abs(term.value - other.value) <= SEEN * np.hypot(term.sd, other.sd) for other in told)
 
 

@@ -57,8 +57,11 @@ from halbach_fe.study.types import COMPONENTS
 TITLE = "Check of a field map"
 
 
-def answer(check: MapCheck) -> Answer:
-    """Say whether the map obeys Maxwell's equations, and what to do next."""
+def answer(check: MapCheck, in_order: bool = True) -> Answer:
+    """Say whether the map obeys Maxwell's equations, and what to do next.
+
+    Not ``in_order``, rows may not be in the order in which they were read.
+    """
     question = "Does the map obey Maxwell's equations?"
     if check.is_too_coarse:
         return Answer(
@@ -88,7 +91,7 @@ def answer(check: MapCheck) -> Answer:
     used, named = ("DIR/oriented_map.csv",
                    "oriented_map.csv, which has the right axes and no broken rows") if better else (
         "MAP", "this map")
-    if any(term.found and _is_change(term) for term in check.terms):
+    if in_order and any(term.found and _is_change(term) for term in check.terms):
         used, named = "DIR/corrected_map.csv", (
             "corrected_map.csv, without what changed during the scan: an update does not fit that")
     said = f"{verdict(check)} {_noise(check, keys=True)}"
@@ -471,12 +474,13 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
     left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
     even = ("Noise alone would be about as large everywhere; here it is not alone"
             if check.uneven is not None else "Noise is about as large everywhere")
-    if "time_s" not in data and is_sorted(points):
+    in_order = "time_s" in data or not is_sorted(points)
+    if not in_order:
         found.append(OF_SORTED_ROWS)
     if doubt := doubt_of_times(data):
         found.append(doubt)
     return Page(
-        "check", TITLE, None, answer(check), check_summary(data, check), [
+        "check", TITLE, None, answer(check, in_order), check_summary(data, check), [
             Section([*([Items(found)] if found else []), Text(
                 f"{check.readings} readings at {check.points} points, "
                 f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "

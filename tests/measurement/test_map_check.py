@@ -406,6 +406,18 @@ def test_a_turn_is_found_where_the_field_is_not_rough(monkeypatch, shares, found
     assert abs(term.value - value) < 2 * term.sd
 
 
+@pytest.mark.parametrize("least", [3.0, map_check.SIGNIFICANT])
+def test_what_another_region_shows_less_certainly_supports_a_drift(monkeypatch, least):
+    """It is 1.97 +- 0.14 % where the field is least rough, and 2.07 +- 0.52 % in a larger region,
+    which by itself, as the control asks, is not enough to be found.
+    """
+    monkeypatch.setattr(map_check, "SHOWN", least)
+    name, value = ERRORS["drift"]
+    term = named(check_map(hard_map(18, "drift")), name)
+    assert term.found == (least < map_check.SIGNIFICANT)
+    assert abs(term.value - value) < 2 * term.sd
+
+
 @pytest.mark.parametrize("merged", [True, False])
 def test_bars_contain_how_regions_of_a_map_differ(monkeypatch, merged):
     """Readings next to the blocks move the gain by 0.3 % of 1.9 %; the control leaves it out."""
