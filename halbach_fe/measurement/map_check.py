@@ -120,6 +120,14 @@ In three maps near cubes and coils by magpylib in which the whole did not tell o
 or a drift of 2 %, both did, with bars 4 to 16 times as short; in three others one alone showed
 terms that were not there."""
 
+MOST_UNSTEADY = 3
+"""Number of parameters that are left out at most because the fit with them contradicts them; after
+three of the measured map of an MRI magnet it contradicted none."""
+
+SHOWN = 3.0
+"""Standard deviations from which another region of a map shows what is found in one. With those of
+`SIGNIFICANT`, 29 of 40 errors of probes near blocks and coils were found, with these 31."""
+
 SEEN = 2.0
 """Standard deviations of a part from which it can tell whether a parameter is there."""
 
@@ -1096,7 +1104,7 @@ def _as_stated(fitted: _Fitted, terms: tuple[InstrumentTerm, ...]) -> ProbeFit:
 def _is_supported(term: InstrumentTerm, others: list[InstrumentTerm]) -> bool:
     """Tell whether no other region of the map contradicts a term, and another one shows it too."""
     told = [other for other in others if other.determined]
-    return any(other.found for other in others) and all(
+    return any(other.predictive and abs(other.value) > SHOWN * other.sd for other in told) and all(
         abs(term.value - other.value) <= SEEN * np.hypot(term.sd, other.sd) for other in told)
 
 
@@ -1123,29 +1131,47 @@ def _asked(
     Parameters are added to a perfect instrument one by one, the most certain first. What is left of
     a field that is steeper than the charges, and positions that are off together along a line, is
     no white noise: parameters take to it with certainty, but differently in every part of the map.
+    One that is not certain any more after the fit with it is left out, and the others are asked
+    again: what else was found beside it holds beside it only.
     """
     no_terms = np.zeros(len(fitted.at.instrument), bool)
     fitted = replace(fitted, at=replace(fitted.at, instrument=np.zeros(len(no_terms))))
-    terms: tuple[InstrumentTerm, ...] = ()
-    for number in range(ROUNDS):
+    unsteady: set[str] = set()
+    for number in range(ROUNDS + MOST_UNSTEADY):
         model = fitted.model.with_terms(~no_terms)
         halves = _halves(model, fitted.at, rows)
         steps = 2 + 2 * len(halves)
+        done = min(number, ROUNDS - 1) * steps
         told: list[Evidence] = []
         for each in Evidence.of(model, rows, fitted.at, fitted.width2, list(halves.values())):
             told.append(each)
-            advance(number * steps + len(told), ROUNDS * steps)
-        parameters = all_parameters(model.prior_sd, model.shares(fitted.at))
+            advance(done + len(told), ROUNDS * steps)
+        parameters = [replace(one, row=0 * one.row) if one.name in unsteady else one
+                      for one in all_parameters(model.prior_sd, model.shares(fitted.at))]
         kept, terms = selected(parameters, EvidenceByPart.of(
             told, list(halves).index("steepness") if "steepness" in halves else None))
         fitted = replace(fitted, model=model).only(kept, rows).weighted(rows)
-        advance((number + 1) * steps, ROUNDS * steps)
-    # the last fit may have moved a term from where the parts of the map were asked: of large turns
-    # that is no straight line, and the bar there does not reach as far
-    values = [float(parameter.row @ fitted.at.instrument) for parameter in parameters]
-    return fitted, tuple(
-        replace(term, value=value, sd=float(np.hypot(term.sd, value - term.value)))
-        if term.found else term for value, term in zip(values, terms, strict=True))
+        advance(done + steps, ROUNDS * steps)
+        steady = [_as_fitted(term, float(parameter.row @ fitted.at.instrument))
+                  for term, parameter in zip(terms, parameters, strict=True)]
+        lost = [now for before, now in zip(terms, steady, strict=True)
+                if before.found and not now.found]
+        if number >= ROUNDS - 1:
+            if not lost:
+                break
+            unsteady.add(min(lost, key=lambda one: abs(one.value) / one.sd).name)
+    return fitted, tuple(steady)
+
+
+def _as_fitted(term: InstrumentTerm, value: float) -> InstrumentTerm:
+    """Return a term; if it was found, with the value of the last fit and a bar that reaches there.
+
+    The fit may move a term from where the parts of the map were asked: of large turns that is no
+    straight line, and the bar there does not reach as far.
+    """
+    if not term.found:
+        return term
+    return replace(term, value=value, sd=float(np.hypot(term.sd, value - term.value)))
 
 
 def selected(

@@ -15,6 +15,7 @@ from halbach_fe.measurement.field_map import points_of, readings_sha256, write_m
 from halbach_fe.measurement.map_check import (
     SCATTERED_M,
     VIOLATED,
+    InstrumentTerm,
     MapCheck,
     Reach,
     inner,
@@ -59,8 +60,11 @@ from halbach_fe.study.types import COMPONENTS
 TITLE = "Check of a field map"
 
 
-def answer(check: MapCheck) -> Answer:
-    """Say whether the map obeys Maxwell's equations, and what to do next."""
+def answer(check: MapCheck, in_order: bool = True) -> Answer:
+    """Say whether the map obeys Maxwell's equations, and what to do next.
+
+    Not ``in_order``, rows may not be in the order in which they were read.
+    """
     question = "Does the map obey Maxwell's equations?"
     if check.is_too_coarse:
         return Answer(
@@ -87,9 +91,12 @@ def answer(check: MapCheck) -> Answer:
             "and check it again.", "halbach-fe check MAP -o DIR",
             sound=False)
     trust = _trust(check)
-    used = "DIR/oriented_map.csv" if better else "MAP"
-    named = ("oriented_map.csv, which has the right axes and no broken rows" if better
-             else "this map")
+    used, named = ("DIR/oriented_map.csv",
+                   "oriented_map.csv, which has the right axes and no broken rows") if better else (
+        "MAP", "this map")
+    if in_order and any(term.found and _is_change(term) for term in check.terms):
+        used, named = "DIR/corrected_map.csv", (
+            "corrected_map.csv, without what changed during the scan: an update does not fit that")
     said = f"{verdict(check)} {_noise(check, keys=True)}"
     if check.is_displaced:
         return Answer(question, said, trust, "Look for rows, axes and units of the positions that "
@@ -367,6 +374,11 @@ def _impossible(check: MapCheck) -> list[str]:
             if term.determined and term.predictive and not term.plausible]
 
 
+def _is_change(term: InstrumentTerm) -> bool:
+    """Tell whether a parameter is a change of the probe during the scan."""
+    return "from start" in term.name or "from the ends" in term.name
+
+
 def _axes(check: MapCheck) -> str:
     """Say which component each column is that has another name."""
     return ", ".join(f"column B{column} is {_component(name)}"
@@ -388,9 +400,8 @@ def instrument_table(check: MapCheck) -> Rows:
 def undetermined(check: MapCheck) -> str:
     """Say which parameters of the instrument the map does not tell, in a sentence; or nothing."""
     said = []
-    of_the_times = ("from start", "from the ends", "lag")  # of the readings
     terms = [term for term in check.terms
-             if check.is_whole or any(words in term.name for words in of_the_times)]
+             if check.is_whole or _is_change(term) or "lag" in term.name]
     for words, predictive in (("Not stated, because parts of the map contradict each other about "
                                "it", False), ("What this map cannot tell", True)):
         names = [term.name for term in terms if term.predictive == predictive
@@ -464,12 +475,13 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
     left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
     even = ("Noise alone would be about as large everywhere; here it is not alone"
             if check.uneven is not None else "Noise is about as large everywhere")
-    if "time_s" not in data and is_sorted(points):
+    in_order = "time_s" in data or not is_sorted(points)
+    if not in_order:
         found.append(OF_SORTED_ROWS)
     if doubt := doubt_of_times(data):
         found.append(doubt)
     return Page(
-        "check", TITLE, None, answer(check), check_summary(data, check), [
+        "check", TITLE, None, answer(check, in_order), check_summary(data, check), [
             Section([Items(found), Text(
                 f"{check.readings} readings at {check.points} points, "
                 f"{decimals(1e3 * check.spacing_m)} mm apart. No magnet is assumed: the map is "
