@@ -420,10 +420,10 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
 
 
 def warn_of_left_out(data: xr.Dataset, kept: Sequence[str], path: Path) -> None:
-    """Warn of columns of a map for which the format of a file has no place."""
+    """Warn of columns of a map for which the format of a file, known by its end, has no place."""
     if left := [name for name in (*TOTAL_COLUMNS, *OTHER_COLUMNS) if name in data
                 and name not in kept]:
-        warnings.warn(f"Left out, as the format of {path} has no place for it: {', '.join(left)}. "
+        warnings.warn(f"Left out, as a file {path.suffix} has no place for it: {', '.join(left)}. "
                       "Files .csv and .h5 of halbach-fe keep everything.", HalbachWarning,
                       stacklevel=4)
 
