@@ -69,7 +69,8 @@ def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, lis
 
     It is the first one with two rows of numbers, else the first with cells; the others are all
     that have such rows too, or a formula without a value. Cells are separated by semicolons;
-    numbers have a ``decimal_comma``, if those that are texts have one. Formulas have the values that the workbook was saved with.
+    numbers have a ``decimal_comma``, if those that are texts have one. Formulas have the values
+    that the workbook was saved with.
 
     Raises
     ------
