@@ -124,6 +124,13 @@ def field_map(
     except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
+    rows = [index for index in (getattr(points_m, "index", None), getattr(B_T, "index", None))
+            if hasattr(index, "equals")]  # of pandas
+    if len(rows) == 2 and not rows[0].equals(rows[1]) and set(rows[0]) == set(rows[1]):
+        raise MeasurementError(must_be(
+            "points_m and B_T", "field_map", "rows in the same order, as those of one table are",
+            "tables with the same index in another order",
+            "Bring them into one order, or give arrays: points.to_numpy()."))
     if given.ndim == len(components) == 1:
         given = given[:, None]
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
