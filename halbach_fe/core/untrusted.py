@@ -110,9 +110,9 @@ def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, lis
             text = io.StringIO()
             csv.writer(text, delimiter=";", lineterminator="\n").writerows(
                 [*row, *[""] * width][:width] for row in rows if any(row))
-            found = text.getvalue().encode(), sheet.title, formula
-            first = first or found
-            chosen = chosen or (found if of_numbers else None)
+            this = text.getvalue().encode(), str(sheet.title), formula
+            first = first or this
+            chosen = chosen or (this if of_numbers else None)
         if first is None:
             raise ValueError("it has no sheet with cells")
         content, title, formula = chosen or first

@@ -124,8 +124,9 @@ def field_map(
     except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
-    rows = [index for index in (getattr(points_m, "index", None), getattr(B_T, "index", None))
-            if hasattr(index, "equals")]  # of pandas
+    rows: list[Any] = [index for index in (
+        getattr(points_m, "index", None), getattr(B_T, "index", None))
+        if hasattr(index, "equals")]  # of pandas
     if len(rows) == 2 and not rows[0].equals(rows[1]) and set(rows[0]) == set(rows[1]):
         raise MeasurementError(must_be(
             "points_m and B_T", "field_map", "rows in the same order, as those of one table are",
