@@ -68,16 +68,17 @@ def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, lis
     """Return a sheet of an Excel workbook (.xlsx) as CSV in UTF-8, its name, and those of others.
 
     It is the first one with two rows of numbers, else the first with cells; the others are all
-    that have such rows too. Cells are separated by semicolons; numbers have a ``decimal_comma``,
-    if those that are texts have one. Formulas have the values that the workbook was saved with.
+    that have such rows too, or a formula without a value. Cells are separated by semicolons;
+    numbers have a ``decimal_comma``, if those that are texts have one. Formulas have the values
+    that the workbook was saved with.
 
     Raises
     ------
     ExtraMissingError
         If openpyxl, which reads it, is not installed.
     ValueError
-        If the file is damaged, larger than 200 million cells or bytes, or has a formula without a
-        value.
+        If the file is damaged, larger than 200 million cells or bytes, or the sheet has a formula
+        without a value.
     """
     max_sheet = 200_000_000  # size in bytes of the largest unpacked workbook that is read
     openpyxl = import_extra("openpyxl", "spreadsheet",
@@ -86,35 +87,38 @@ def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, lis
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
             if sum(part.file_size for part in packed.infolist()) > max_sheet:
                 raise ValueError(f"it unpacks to more than {max_sheet} bytes")
-            for name in packed.namelist():
-                if name.startswith("xl/worksheets/") and (found := NO_VALUE.search(
-                        packed.read(name))):
-                    raise ValueError(f"the formula in {found[1].decode()} has no value")
+            without_value = {name: found[1].decode() for name in packed.namelist()
+                             if name.startswith("xl/worksheets/")
+                             and (found := NO_VALUE.search(packed.read(name)))}
         book = openpyxl.load_workbook(io.BytesIO(raw), read_only=True, data_only=True)
-        first: tuple[bytes, str] | None = None
-        chosen: tuple[bytes, str] | None = None
+        first: tuple[bytes, str, str] | None = None
+        chosen: tuple[bytes, str, str] | None = None
         others = []
         for sheet in book.worksheets:
+            formula = without_value.get(sheet._worksheet_path.lstrip("/"), "")
             values = list(sheet.iter_rows(values_only=True))
             rows = [["" if cell is None else str(cell).replace(".", ",")
                      if decimal_comma and isinstance(cell, float) else str(cell)
                      for cell in row] for row in values]
             width = max((n for row in rows for n, cell in enumerate(row, 1) if cell), default=0)
-            if not width:
-                continue
             of_numbers = sum(sum(isinstance(cell, int | float) for cell in row) > 1
                              for row in values) > 1
-            if of_numbers and chosen:
+            if formula or (of_numbers and chosen):
                 others.append(sheet.title)
+            if not (width or formula) or (of_numbers and chosen):
                 continue
             text = io.StringIO()
             csv.writer(text, delimiter=";", lineterminator="\n").writerows(
                 [*row, *[""] * width][:width] for row in rows if any(row))
-            first = first or (text.getvalue().encode(), sheet.title)
-            chosen = chosen or ((text.getvalue().encode(), sheet.title) if of_numbers else None)
-    if first is None:
-        raise ValueError("it has no sheet with cells")
-    return *(chosen or first), others
+            this = text.getvalue().encode(), str(sheet.title), formula
+            first = first or this
+            chosen = chosen or (this if of_numbers else None)
+        if first is None:
+            raise ValueError("it has no sheet with cells")
+        content, title, formula = chosen or first
+        if formula:
+            raise ValueError(f"the formula in {formula} has no value")
+    return content, title, [other for other in others if other != title]
 
 
 def finite_array(data: xr.DataArray, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -66,12 +66,37 @@ def turn_corners(coil: Racetrack, across: float, chords: int) -> Floats:
     return np.column_stack([turn, np.zeros(len(turn))])
 
 
+def distance_in_magnet(coil: AnyCoil, points: Floats) -> Floats:
+    """Return the `distance` (n,) in m of points (n, 3) in m of the magnet from a coil."""
+    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
+    return distance(coil, (points - coil.centre_m) @ axes)
+
+
 def in_winding(coil: AnyCoil, points: Floats) -> Ints:
     """Return which points (n, 3) in m of the magnet lie in a winding, and not at its surface."""
     if coil.kind == "polygon" or not all(coil.section_m):
         return np.zeros(0, int)
-    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
-    return np.flatnonzero(distance(coil, (points - coil.centre_m) @ axes) < -closest(coil))
+    return np.flatnonzero(distance_in_magnet(coil, points) < -closest(coil))
+
+
+def crosses_disc(coil: AnyCoil, radius: float, z: float) -> bool:
+    """Return whether a winding comes within 1/200 of its radius to a flat disc about the z axis.
+
+    Squares of the disc at ``z`` in m that the winding does not reach are left out, and the others
+    quartered.
+    """
+    half, places = radius, np.zeros((1, 2))
+    while len(places):
+        off_axis = np.hypot(*places.T)
+        apart = distance_in_magnet(coil, np.column_stack([places, np.full(len(places), z)]))
+        if half < radius / 400 or ((apart <= 0) & (off_axis <= radius)).any():
+            return True
+        corner = np.sqrt(2) * half
+        near = places[(apart < corner) & (off_axis < radius + corner)]
+        half /= 2
+        places = (near[:, None] + half * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])).reshape(
+            -1, 2)
+    return False
 
 
 def points_in_winding(coil: AnyCoil) -> Floats:

@@ -124,6 +124,14 @@ def field_map(
     except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
+    rows: list[Any] = [index for index in (
+        getattr(points_m, "index", None), getattr(B_T, "index", None))
+        if hasattr(index, "equals")]  # of pandas
+    if len(rows) == 2 and not rows[0].equals(rows[1]) and set(rows[0]) == set(rows[1]):
+        raise MeasurementError(must_be(
+            "points_m and B_T", "field_map", "rows in the same order, as those of one table are",
+            "tables with the same index in another order",
+            "Bring them into one order, or give arrays: points.to_numpy()."))
     if given.ndim == len(components) == 1:
         given = given[:, None]
     columns = [COMPONENTS.index(name) for name in components if name in COMPONENTS]
@@ -420,10 +428,10 @@ def _write_csv(data: xr.Dataset, path: Path) -> None:
 
 
 def warn_of_left_out(data: xr.Dataset, kept: Sequence[str], path: Path) -> None:
-    """Warn of columns of a map for which the format of a file has no place."""
+    """Warn of columns of a map for which the format of a file, known by its end, has no place."""
     if left := [name for name in (*TOTAL_COLUMNS, *OTHER_COLUMNS) if name in data
                 and name not in kept]:
-        warnings.warn(f"Left out, as the format of {path} has no place for it: {', '.join(left)}. "
+        warnings.warn(f"Left out, as a file {path.suffix} has no place for it: {', '.join(left)}. "
                       "Files .csv and .h5 of halbach-fe keep everything.", HalbachWarning,
                       stacklevel=4)
 

@@ -564,7 +564,9 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
             for one, other in pairs:
                 if (one, other) not in turned:
                     stated = as_stated[one, other]
-                    best = _match_of(maps[one], maps[other], list(_axes()))
+                    best = _match_of(maps[one], maps[other], [(np.eye(3), -1)])
+                    if not best.fits:  # of many ways only the likeliest are tried
+                        best = _match_of(maps[one], maps[other], list(_axes()))
                     better = best.fits and best.odds > stated.odds + CERTAIN
                     turned[one, other] = best if better or not stated.fits else stated
             known = {pair: turned[pair] for pair in pairs}

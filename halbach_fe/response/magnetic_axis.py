@@ -29,6 +29,7 @@ import numpy as np
 from scipy import optimize
 
 from halbach_fe.core.arrays import Floats, unit_circle
+from halbach_fe.geometry.coils import distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.harmonic_field import solid_harmonic_fields
 from halbach_fe.measurement.observation import flux_density_at
@@ -111,8 +112,8 @@ def magnetic_axis(
     # radius of the sphere on which a dipole's field is expanded, relative to that of the bore
     sphere = bore / 4 * _ON_SPHERE
     points = np.vstack([around, sphere]) if order == 1 and not flat else around
-    if magnet.contains(points).any():  # something stands in the bore
-        return None
+    if magnet.contains(points).any() or _has_source(magnet, bore / 4, reach):
+        return None  # something stands in the bore
     size = magnet.dimension
     field, nominal, columns = (
         values[:, :size] for values in _fields(magnet, points, session, magnetizations.mean))
@@ -153,6 +154,16 @@ def magnetic_axis(
         return (float(line[number].real), float(line[number].imag)), tuple(sd.tolist())
 
     return MagneticAxis(order, roll, roll_sd, *both(0), *(() if flat else both(1)))
+
+
+def _has_source(magnet: Magnet, radius: float, reach: float) -> bool:
+    """Return whether a coil or dipole is within a radius in m of the axis up to |z| = reach."""
+    axis = np.zeros((1 + 2 * int(np.ceil(2 * reach / radius)), 3))
+    axis[:, 2] = np.linspace(-reach, reach, len(axis))
+    return any((distance_in_magnet(coil, axis) < radius).any()
+               for coil in magnet.external.coils) or any(
+        (np.linalg.norm(axis - one.position_m, axis=1) < radius).any()
+        for one in magnet.external.dipoles)
 
 
 def _fields(

@@ -34,7 +34,7 @@ from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.coils import points_in_winding
+from halbach_fe.geometry.coils import crosses_disc, distance_in_magnet, points_in_winding
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
@@ -337,9 +337,11 @@ def multipole_models(
         try:
             if integrated:
                 matrix, offset, error = _along_all_z(magnet, observation, model, part)
+            else:
+                _check_no_source(magnet, radius, z or 0.0)
             why = (f"no multipole of order {main}, which cancels there: its table, in units of "
                    "1e-4 of that,")
-            turn = _turn(magnet, matrix[main - 1], model)
+            turn = _turn(magnet, matrix[main - 1], model, offset[main - 1])
         except StudyError:
             if len(left_out) == len(references) - 1:
                 raise
@@ -369,6 +371,32 @@ def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
             f"one of {1e3 * radius:.4g} mm about the z axis, inside magnet or iron{bore}",
             "Only a field about a free axis has multipoles; halbach-fe solve computes this one at "
             "any points."))
+
+
+def _check_no_source(magnet: Magnet, radius: float, z: float) -> None:
+    """Refuse a reference circle within which a coil or a dipole is: B_r has no multipoles there.
+
+    Raises
+    ------
+    StudyError
+    """
+    if source := _source_within(magnet, radius, z):
+        raise StudyError(must_be(
+            "the reference circle of multipoles", f"study {magnet.name}",
+            "free of coils and dipoles within it", f"one of {1e3 * radius:.4g} mm at z = "
+            f"{1e3 * z:.4g} mm, within which `external.{source}` is",
+            "Take a smaller radius or another z where there is none; halbach-fe solve computes "
+            "this field at any points."))
+
+
+def _source_within(magnet: Magnet, radius: float, z: float) -> str:
+    """Return the first coil or dipole in the flat disc within a circle; empty if there is none."""
+    external = magnet.external
+    return next((f"coils[{number}]" for number, coil in enumerate(external.coils, start=1)
+                 if crosses_disc(coil, radius, z)), "") or next(
+        (f"dipoles[{number}]" for number, one in enumerate(external.dipoles, start=1)
+         if np.hypot(*one.position_m[:2]) <= radius
+         and abs(one.position_m[2] - z) < radius / 200), "")
 
 
 def unwanted_orders(
@@ -406,7 +434,7 @@ def circle_models(
     study reads no full circles; if that main multipole is no larger than its error bar or than 3 %
     of the largest at other z, as between the poles of an undulator; or if its instrument changes or
     moves the readings: these are then not on circles about the magnet's axis, or at other z than
-    the map states.
+    the map states. Circles within which a coil or a dipole is are left out.
 
     The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
     also contains (aliases with) order m - n, which the blocks' field in vacuum tells: it is
@@ -415,7 +443,8 @@ def circle_models(
     """
     main, models = magnet.array.multipole_order, []
     deviations = Deviations.of(magnet)
-    circles = _read_circles(magnet, observation)
+    circles = [(radius, z, analysis) for radius, z, analysis in _read_circles(magnet, observation)
+               if not _source_within(magnet, radius, z)]
     for radius in sorted({radius for radius, _, _ in circles}):
         own = sorted((z, analysis) for other, z, analysis in circles if other == radius)
         _, middle = min(own, key=lambda pair: abs(pair[0]))
@@ -430,7 +459,7 @@ def circle_models(
         try:
             # between the poles of an undulator 0.5 % of the largest were left of mesh and columns
             least = 0.03 * max(abs(row[main - 1] @ model.nominal) for row in by_z.values())
-            turn = _turn(magnet, reference[0], model, max(
+            turn = _turn(magnet, reference[0], model, fixed[0], max(
                 least, _circle_error(middle, model.error)[main - 1]))
         except StudyError:
             continue
@@ -524,25 +553,29 @@ def _complexes(values: Floats) -> Complexes:
     return values[half:] + 1j * values[:half]
 
 
-def _turn(magnet: Magnet, row: Complexes, model: Response, least_T: float = 0.0) -> float:
+def _turn(
+    magnet: Magnet, row: Complexes, model: Response, external: complex, least_T: float = 0.0
+) -> float:
     """Return the angle in rad of the nominal main multipole about z.
 
-    ``row`` (parameters,) is the row of the main multipole in the matrix from magnetizations to C.
+    ``row`` (parameters,) is the row of the main multipole in the matrix from magnetizations to C,
+    and ``external`` what external fields add to it.
 
     Raises
     ------
     StudyError
-        If the main multipole of the nominal magnet vanishes, or is no larger than ``least_T``.
+        If the main multipole of the nominal magnet, with external fields or without, vanishes, or
+        is no larger than ``least_T``.
     """
     own = row @ model.nominal
     scale = np.abs(row).sum() * np.abs(model.nominal).max()
-    if not abs(own) > max(NOTHING_THERE * scale, least_T):
+    if not min(abs(own), abs(own + external)) > max(NOTHING_THERE * scale, least_T):
         raise StudyError(must_be(
             "`array`", f"study {magnet.name}",
             f"that of a magnet with a multipole of order {magnet.array.multipole_order}",
             "a magnet without it", "Check multipole_order and its exceptions; of an undulator, "
             "whose field cancels along z, ask on circles at poles: --at-z-m Z."))
-    return float(np.angle(own)) / magnet.array.multipole_order
+    return float(np.angle(own + external)) / magnet.array.multipole_order
 
 
 def _read_circles(
@@ -621,14 +654,13 @@ def _along_all_z(
         matrix[:, column] -= observation.operator @ np.tile(uniform, len(observation.points))
     near, far = complexes(matrix)
     offset_near, offset_far = complexes(offset)
-    circle = observation.points[observation.points[:, 2] == observation.points[0, 2]]
-    radius, highest = float(np.hypot(*circle[0, :2])), len(near)
+    radius, highest = float(np.hypot(*observation.points[0, :2])), len(near)
     shapes, inexact = _integrals_of_shapes(magnet.blocks, radius, highest)
     others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
     of_others, inexact_others = _integrals_of_shapes(others, radius, highest)
     sources = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
                   for one, shape in zip(others, of_others, strict=True))
-    coils, coils_error = _integrals_of_coils(magnet, circle, highest)
+    coils, coils_error = _integrals_of_coils(magnet, radius, highest)
     mesh = model.error[part].reshape(2, 2, -1).max(axis=1).sum(axis=0)
     error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + inexact_others + coils_error
     total = near + far
@@ -707,11 +739,11 @@ def _harmonics_of_shape(block: MagnetBlock, radius: float, highest: int, size: i
 
 
 def _integrals_of_coils(
-    magnet: Magnet, circle: Floats, highest: int
+    magnet: Magnet, radius: float, highest: int
 ) -> tuple[Complexes, float]:
     """Return C_n (K,) of external coils and dipoles, integrated along all of z, in T m.
 
-    The error bar in T m of all comes second. ``circle`` (angles, 3) in m are equidistant points.
+    The error bar in T m of all comes second. The ``radius`` of the circle is in m.
 
     Raises
     ------
@@ -721,7 +753,7 @@ def _integrals_of_coils(
     external = External(coils=magnet.external.coils, dipoles=magnet.external.dipoles)
     if external == External():
         return np.zeros(highest, complex), 0.0
-    radius = np.hypot(*circle[0, :2])
+    closest = np.inf
     for name, each in (*((f"coils[{number}]", points_in_winding(coil))
                          for number, coil in enumerate(external.coils, start=1)),
                        *((f"dipoles[{number}]", np.array([one.position_m]))
@@ -732,12 +764,15 @@ def _integrals_of_coils(
                 f"for multipoles that are integrated along z: farther than {radius:g} m from the "
                 "axis", f"{nearest:.4g} m", "Ask on a circle at one place: --at-z-m Z, in Python "
                 "MultipoleReference(z_m=Z)."))
+        closest = min(closest, max(float(nearest), 1.002 * radius))
     alone = magnet.with_(external=external)
-    angle = azimuths_of(circle)
+    angles = _angles(highest, radius / closest)
+    angle = 2 * np.pi * np.arange(angles) / angles
+    circle = radius * unit_circle(angle)[:, :2]
     wave = np.exp(-1j * np.outer(np.arange(highest), angle)) / len(angle)
 
     def harmonics(z: float) -> Floats:
-        field = external_field(alone, at_heights(circle[:, :2], z))
+        field = external_field(alone, at_heights(circle, z))
         found = wave @ (field[:, 1] + 1j * field[:, 0])
         return np.concatenate([found.real, found.imag])
 
@@ -815,16 +850,13 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
     """
     free = _free_radius(magnet, z)
     bore = free if radius < free else magnet.bore_radius
-    # tolerance of sums over equally spaced angles or z, relative to the field at blocks and iron.
-    # Such a sum mixes a small part of a multipole into another. Harmonics of order k fall as
-    # (R / r)^k from their inner radius r inwards, and the sum over steps h along z of a field whose
-    # sources are at the distance d has the error exp(-2 pi d / h).
-    sum_error = 1e-8
-    angles = max(2 * highest + 1, highest + int(np.ceil(np.log(sum_error) / np.log(radius / bore))))
+    if magnet.dimension == 2 or z is not None:  # the sum along z is without coils and dipoles
+        bore = min(bore, radius + _nearest_source(magnet, radius, z or 0.0))
+    angles = _angles(highest, radius / bore)
     limits: tuple[float, float, int] = (z or 0.0, z or 0.0, 1)
     if magnet.dimension == 3 and z is None:
         end = magnet.field_reach
-        step = 2 * np.pi * (bore - radius) / -np.log(sum_error)
+        step = 2 * np.pi * (bore - radius) / -np.log(SUM_ERROR)
         limits = (-end, end, int(np.ceil(2 * end / step)) + 1)
     settings = FourierCoefficients(
         quantity="fourier_coefficients", harmonics=highest, positions=CirclePositions(
@@ -846,6 +878,30 @@ def _observation(magnet: Magnet, radius: float, highest: int, z: float | None) -
         total = sparse.csr_array(sparse.vstack([total, beyond]))
         labels, positions = 2 * labels, np.tile(positions, (2, 1))
     return Observation(points, total, total, points, labels, positions)
+
+
+SUM_ERROR = 1e-8
+"""Tolerance of sums over equally spaced angles or z, relative to the field at blocks and iron.
+
+Such a sum mixes a small part of a multipole into another. Harmonics of order k fall as (R / r)^k
+from their inner radius r inwards, and the sum over steps h along z of a field whose sources are at
+the distance d has the error exp(-2 pi d / h)."""
+
+
+def _angles(highest: int, ratio: float) -> int:
+    """Return how many angles tell orders up to the highest, if harmonics fall as ratio^k."""
+    return max(2 * highest + 1, highest + int(np.ceil(np.log(SUM_ERROR) / np.log(ratio))))
+
+
+def _nearest_source(magnet: Magnet, radius: float, z: float) -> float:
+    """Return how far in m the nearest coil or dipole is from a circle at z in m, or 1/200 of the
+    radius if it is nearer; infinite without any.
+    """
+    angle = np.linspace(0, 2 * np.pi, 1000)
+    circle = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle + z])
+    apart = [distance_in_magnet(coil, circle).min() for coil in magnet.external.coils] + [
+        np.linalg.norm(circle - one.position_m, axis=1).min() for one in magnet.external.dipoles]
+    return max(float(min(apart, default=np.inf)), radius / 200)
 
 
 SAME_HEIGHT_M = 1e-6

@@ -276,3 +276,15 @@ def test_placeholders_and_copies(tmp_path):
     with pytest.raises(MeasurementError, match=r"Remove them: what is read again differs") as said:
         read_map(tmp_path / "map.csv")
     assert "time_s" not in str(said.value)
+
+
+def test_tables_in_another_order_are_refused():
+    """Positions and readings of rows that were sorted apart were paired by their places."""
+    pandas = pytest.importorskip("pandas")
+    points = pandas.DataFrame([[0.0, 0.0, 0.2], [0.0, 0.0, 0.1]], columns=["x_m", "y_m", "z_m"])
+    field = pandas.DataFrame([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], columns=["Bx_T", "By_T", "Bz_T"])
+    with pytest.raises(MeasurementError, match=r"same order.*to_numpy"):
+        field_map(points.sort_values("z_m"), field)
+    for places in (points, points.set_index(pandas.Index(["a", "b"])),
+                   points.sort_values("z_m").to_numpy()[::-1]):
+        np.testing.assert_allclose(field_map(places, field)["B_T"][:, 0], [1.0, 2.0])

@@ -189,6 +189,20 @@ def test_how_a_block_lies_is_not_guessed(tmp_path, asked):
         assert found.rotation_z_deg == (50.0,)
 
 
+@pytest.mark.parametrize(("name", "cell", "turns"), [
+    ("rotor", "A7", False), ("turns", "12", False), ("rolled by", "Ann", False),
+    ("pitch [mm]", "10", False), ("phi [mm]", "3", False), ("turn", "30", True),
+    ("tilt", "3", True), ("angle about z", "30", True), ("rot_z2", "3", True),
+    ("orientation", "up", True), ("Yaw angle", "3", True), ("phiz", "3", True)])
+def test_words_that_only_begin_like_a_turn(tmp_path, name, cell, turns):
+    """A rotor or the turns of a coil stopped the table; what says how a block lies still does."""
+    text = (f"x [mm];y [mm];z [mm];dx [mm];dy [mm];dz [mm];Br [T];{name}\n"
+            f"0;0;0;10;20;30;1.3;{cell}\n")
+    with (pytest.raises(MeasurementError, match="turned by") if turns
+          else pytest.warns(HalbachWarning, match="not read")):
+        imported(tmp_path, text, fixed={"shape": "cuboid"})
+
+
 def test_lengths_of_J_with_a_direction_and_diameters(tmp_path):
     """J was taken along x beside its direction. Negative controls: without one, and by radius."""
     text = ("x [mm];y [mm];z [mm];Diameter [mm];Height [mm];Br [T];{}\n0;0;0;30;10;1.3;0;1\n")
@@ -362,6 +376,24 @@ def test_workbooks_whose_numbers_are_texts_with_decimal_commas(tmp_path):
     found = import_map(path, DeclaredFormat(decimal_comma=True)).data
     np.testing.assert_allclose(found["B_T"][:, 0], [0.1005, 0.101])
     np.testing.assert_allclose(found["x_m"], 0.0015)
+
+
+def test_a_formula_without_its_value_in_another_sheet(tmp_path):
+    """It refused the workbook. The sheet is named, as what it would have held is not read."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, path = openpyxl.Workbook(), tmp_path / "map.xlsx"
+    cover, data = book.active, book.create_sheet("Data")
+    cover.append(["=Data!A2", "=Data!B2"])
+    for row in (["x [mm]", "y [mm]", "z [mm]", "Bx [mT]"], [1, 2, 3, 100], [1, 2, 4, 101]):
+        data.append(row)
+    book.save(path)
+    with pytest.warns(HalbachWarning, match="sheet 'Data' is read; 'Sheet' would have to be"):
+        found = import_map(path, DeclaredFormat()).data
+    np.testing.assert_allclose(found["B_T"][:, 0], [0.1, 0.101])
+    data.append([1, 2, 5, "=D3+1"])
+    book.save(path)
+    with pytest.raises(MeasurementError, match="the formula in D4 has no value"):
+        import_map(path, DeclaredFormat())
 
 
 @pytest.mark.parametrize(("saved", "text"), [("", False), ("101", False), ("", True)])

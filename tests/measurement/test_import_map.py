@@ -172,6 +172,27 @@ def test_everything_missing_is_asked_for_at_once(tmp_path):
     assert "Br, Bphi" not in sentence
 
 
+@pytest.mark.parametrize("header", [
+    "x,y,z [mm],Bx,By,Bz [G]", "x [mm],y,z,Bx [G],By,Bz", "x,y,z,Bx,By,Bz\nmm,,,G,,",
+    "x (mm),y (mm),z (mm),Bx,By,Bz (G)"])
+def test_one_unit_for_the_columns_beside_it(tmp_path, header):
+    """It had been refused. A sentence says which columns do not state their own."""
+    found = imported(tmp_path, f"{header}\n1,2,3,4000,5000,6000\n")
+    assert re.search("'By'.* were read in the unit of the column beside", " ".join(found.remarks))
+    data = found.data
+    np.testing.assert_allclose(data["B_T"], [[0.4, 0.5, 0.6]])
+    np.testing.assert_allclose(data["z_m"], 0.003)
+
+
+@pytest.mark.parametrize(("header", "asked"), [
+    ("x [mm],y [cm],z,Bx,By,Bz [G]", "unit of z "),  # two units
+    ("x,y [mm],z,Bx,By,Bz [G]", "unit of x, z "),  # in the middle
+    ("x,Bx,y,By,z [mm],Bz [G]", "unit of x, y .*; the unit of Bx, By ")])  # not side by side
+def test_a_unit_that_may_be_that_of_its_column_alone(tmp_path, header, asked):
+    with pytest.raises(MeasurementError, match=asked):
+        imported(tmp_path, f"{header}\n1,2,3,4,5,6\n")
+
+
 def test_one_component_along_a_line(tmp_path):
     found = imported(tmp_path, "z [mm]  B [G]\n0 100\n10 200\n", component="y",
                      at={"x": 0.01, "y": 0.0}, origin_m=(0.0, 0.0, -0.5))

@@ -169,6 +169,32 @@ def test_the_sign_that_no_single_map_shows():
     assert "opposite sign" in sentences(joined)[0]
 
 
+def test_the_sign_is_tried_before_other_axes(generator, monkeypatch):
+    """Of such a dipole many axes may be likelier at first, of which none fits; its own sign, then
+    not tried, was called a map of another magnet. Here there are no other axes at all.
+    """
+    monkeypatch.setattr(map_join, "_axes", lambda: iter(()))
+    magpylib = pytest.importorskip("magpylib")
+    cubes = []
+    for z in (-0.0225, 0.0225):
+        for angle in 2 * np.pi * np.arange(12) / 12:
+            easy = 1.3 * np.array([np.cos(2 * angle), np.sin(2 * angle), 0.0])
+            cubes.append(magpylib.magnet.Cuboid(
+                polarization=easy + 0.026 * generator.standard_normal(3), dimension=(0.02,) * 3,
+                position=(0.06 * np.cos(angle), 0.06 * np.sin(angle), z)))
+    side = np.linspace(-0.015, 0.015, 7)
+    turn, middle = Rotation.from_euler("z", 0.01), np.array([0.001, -0.002, 0.06])
+    maps = {}
+    for name, z in (("body", np.linspace(-0.03, 0.03, 13)), ("back", np.linspace(-0.04, 0.04, 17))):
+        points = np.stack(np.meshgrid(side, side, z, indexing="ij"), axis=-1).reshape(-1, 3)
+        field = magpylib.getB(cubes, points, sumup=True) if name == "body" else -turn.inv().apply(
+            magpylib.getB(cubes, turn.apply(points) + middle, sumup=True))
+        maps[name] = field_map(points, field + 2e-5 * generator.standard_normal(points.shape))
+    _, (pose, sign) = map_join._places(as_checked(maps))
+    assert sign == -1
+    np.testing.assert_allclose(pose.turn, turn.as_matrix(), atol=2e-3)
+
+
 def test_a_reversed_map_of_a_symmetric_magnet(generator):
     """It fitted beside the other map, face to face: two components of three agree there. That it
     is turned half round, or mirrored, is as likely as its sign, which is simpler.

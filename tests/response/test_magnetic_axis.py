@@ -227,6 +227,18 @@ def test_there_is_none_without_the_multipole(tmp_path):
     assert magnetic_axis(magnet, Session.open(tmp_path), exact) is None
 
 
+@pytest.mark.parametrize(("x", "there"), [(0.005, False), (0.04, True)])
+def test_there_is_none_with_a_wire_in_the_middle_of_the_bore(tmp_path, x, there):
+    """Its own field is no multipole of the magnet: it had a centre. The control passes outside."""
+    magnet = build_magnet(study(2)).with_(external={"coils": [{
+        "kind": "polygon", "current_A": 10.0, "points_m": [
+            [x, 0.0, -1.0], [x, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0]]}]})
+    nominal = magnet.nominal_magnetization
+    found = magnetic_axis(magnet, Session.open(tmp_path),
+                          Gaussian(nominal, np.zeros((len(nominal), 1))))
+    assert (found is not None) is there
+
+
 def test_a_result_knows_its_magnet(generator, tmp_path):
     """A ring of another radius has as many blocks, so that only the result tells them apart."""
     own = study(2)

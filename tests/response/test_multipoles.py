@@ -246,6 +246,77 @@ def test_an_integral_that_has_sources_within_its_circle(session, external, named
     assert len(said) == 1
 
 
+def loop_beside_the_axis(x, half_length=0.1):
+    """100 A up at x, and down at x = 0.3 m."""
+    return {"coils": [{"kind": "polygon", "current_A": 100.0, "points_m": [
+        [x, 0, -half_length], [x, 0, half_length], [0.3, 0, half_length], [0.3, 0, -half_length]]}]}
+
+
+def test_a_wire_just_beyond_the_circle(session):
+    """Its high orders were mistaken for low ones: c_10 of the circle half of its size, and c_2 of
+    the integral 6 % off, without a word. Truth: B_y + i B_x = mu_0 I L / 2 pi (z - x), integrated;
+    on the circle magpylib, by many angles. The control is that of as few angles as before.
+    """
+    magpylib = pytest.importorskip("magpylib")
+    radius, x, order = 0.02, 0.0222, np.arange(1, 11)
+    external = loop_beside_the_axis(x)
+    magnet = magnet_of_blocks(ALONE | {"x_m": [-0.04]}).with_(external=external)
+    model = multipole_model(magnet, MultipoleReference(radius), session)
+    wires = -2e-7 * 100.0 * 0.2 * radius**(order - 1) * (x**-order - 0.3**-order)
+    np.testing.assert_allclose(model.offset, wires * np.exp(1j * model.turn * order), rtol=1e-6)
+    at_z = multipole_model(magnet, MultipoleReference(radius, z_m=0.01), session)
+    corners = external["coils"][0]["points_m"]
+    wire = magpylib.current.Polyline(current=100.0, vertices=[*corners, corners[0]])
+
+    def on_circle(angles):
+        angle = 2 * np.pi * np.arange(angles) / angles
+        points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle + 0.01])
+        radial = np.einsum("nc,nc->n", wire.getB(points)[:, :2], points[:, :2]) / radius
+        return 2j * np.exp(-1j * np.outer(order, angle)) @ radial / angles
+
+    found = at_z.offset * np.exp(-1j * at_z.turn * order)
+    np.testing.assert_allclose(found, on_circle(2000), rtol=1e-6)
+    assert np.abs(found / on_circle(45) - 1).max() > 0.01
+
+
+@pytest.mark.parametrize(("external", "named"), [
+    (loop_beside_the_axis(0.0199), r"coils\[1\]"),
+    ({"coils": [{"kind": "racetrack", "size_m": [0.012, 0.008], "section_m": [0, 0.004],
+                 "current_A": 5.0}]}, r"coils\[1\]"),
+    ({"coils": [{"kind": "round", "radius_m": 0.04, "section_m": [0.002, 0.002], "current_A": 5,
+                 "centre_m": [0, 0.0357, 0.0306], "rotation_deg": [50, 0, 0]}]}, r"coils\[1\]"),
+    ({"dipoles": [{"position_m": [0.0, 0.01, 0.0], "moment_A_m2": [0, 3, 0]}]}, r"dipoles\[1\]")])
+def test_a_circle_around_sources(session, external, named):
+    """Its B_r was given as multipoles with Yes, though no series of them is the field in it. The
+    controls are circles that the coil passes by.
+    """
+    magnet = magnet_of_blocks(ALONE).with_(external=external)
+    with pytest.raises(StudyError, match=f"free of coils and dipoles within it.*{named}.*solve"):
+        multipole_model(magnet, MultipoleReference(0.02, (2, 3), 0.0), session)
+    assert multipole_model(magnet, MultipoleReference(0.02, (2, 3), 0.15), session)
+    study = parse_study(changed(DIPOLE, array__recoil_permeability=1.0, dimension=3,
+                                array__ring_length_m=0.1, external=external,
+                                observation__positions={
+        "kind": "circles", "radius_m": 0.02, "angles": 32, "z_min_m": 0.0, "z_max_m": 0.15,
+        "count": 2}))
+    points, ring = points_from(study.observation.positions), build_magnet(study)
+    tables = solved_circles(ring, points, ring.field_T(points), np.zeros(3 * len(points)))
+    assert [model.z for model, _ in tables] == [0.15]
+
+
+def test_the_axes_beside_a_turned_neighbour(session):
+    """They were those of the blocks alone, so that the magnet as ordered had a roll of 0.1 rad."""
+    magnet = magnet_of_blocks(ALONE).with_(
+        external={"neighbours": [{"z_m": 0.06, "turn_deg": 40.0}]})
+    for z in (None, 0.02):
+        model = multipole_model(magnet, MultipoleReference(0.02, (2, 3), z), session)
+        nominal = model.of(Gaussian(model.nominal, np.zeros((len(model.nominal), 1))))
+        assert abs(nominal.roll) < 1e-12
+        bare = multipole_model(magnet.with_(external={}), MultipoleReference(0.02, (2, 3), z),
+                               session)
+        assert abs(bare.turn - model.turn) > 0.05
+
+
 def test_what_is_cut_off_of_permeability_is_in_the_bar(session, monkeypatch):
     """The same cube summed over three times the distance. Measured: the continuation beyond the
     ends misses 8 % of itself, and all of it is in the bar; the control is the sum without it.

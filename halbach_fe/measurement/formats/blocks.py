@@ -72,8 +72,10 @@ WITHOUT_AXIS = ("length", "width")
 """Names of edges that do not say their axis; height and thickness are along z."""
 DIRECTION = re.compile(r"(?:mag(?:neti[sz]ation)?|easy|j|m)?(?:direction|dir|axis|u|n|e)[xyz]")
 """Names, without spaces and marks, of columns of a direction beside a length of J."""
-TURN = re.compile(r"(?i)\W*(?:rot|turn|angle|phi|theta|euler|roll|pitch|yaw|tilt|azimuth|orient)")
-"""Beginnings of names of columns that say how a block lies."""
+TURN = re.compile(
+    r"(?i)\W*(?:rot(?:at(?:ion|ed))?|turn(?:ed)?|angles?|phi|theta|euler|roll|pitch|yaw|tilt(?:ed)?|"
+    r"azimuth(?:al)?|orient(?:ation|ed)?)(?:[xyz]|angles?|deg|vec|about.*)?(?:[\W\d_].*)?")
+"""Names of columns that say how a block lies; a rotor and the turns of a coil do not."""
 LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
 KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys(
     LENGTHS, "length") | {
@@ -377,8 +379,8 @@ def _unclear(table: _Table) -> list[str]:
     sizes = [text for name, text in table.named.items() if name in ("size_x", "size_y")
              and names.split_unit(text)[0].lower().strip() in WITHOUT_AXIS]
     other = [text for text in table.unknown if "at_x" in table and (
-        units.kind_of(names.split_unit(text)[1]) == "angle"
-        or TURN.match(names.split_unit(text)[0]))]
+        (kind := units.kind_of(names.split_unit(text)[1])) == "angle"
+        or (not kind and TURN.fullmatch(names.split_unit(text)[0])))]
     found = []
     if said:
         found.append(

@@ -349,6 +349,12 @@ def _remarks(
                if one != other]
     said = [f"{_quoted(by_axis)} were read as positions or components, by their axes and units."
             ] if by_axis and not declared.columns else []
+    shared = [columns[used[name]].text for name, unit in unit_of.items()
+              if name not in names.NOISE and not columns[used[name]].unit and not declared.unit_of(
+                  _kind(name)) and unit != "hhmmss" and not table.length_unit]
+    if shared:
+        said.append(f"{_quoted(shared)} {'was' if len(shared) == 1 else 'were'} read in the unit "
+                    "of the column beside.")
     said += ["The columns of H were read as B = mu_0 H, as it is in air."] if any(
         unit.rpartition(" ")[2] in units.H_FIELDS for unit in unit_of.values()) else []
     noise = [name for name in names.NOISE if name in used]
@@ -670,8 +676,9 @@ def _units(
     if option and not own and not missing:
         raise _contradiction(table, "header", f"no column of this kind ({kind})",
                              f"--{kind}-unit {option}")
+    shared = _unit_of_all(columns, {used[name] for name in own if name not in names.NOISE})
     for name in own:
-        text = columns[used[name]].unit
+        text = columns[used[name]].unit or ("" if name in names.NOISE else shared)
         if units.states_no_unit(text):
             text = table.length_unit if kind == "length" else ""
         if kind == "time":
@@ -699,6 +706,18 @@ def _units(
     if unknown:
         missing.append(f"the unit of {', '.join(unknown)} ({OPTIONS[kind]})")
     return found
+
+
+def _unit_of_all(columns: Sequence[ColumnName], own: set[int]) -> str:
+    """Return the unit that one of the columns ``own`` of a kind states for all, or an empty text.
+
+    It is the first or the last one of columns beside each other, as in Bx, By, Bz [mT].
+    """
+    first, last = min(own, default=0), max(own, default=0)
+    stated = {index: columns[index].unit for index in own if columns[index].unit}
+    beside = last - first + 1 == len(own)
+    return next(iter(stated.values())) if beside and len(stated) == 1 and (
+        {first, last} & stated.keys()) else ""
 
 
 def _stated(text: str, kind: str) -> str:
