@@ -111,7 +111,8 @@ def sheet_text(raw: bytes, decimal_comma: bool = False) -> tuple[bytes, str, lis
             csv.writer(text, delimiter=";", lineterminator="\n").writerows(
                 [*row, *[""] * width][:width] for row in rows if any(row))
             this = text.getvalue().encode(), str(sheet.title), formula
-            first = first or this
+            if first is None or (formula and not first[2]):  # numbers may be in these alone
+                first = this
             chosen = chosen or (this if of_numbers else None)
         if first is None:
             raise ValueError("it has no sheet with cells")

@@ -27,7 +27,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.legend import Legend
 from matplotlib.patches import Circle, Polygon, Rectangle
-from matplotlib.path import Path as Outline
 from matplotlib.ticker import FuncFormatter, LogFormatter
 from scipy.spatial import ConvexHull
 from tomlkit.items import Array, Trivia, Whitespace
@@ -202,8 +201,8 @@ class Page:
     @property
     def unplaced(self) -> list[str]:
         """Figures that no section has."""
-        placed = {part.file for section in self.sections for part in section.parts
-                  if isinstance(part, Drawn)}
+        placed = {part.file for section in self.sections if section.about
+                  for part in section.parts if isinstance(part, Drawn)}
         return [name for name in self.figures if name not in placed]
 
 
@@ -406,7 +405,7 @@ def _templates() -> jinja2.Environment:
     environment.tests |= {kind.__name__.lower(): lambda part, kind=kind: isinstance(part, kind)
                           for kind in (Text, Items, Table, Drawn, View)}
     environment.tests["empty"] = lambda part: not (
-        part[0] if isinstance(part, Text | Items) else part)
+        part[0] if isinstance(part, Text | Items | Table) else part)
     return environment
 
 
@@ -606,25 +605,36 @@ def _inner_radii(magnet: Magnet) -> list[float]:
 def _side_of(body: IronSolid) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits in m of a body along z, and of its distances from the z axis.
 
-    Of a body that is no tube they are those of the hull of its shadow along z.
+    Of a body of triangles they are those of its shadow along z; of prisms, spheres and tubes that
+    are not about that axis, those of the hull of the shadow.
     """
-    x, y, z = (part.ravel() for part in body.surface)
-    reach, ends = float(np.hypot(x, y).max()), (float(z.min()), float(z.max()))
+    x, y, z = body.surface
+    ends, reach = (float(z.min()), float(z.max())), float(np.hypot(x, y).max())
     if body.is_coaxial:
         return ends, (body.inner_radius, reach)
-    shadow = np.column_stack([x, y])
-    corners = shadow[ConvexHull(shadow).vertices]
-    t = np.linspace(0, 1, 33)[:, None, None]
-    sides = (1 - t) * corners + t * np.roll(corners, -1, axis=0)
-    inside = Outline(corners).contains_point((0, 0))
-    return ends, (0.0 if inside else float(np.linalg.norm(sides, axis=2).min()), reach)
+    shadow = np.stack([x, y], axis=2)
+    if body.triangles is None:
+        shadow = shadow.reshape(-1, 2)
+        shadow = shadow[ConvexHull(shadow).vertices][None]
+    return ends, (_from_axis(shadow), reach)
+
+
+def _from_axis(polygons: Floats) -> float:
+    """Return the distance of the origin from convex polygons (m, n, 2), 0 within one of them."""
+    along = np.roll(polygons, -1, axis=1) - polygons
+    left = polygons[..., 0] * along[..., 1] - polygons[..., 1] * along[..., 0]
+    if ((left > 0).all(axis=1) | (left < 0).all(axis=1)).any():
+        return 0.0
+    share = np.clip(-np.sum(polygons * along, axis=2) / np.maximum(
+        np.sum(along**2, axis=2), np.finfo(float).tiny), 0, 1)  # sides of walls along z are points
+    return float(np.linalg.norm(polygons + share[..., None] * along, axis=2).min())
 
 
 def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None) -> Figure:
     """Draw the positions of readings in the cross-section of the magnet.
 
     If the positions are not in a single plane, a second panel shows them by z and distance from
-    the axis.
+    the axis; of a cross-section, which has no ends, none does.
 
     Parameters
     ----------
@@ -632,7 +642,7 @@ def geometry_figure(magnet: Magnet, points: Floats, others: Floats | None = None
     others : ndarray, shape (m, 3), in m, optional
         Positions of held-out readings.
     """
-    flat = np.ptp(points[:, 2]) == 0
+    flat = magnet.dimension == 2 or np.ptp(points[:, 2]) == 0
     figure = figure_of(5.8, 5.5) if flat else figure_of(4.2)
     left, *right = figure.subplots(1, 1 if flat else 2, squeeze=False)[0]
     draw_cross_section(left, magnet)

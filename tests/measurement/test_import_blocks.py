@@ -396,6 +396,20 @@ def test_a_formula_without_its_value_in_another_sheet(tmp_path):
         import_map(path, DeclaredFormat())
 
 
+def test_a_workbook_whose_only_numbers_are_formulas_without_values(tmp_path):
+    """The notes in its first sheet are not what has to be mended."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, path = openpyxl.Workbook(), tmp_path / "map.xlsx"
+    for text in ("Measured on Monday", "by a Hall probe"):
+        book.active.append([text])
+    data = book.create_sheet("Map")
+    for row in (["x [mm]", "y [mm]", "z [mm]", "Bx [mT]"], ["=1", "=2", "=3", "=100"]):
+        data.append(row)
+    book.save(path)
+    with pytest.raises(MeasurementError, match="the formula in A2 has no value"):
+        import_map(path, DeclaredFormat())
+
+
 @pytest.mark.parametrize(("saved", "text"), [("", False), ("101", False), ("", True)])
 def test_a_formula_without_its_value_is_not_left_out(tmp_path, saved, text):
     """Negative controls: one that was saved with its value, and an empty text."""
