@@ -1,4 +1,4 @@
-"""Type aliases of NumPy arrays, and points about the z axis."""
+"""Type aliases of NumPy arrays, and the geometry of points, polygons and vectors."""
 
 from __future__ import annotations
 
@@ -25,6 +25,13 @@ def radii_of(points: Floats) -> Floats:
 def azimuths_of(points: Floats) -> Floats:
     """Return the angles (n,) in rad of points (n, 2 or 3) about the z axis, from -pi to pi."""
     return np.asarray(np.arctan2(points[:, 1], points[:, 0]), np.float64)
+
+
+def degrees_of(points: Floats) -> Floats:
+    """Return the angles (n,) in degrees of points (n, 2 or 3) about the z axis, from 0 to 360."""
+    rounding = 1e-3  # an angle of -1e-17 is 0, not 360
+    angle = np.degrees(azimuths_of(points)) % 360
+    return np.asarray(np.where(angle > 360 - rounding, 0.0, angle), np.float64)
 
 
 def box_middle(points: Floats) -> Floats:

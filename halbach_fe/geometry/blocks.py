@@ -112,7 +112,7 @@ class MagnetBlock:
 
     @cached_property
     def mounted_middle(self) -> Floats:
-        """The same of the block where it is mounted, (3,) in m."""
+        """Middle of the block where it is mounted, (3,) in m."""
         return np.asarray(self.middle + self.displacement_m)
 
     @cached_property

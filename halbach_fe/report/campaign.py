@@ -18,7 +18,15 @@ from halbach_fe.measurement.instrument import by_stated_units
 from halbach_fe.measurement.observation import TOTAL_LABEL
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.magnet_view_3d import ViewPoints, view_of_nominal_magnet
-from halbach_fe.report.page import OF_COMPONENTS, Page, Section, Table, View, chart, geometry_figure
+from halbach_fe.report.page import (
+    COLOURS_OF_COMPONENTS,
+    Page,
+    Section,
+    Table,
+    View,
+    chart,
+    geometry_figure,
+)
 from halbach_fe.report.point_maps import curve, maps_figure
 from halbach_fe.report.words import counted, flux_density
 from halbach_fe.study.model import Study
@@ -139,7 +147,7 @@ def _field_figure(study: Study, maps: dict[str, xr.Dataset]) -> Figure:
     for (name, data), marker in zip(maps.items(), (".", "x"), strict=False):
         place, label = curve(points_of(data)) or (np.zeros(0), "")
         for (shown, column), colour in zip(
-                _columns(study, data).items(), OF_COMPONENTS, strict=False):
+                _columns(study, data).items(), COLOURS_OF_COMPONENTS, strict=False):
             axis.plot(place, 1e3 * column, marker, ms=4, color=colour, label=f"{shown}, {name}")
         axis.set_xlabel(label)
     axis.set_ylabel("reading in mT")

@@ -33,7 +33,7 @@ from tomlkit.items import Array, Trivia, Whitespace
 
 import halbach_fe
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, box_middle
+from halbach_fe.core.arrays import Floats, box_middle, degrees_of, radii_of
 from halbach_fe.core.code_digest import version
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.files import atomic, make_folder, write_text
@@ -62,7 +62,7 @@ from halbach_fe.study.study_file import study_text, write_edited
 PRIOR, POSTERIOR, PUBLISHED, MEASURED = "#E69F00", "#0072B2", "#999999", "#000000"
 SECOND, THIRD = "#009E73", "#CC79A7"
 IRON = "#56B4E9"
-OF_COMPONENTS = (POSTERIOR, PRIOR, SECOND)
+COLOURS_OF_COMPONENTS = (POSTERIOR, PRIOR, SECOND)
 
 PROGRAMS = ("halbach-fe", "gmsh", "numpy", "scipy")
 """Packages whose versions each page states."""
@@ -514,11 +514,10 @@ def axis_of_points(points: Floats) -> tuple[Floats, str]:
     The abscissa is z; for points in a single plane the angle about z; and if one of them is on the
     axis, the number of the point.
     """
-    x, y, z = points.T
-    if np.ptp(z) > 0:
-        return 1e3 * z, "z in mm"
-    if np.hypot(x, y).min() > 0:
-        return np.asarray(np.degrees(np.arctan2(y, x)) % 360, np.float64), "angle in degrees"
+    if np.ptp(points[:, 2]) > 0:
+        return 1e3 * points[:, 2], "z in mm"
+    if radii_of(points).min() > 0:
+        return degrees_of(points), "angle in degrees"
     return np.arange(1.0, len(points) + 1), "number of the point"
 
 

@@ -14,7 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from scipy import special
 
-from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, degrees_of, radii_of
 from halbach_fe.inference.result import (
     COVERAGE_Z,
     HELD_OUT,
@@ -83,7 +83,7 @@ def curve(points: Floats) -> tuple[Floats, str] | None:
         return 1e3 * (centred @ along), "distance along the line in mm"
     radii = radii_of(points)
     if np.ptp(points[:, 2]) <= SAME * radii.max() and np.ptp(radii) <= SAME * radii.max():
-        return _angle(points), "angle in degrees"
+        return degrees_of(points), "angle in degrees"
     return None
 
 
@@ -99,7 +99,7 @@ def panels(points: Floats) -> list[Panel]:
     from_middle = np.linalg.norm(points - _centre(points), axis=1)
 
     def unrolled(title: str, chosen: Ints) -> Panel:
-        return Panel(title, chosen, z[chosen], _angle(points[chosen]),
+        return Panel(title, chosen, z[chosen], degrees_of(points[chosen]),
                      ("z in mm", "angle in degrees"), lengths=False)
 
     if np.ptp(from_middle) <= 10 * SAME * from_middle.max():
@@ -137,12 +137,6 @@ def _different(values: Floats, apart: float) -> tuple[Floats, Ints]:
     number = np.empty(len(values), np.intp)
     number[order] = np.append(0, np.cumsum(np.diff(values[order]) > apart))
     return np.asarray(np.bincount(number, values) / np.bincount(number)), number
-
-
-def _angle(points: Floats) -> Floats:
-    """Return the angles (n,) of points (n, 3) about z, from 0 to 360 degrees."""
-    angle = np.degrees(azimuths_of(points)) % 360
-    return np.asarray(np.where(angle > 360 - SAME, 0.0, angle), np.float64)  # -1e-17 is 0
 
 
 def _slice(points: Floats, chosen: Ints, across: int) -> Panel:
@@ -284,14 +278,14 @@ def axis_of_readings(result: InferenceResult) -> tuple[Floats, str]:
     coefficients in a single plane their order. Positions are those that the map states; of several
     maps, those in the magnet.
     """
-    x, y, z = (result.observation.places if result.is_campaign
-               else result.observation.positions).T
+    places = (result.observation.places if result.is_campaign
+              else result.observation.positions)
     if (along := _line_of_all(result)) is not None:
         return along
-    if np.ptp(z) > 0:
-        return 1e3 * z, "z in mm"
+    if np.ptp(places[:, 2]) > 0:
+        return 1e3 * places[:, 2], "z in mm"
     if any(result.observation.components):
-        return np.degrees(np.arctan2(y, x)) % 360, "angle in degrees"
+        return degrees_of(places), "angle in degrees"
     return np.array([float(label[1:]) for label in result.observation.labels]), "harmonic"
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import Figure
 
-from halbach_fe.core.arrays import Floats, azimuths_of
+from halbach_fe.core.arrays import Floats, azimuths_of, degrees_of
 from halbach_fe.design.shim_tray import FilledTray
 from halbach_fe.report.answer import Answer, of_a_conflict
 from halbach_fe.report.homogeneity import largest_shown, plain_homogeneity, slices_figure
@@ -149,7 +149,7 @@ def _tray_figure(found: FilledTray) -> Figure:
     figure, axis = chart(float(np.clip(1.6 + 0.45 * rows, 3.0, 8.0)), grid=False)
 
     def unrolled(places: Floats) -> tuple[Floats, Floats]:
-        return np.degrees(azimuths_of(places)) % 360, 1e3 * places[:, 2]
+        return degrees_of(places), 1e3 * places[:, 2]
 
     axis.plot(*unrolled(found.places_m), "o", ms=12, mfc="none", mec=PUBLISHED, lw=0.5,
               label="place")

@@ -20,8 +20,8 @@ from halbach_fe.report.multipoles import (
     sections_of_circles,
 )
 from halbach_fe.report.page import (
+    COLOURS_OF_COMPONENTS,
     MEASURED,
-    OF_COMPONENTS,
     Figures,
     Page,
     Rows,
@@ -201,8 +201,9 @@ def field_figure(solution: Solution) -> Figure:
     figure, (top, *others) = charts(5.8, 2, height_ratios=[2, 1], sharex=not fourier) if (
         below) else charts(4.1)
     order = np.argsort(place, kind="stable")
-    for component, colour, column in zip(COMPONENTS[:solution.magnet.dimension], OF_COMPONENTS,
-                                         solution.flux_density.T, strict=False):
+    for component, colour, column in zip(
+            COMPONENTS[:solution.magnet.dimension], COLOURS_OF_COMPONENTS, solution.flux_density.T,
+            strict=False):
         top.plot(place[order], 1e3 * column[order], ".-", ms=4, lw=0.8, color=colour,
                  label=f"B{component}")
     top.set_ylabel("B in mT")
