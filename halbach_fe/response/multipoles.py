@@ -34,7 +34,7 @@ from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.coils import crosses_disc, distance_in_magnet, points_in_winding
+from halbach_fe.geometry.coils import crosses_disc, distance_from_axis, distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
@@ -754,17 +754,17 @@ def _integrals_of_coils(
     if external == External():
         return np.zeros(highest, complex), 0.0
     closest = np.inf
-    for name, each in (*((f"coils[{number}]", points_in_winding(coil))
-                         for number, coil in enumerate(external.coils, start=1)),
-                       *((f"dipoles[{number}]", np.array([one.position_m]))
-                         for number, one in enumerate(external.dipoles, start=1))):
-        if (nearest := radii_of(each).min()) < radius:
+    for name, nearest in (*((f"coils[{number}]", distance_from_axis(coil, radius / 1000))
+                            for number, coil in enumerate(external.coils, start=1)),
+                          *((f"dipoles[{number}]", float(np.hypot(*one.position_m[:2])))
+                            for number, one in enumerate(external.dipoles, start=1))):
+        if nearest < radius:
             raise StudyError(must_be(
                 f"`external.{name}`", f"study {magnet.name}", "outside the circle, at whatever z, "
                 f"for multipoles that are integrated along z: farther than {radius:g} m from the "
-                "axis", f"{nearest:.4g} m", "Ask on a circle at one place: --at-z-m Z, in Python "
-                "MultipoleReference(z_m=Z)."))
-        closest = min(closest, max(float(nearest), 1.002 * radius))
+                "axis", f"{max(nearest, 0.0):.4g} m", "Ask on a circle at one place: --at-z-m Z, "
+                "in Python MultipoleReference(z_m=Z)."))
+        closest = min(closest, max(nearest, 1.002 * radius))
     alone = magnet.with_(external=external)
     angles = _angles(highest, radius / closest)
     angle = 2 * np.pi * np.arange(angles) / angles

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from halbach_fe import api
+from halbach_fe.core.arrays import radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.geometry.coils import distance_from_axis, points_in_winding
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.measurement.observation import observe
@@ -29,6 +31,7 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.magnet import External
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
@@ -225,9 +228,25 @@ def test_the_integral_of_external_fields(session):
     assert abs(at_z.matrix[0, -1]) == pytest.approx(1e-3, rel=1e-9)
 
 
+ACROSS = {"kind": "polygon", "current_A": 5.0, "points_m": [
+    [-1.5, 0.003, 1.5], [1.5, 0.003, 1.5], [1.5, 2.06, 1.5], [-1.5, 2.06, 1.5]]}
+
+
+def test_how_far_windings_are_from_the_axis():
+    """Of 200 points of a long loop none was in a circle that its wire crosses, the control."""
+    wire, sheet, thick = External(coils=[ACROSS, {
+        "kind": "round", "radius_m": 0.1, "section_m": [0.0, 0.02], "current_A": 5.0}, {
+        "kind": "round", "radius_m": 0.1, "section_m": [0.01, 0.02], "current_A": 5.0,
+        "centre_m": [0.1, 0.0, 0.0]}]).coils
+    found = [distance_from_axis(coil, 1e-5) for coil in (wire, sheet, thick)]
+    assert found == pytest.approx([0.003, 0.1, -0.005], abs=1e-5)
+    assert radii_of(points_in_winding(wire)).min() > 0.02
+
+
 @pytest.mark.parametrize(("external", "named"), [
     ({"coils": [{"kind": "round", "radius_m": 0.1, "section_m": [0, 0], "current_A": 5.0,
                  "centre_m": [0.01, 0, 0.4], "rotation_deg": [0, 90, 0]}]}, r"coils\[1\]"),
+    ({"coils": [ACROSS]}, r"coils\[1\]"),
     ({"dipoles": [{"position_m": [0.0, 0.01, 1.0], "moment_A_m2": [0, 3, 0]}]}, r"dipoles\[1\]")])
 def test_an_integral_that_has_sources_within_its_circle(session, external, named):
     """It is no multipole series: a wire across the axis made multipoles of all orders. On a circle
