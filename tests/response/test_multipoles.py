@@ -298,6 +298,33 @@ def test_a_wire_just_beyond_the_circle(session):
     assert np.abs(found / on_circle(45) - 1).max() > 0.01
 
 
+def test_a_wire_just_beyond_the_circles_of_a_study(session):
+    """What 32 angles mistake of it was in c_10 of a solved field and of an update: a quarter of it.
+    Truth and control: by many angles, and by these alone.
+    """
+    radius, order = 0.02, np.arange(1, 11)
+    study = parse_study(changed(
+        DIPOLE, array__recoil_permeability=1.0, dimension=3, array__ring_length_m=0.1,
+        external=loop_beside_the_axis(0.0225), observation__positions={
+            "kind": "circles", "radius_m": radius, "angles": 32}))
+    points, ring = points_from(study.observation.positions), build_magnet(study)
+    (solved, _), = solved_circles(ring, points, ring.field_T(points), np.zeros(3 * len(points)))
+    observation = observe(study, points, np.ones_like(points, bool))
+    updated, = circle_models(ring, observation, response_matrix(ring, observation, session))
+
+    def by(angles):
+        angle = 2 * np.pi * np.arange(angles) / angles
+        places = radius * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+        radial = np.einsum("nc,nc->n", ring.field_T(places), places) / radius
+        return 2j * np.exp(-1j * np.outer(order, angle)) @ radial / angles
+
+    for model in (solved, updated):
+        found = (model.offset + model.matrix @ model.nominal)[1:] * np.exp(
+            -1j * model.turn * order)
+        np.testing.assert_allclose(found[4:], by(2000)[4:], rtol=1e-5)
+    assert np.abs(by(32) / by(2000) - 1)[-1] > 0.2
+
+
 @pytest.mark.parametrize(("external", "named"), [
     (loop_beside_the_axis(0.0199), r"coils\[1\]"),
     ({"coils": [{"kind": "racetrack", "size_m": [0.012, 0.008], "section_m": [0, 0.004],
@@ -477,7 +504,7 @@ def test_few_angles_do_not_mistake_high_orders_for_low_ones(
     errors = {}
     for name in ("without", "with"):
         if name == "with":
-            monkeypatch.setattr(multipoles, "_aliases", lambda *arguments: 0.0)
+            monkeypatch.setattr(multipoles, "_aliases", lambda *arguments: (0.0, 0.0))
         models = circles_of(study, session)
         main = None
         for model in sorted(models, key=lambda one: abs(one.z)):
