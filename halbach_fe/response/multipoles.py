@@ -452,7 +452,8 @@ def circle_models(
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
-        by_z, offsets = {}, {}
+        by_z: dict[float, Complexes] = {}
+        offsets: dict[float, Complexes] = {}
         for z, analysis in own:
             mistaken, of_others = _aliases(
                 deviations, observation, radius, z, analysis.shape[0] // 2, whole)
