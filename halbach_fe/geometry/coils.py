@@ -79,6 +79,23 @@ def in_winding(coil: AnyCoil, points: Floats) -> Ints:
     return np.flatnonzero(distance_in_magnet(coil, points) < -closest(coil))
 
 
+def distance_from_axis(coil: AnyCoil, accuracy: float) -> float:
+    """Return the distance in m of a winding from the z axis, too large by at most the accuracy.
+
+    It is negative if the axis runs through the winding. Of the axis all parts are halved that may
+    be nearer to the winding than what was found.
+    """
+    middle = np.array(coil.centre_m)
+    half = 2 * float(np.linalg.norm(points_in_winding(coil) - middle, axis=1).max())
+    nearest, heights = np.inf, middle[2:]
+    while len(heights):
+        apart = distance_in_magnet(coil, heights[:, None] * [0.0, 0.0, 1.0])
+        nearest = min(nearest, float(apart.min()))
+        half /= 2
+        heights = (heights[apart - 2 * half < nearest - accuracy, None] + [-half, half]).ravel()
+    return nearest
+
+
 def crosses_disc(coil: AnyCoil, radius: float, z: float) -> bool:
     """Return whether a winding comes within 1/200 of its radius to a flat disc about the z axis.
 

@@ -124,13 +124,13 @@ def field_map(
     except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(must_be("points_m and B_T", "field_map", "arrays of numbers",
                                        f"what is none: {error}")) from None
-    rows: list[Any] = [index for index in (
-        getattr(points_m, "index", None), getattr(B_T, "index", None))
-        if hasattr(index, "equals")]  # of pandas
-    if len(rows) == 2 and not rows[0].equals(rows[1]) and set(rows[0]) == set(rows[1]):
+    rows: list[list[Any]] = [np.asarray(index).tolist() for index in (
+        getattr(each, "index", None) for each in (points_m, B_T, sigma_T))
+        if hasattr(index, "equals") and np.ndim(index) == 1]  # of pandas, or made of it
+    if any(rows[0] != each and set(rows[0]) == set(each) for each in rows[1:]):
         raise MeasurementError(must_be(
-            "points_m and B_T", "field_map", "rows in the same order, as those of one table are",
-            "tables with the same index in another order",
+            "points_m, B_T and sigma_T", "field_map", "rows in the same order, as those of one "
+            "table are", "tables with the same index in another order",
             "Bring them into one order, or give arrays: points.to_numpy()."))
     if given.ndim == len(components) == 1:
         given = given[:, None]

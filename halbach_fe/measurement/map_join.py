@@ -563,12 +563,15 @@ def _places(maps: Sequence[Checked]) -> list[tuple[Pose, int]]:
         if not known:
             for one, other in pairs:
                 if (one, other) not in turned:
-                    stated = as_stated[one, other]
-                    best = _match_of(maps[one], maps[other], [(np.eye(3), -1)])
-                    if not best.fits:  # of many ways only the likeliest are tried
-                        best = _match_of(maps[one], maps[other], list(_axes()))
-                    better = best.fits and best.odds > stated.odds + CERTAIN
-                    turned[one, other] = best if better or not stated.fits else stated
+                    best = as_stated[one, other]
+                    # of many ways only the likeliest are tried, so the opposite sign alone first
+                    for axes in ([(np.eye(3), -1)], list(_axes())):
+                        if not best.fits or best.off > FAR_OFF:
+                            match = _match_of(maps[one], maps[other], axes)
+                            if not best.fits or (
+                                    match.fits and match.odds > best.odds + CERTAIN):
+                                best = match
+                    turned[one, other] = best
             known = {pair: turned[pair] for pair in pairs}
         first, other = max(known, key=lambda pair: (
             known[pair].fits, not known[pair].is_mirrored, known[pair].odds))

@@ -465,6 +465,11 @@ CLOCK_SETS = 0.01
 more falling times."""
 
 
+def are_in_order(data: xr.Dataset) -> bool:
+    """Tell whether the rows of a map may be judged in the order in which they were read."""
+    return "time_s" in data or not is_sorted(points_of(data))
+
+
 def page(data: xr.Dataset, check: MapCheck) -> Page:
     """Return the page of the check of a map, and the maps that are made of it."""
     points, found, rows = points_of(data), sentences(check), residual_table(check)
@@ -475,8 +480,7 @@ def page(data: xr.Dataset, check: MapCheck) -> Page:
     left_out = ". Crosses are rows that were left out" if check.excluded.any() else ""
     even = ("Noise alone would be about as large everywhere; here it is not alone"
             if check.uneven is not None else "Noise is about as large everywhere")
-    in_order = "time_s" in data or not is_sorted(points)
-    if not in_order:
+    if not (in_order := are_in_order(data)):
         found.append(OF_SORTED_ROWS)
     if doubt := doubt_of_times(data):
         found.append(doubt)

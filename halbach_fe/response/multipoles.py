@@ -34,7 +34,7 @@ from halbach_fe.core.arrays import Floats, azimuths_of, radii_of, unit_circle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.core.numbers import HIGHEST_ORDER, check_number
 from halbach_fe.geometry.blocks import MagnetBlock
-from halbach_fe.geometry.coils import crosses_disc, distance_in_magnet, points_in_winding
+from halbach_fe.geometry.coils import crosses_disc, distance_from_axis, distance_in_magnet
 from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
@@ -437,9 +437,10 @@ def circle_models(
     the map states. Circles within which a coil or a dipole is are left out.
 
     The multipoles are Fourier coefficients of B_r at the study's own angles. With m angles, order n
-    also contains (aliases with) order m - n, which the blocks' field in vacuum tells: it is
-    subtracted. What permeable blocks and iron make of order m - n is neglected, some per cent of
-    it. ``whole`` tells that the only parameter is the strength of the nominal magnet.
+    also contains (aliases with) order m - n, which the field of blocks in vacuum and of external
+    sources tells: it is subtracted. What permeable blocks and iron make of order m - n is
+    neglected, some per cent of it. ``whole`` tells that the only parameter is the strength of the
+    nominal magnet.
     """
     main, models = magnet.array.multipole_order, []
     deviations = Deviations.of(magnet)
@@ -451,11 +452,14 @@ def circle_models(
         orders = tuple(range(1, middle.shape[0] // 2 + 1))[:len(DEFAULT_ORDERS)]
         if main not in orders:
             continue
-        by_z = {z: _complexes(_seen(analysis, model.matrix)) - _aliases(
-            deviations, observation, radius, z, analysis.shape[0] // 2, whole)
-            for z, analysis in own}
-        reference = by_z[min(by_z, key=abs)][main - 1:main]
-        fixed = _complexes(_seen(middle, model.offset))[main - 1:main]
+        by_z: dict[float, Complexes] = {}
+        offsets: dict[float, Complexes] = {}
+        for z, analysis in own:
+            mistaken, of_others = _aliases(
+                deviations, observation, radius, z, analysis.shape[0] // 2, whole)
+            by_z[z] = _complexes(_seen(analysis, model.matrix)) - mistaken
+            offsets[z] = _complexes(_seen(analysis, model.offset)) - of_others
+        reference, fixed = (each[min(by_z, key=abs)][main - 1:main] for each in (by_z, offsets))
         try:
             # between the poles of an undulator 0.5 % of the largest were left of mesh and columns
             least = 0.03 * max(abs(row[main - 1] @ model.nominal) for row in by_z.values())
@@ -466,8 +470,7 @@ def circle_models(
         order = np.array([main, *orders])
         phases = np.exp(-1j * turn * order)
         for z, analysis in own:
-            matrix = by_z[z][:len(orders)]
-            offset = _complexes(_seen(analysis, model.offset))[:len(orders)]
+            matrix, offset = by_z[z][:len(orders)], offsets[z][:len(orders)]
             models.append(MultipoleModel(
                 orders, main, radius, z if magnet.dimension == 3 else None, False,
                 phases[:, None] * np.vstack([reference, matrix]),
@@ -508,11 +511,12 @@ def solved_circles(
 def _aliases(
     deviations: Deviations, observation: Observation, radius: float, z: float, orders: int,
     whole: bool,
-) -> Complexes:
+) -> tuple[Complexes, Complexes]:
     """Return what the angles of a circle mistake for its orders 1 ... K, in vacuum.
 
-    The result is (K, parameters) in T per parameter, or (K, 1) for the whole nominal magnet. It is
-    the difference of the sums over the circle's own angles and over a multiple of them.
+    The first result is (K, parameters) in T per parameter, the second that of external fields (K,)
+    in T; of the ``whole`` nominal magnet it is (K, 1) with external fields, and zero. It is the
+    difference of the sums over the circle's own angles and over a multiple of them.
     """
     magnet, points = deviations.magnet, observation.map_points
     # relative difference of radii up to which points are on one circle, and angle in rad up to
@@ -524,7 +528,8 @@ def _aliases(
     # orders count as aliases until their decay in the bore, (radius / bore radius)^n, is below the
     # first; where circles are near the blocks or outside of the bore, the second is their decay
     alias_left, slowest_decay = 1e-6, 0.95
-    decay = min(radius / magnet.bore_radius, slowest_decay)
+    nearest = min(magnet.bore_radius, radius + _nearest_source(magnet, radius, z))
+    decay = min(radius / nearest, slowest_decay)
     needed = orders + int(np.ceil(np.log(alias_left) / np.log(decay)))
     times = max(1, int(np.ceil(needed / own)))
     angle = np.arctan2(here[0, 1], here[0, 0]) + 2 * np.pi * np.arange(times * own) / (times * own)
@@ -532,13 +537,15 @@ def _aliases(
     places = radius * direction
     places[:, 2] = z
     columns = deviations.columns(places).reshape(len(places), 3, -1)
+    others = external_field(magnet, places)[..., None]
     if whole:
         nominal = np.zeros(columns.shape[2])
         nominal[:len(magnet.nominal_magnetization)] = magnet.nominal_magnetization
-        columns = (columns @ nominal)[..., None]
-    radial = np.einsum("ni,nip->np", direction, columns)
+        columns, others = (columns @ nominal)[..., None] + others, 0 * others
+    radial = np.einsum("ni,nip->np", direction, np.concatenate([columns, others], axis=2))
     wave = np.exp(-1j * np.outer(np.arange(1, orders + 1), angle)) * 2j  # B_n + i A_n
-    return np.asarray(wave[:, ::times] @ radial[::times] / own - wave @ radial / len(angle))
+    found = wave[:, ::times] @ radial[::times] / own - wave @ radial / len(angle)
+    return found[:, :-1], found[:, -1]
 
 
 def _seen(analysis: sparse.csr_array, values: Floats | StoredMatrix) -> Floats:
@@ -754,17 +761,17 @@ def _integrals_of_coils(
     if external == External():
         return np.zeros(highest, complex), 0.0
     closest = np.inf
-    for name, each in (*((f"coils[{number}]", points_in_winding(coil))
-                         for number, coil in enumerate(external.coils, start=1)),
-                       *((f"dipoles[{number}]", np.array([one.position_m]))
-                         for number, one in enumerate(external.dipoles, start=1))):
-        if (nearest := radii_of(each).min()) < radius:
+    for name, nearest in (*((f"coils[{number}]", distance_from_axis(coil, radius / 1000))
+                            for number, coil in enumerate(external.coils, start=1)),
+                          *((f"dipoles[{number}]", float(np.hypot(*one.position_m[:2])))
+                            for number, one in enumerate(external.dipoles, start=1))):
+        if nearest < radius:
             raise StudyError(must_be(
                 f"`external.{name}`", f"study {magnet.name}", "outside the circle, at whatever z, "
                 f"for multipoles that are integrated along z: farther than {radius:g} m from the "
-                "axis", f"{nearest:.4g} m", "Ask on a circle at one place: --at-z-m Z, in Python "
-                "MultipoleReference(z_m=Z)."))
-        closest = min(closest, max(float(nearest), 1.002 * radius))
+                "axis", f"{max(nearest, 0.0):.4g} m", "Ask on a circle at one place: --at-z-m Z, "
+                "in Python MultipoleReference(z_m=Z)."))
+        closest = min(closest, max(nearest, 1.002 * radius))
     alone = magnet.with_(external=external)
     angles = _angles(highest, radius / closest)
     angle = 2 * np.pi * np.arange(angles) / angles

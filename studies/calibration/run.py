@@ -182,7 +182,9 @@ def always(noise: NoiseCovariance) -> Noise:
 
 
 def linear_sampler(response: Response, noise: Noise, prior: Gaussian) -> Sampler:
-    """Return draws of the linear posterior, in closed form, as `halbach-fe infer` finds it."""
+    """Return draws of the linear posterior, in closed form, as `halbach-fe infer` finds it but for
+    the multiple of the solver's error that readings share, which makes its bars longer.
+    """
     matrix, nominal = response.whole, noise(np.zeros(0))
 
     def draw(readings: Floats, generator: np.random.Generator) -> Floats:

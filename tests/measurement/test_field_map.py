@@ -285,6 +285,14 @@ def test_tables_in_another_order_are_refused():
     field = pandas.DataFrame([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], columns=["Bx_T", "By_T", "Bz_T"])
     with pytest.raises(MeasurementError, match=r"same order.*to_numpy"):
         field_map(points.sort_values("z_m"), field)
+    sigma = pandas.Series([1e-3, 2e-3])
+    with pytest.raises(MeasurementError, match=r"sigma_T.*same order"):
+        field_map(points, field, sigma.sort_values(ascending=False))
+    assert field_map(points, field, sigma)["sigma_T"][1, 0] == 2e-3
+    labelled = field.rename_axis("index").rename_axis("component", axis=1).stack().to_xarray()
+    with pytest.raises(MeasurementError, match="same order"):
+        field_map(points, labelled.isel(index=[1, 0]))
+    np.testing.assert_allclose(field_map(points, labelled)["B_T"][:, 0], [1.0, 2.0])
     for places in (points, points.set_index(pandas.Index(["a", "b"])),
                    points.sort_values("z_m").to_numpy()[::-1]):
         np.testing.assert_allclose(field_map(places, field)["B_T"][:, 0], [1.0, 2.0])

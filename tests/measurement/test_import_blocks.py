@@ -193,7 +193,8 @@ def test_how_a_block_lies_is_not_guessed(tmp_path, asked):
     ("rotor", "A7", False), ("turns", "12", False), ("rolled by", "Ann", False),
     ("pitch [mm]", "10", False), ("phi [mm]", "3", False), ("turn", "30", True),
     ("tilt", "3", True), ("angle about z", "30", True), ("rot_z2", "3", True),
-    ("orientation", "up", True), ("Yaw angle", "3", True), ("phiz", "3", True)])
+    ("orientation", "up", True), ("Yaw angle", "3", True), ("phiz", "3", True),
+    ("RotationZDeg", "3", True), ("tiltAngleX", "3", True), ("PhiM", "3", True)])
 def test_words_that_only_begin_like_a_turn(tmp_path, name, cell, turns):
     """A rotor or the turns of a coil stopped the table; what says how a block lies still does."""
     text = (f"x [mm];y [mm];z [mm];dx [mm];dy [mm];dz [mm];Br [T];{name}\n"

@@ -357,6 +357,12 @@ def test_comsol_spreadsheets(tmp_path):
     assert same(found)
     assert not same(imported(tmp_path, text.replace("unit:        mm", "unit:        cm")))
     assert "--length-unit" in said(tmp_path, text.replace("% Length unit:        mm\n", ""))
+    for one, remark in (("% X (cm) Y Z mf.Bx (T) mf.By (T) mf.Bz (T)\n", ""), (
+            "% X Y Z mf.Bx (T) mf.By mf.Bz\n", "'mf.By' and 'mf.Bz' were read in the unit of")):
+        found = imported(tmp_path, COMSOL + one + rows(field=FIELD))
+        assert remark in " ".join(found.remarks)
+        np.testing.assert_allclose(found.data["z_m"], POINTS[:, 2])  # in the unit of the file
+        np.testing.assert_allclose(found.data["B_T"], FIELD, rtol=1e-8)
     commas = (COMSOL.replace(":  ", ",") + SPREADSHEET.replace("% X", "% X,").replace(
         "    m", ",m").replace("   mf.Bx", ",mf.Bx").replace("Y    ", "Y,")
         + rows(",", field=FIELD * [1, 1, 1000]))

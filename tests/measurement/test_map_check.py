@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import magpylib
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from halbach_fe import explanation
 from halbach_fe.cli import main
 from halbach_fe.cli.measured import floor_of
 from halbach_fe.core.errors import HalbachWarning, MeasurementError
+from halbach_fe.core.pace import quiet
 from halbach_fe.measurement import harmonic_field, map_check
 from halbach_fe.measurement.field_map import (
     checked_map,
@@ -30,6 +33,7 @@ from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
 from halbach_fe.measurement.scan_lines import held_out_lines, is_sorted, motion
 from halbach_fe.measurement.suspect_rows import broken_rows, neighbours, rough_rows, stands_out
+from halbach_fe.report.answer import Answer
 from halbach_fe.report.map_check import (
     OPEN_SIGN,
     answer,
@@ -42,6 +46,7 @@ from halbach_fe.report.map_check import (
     weighted_note,
 )
 from halbach_fe.report.map_check import page as page_of_check
+from halbach_fe.solver.session import NOT_KEPT
 from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 from tests.support.short_dipole import FRINGE, sectors, truth
 
@@ -810,6 +815,20 @@ def test_the_stage_moves_in_the_order_of_times(generator):
     assert is_sorted(points[order])
     np.testing.assert_array_equal(motion(points[order], time[order]), motion(points)[order])
     assert (motion(points[order]) != motion(points)[order]).any()  # the control: without times
+
+
+@pytest.mark.parametrize("in_order", [False, True])
+def test_explain_corrects_no_change_during_the_scan_in_sorted_rows(monkeypatch, in_order):
+    """As the page of check does. The control has times."""
+    data, asked = field_map(GRID, GRID), []
+    monkeypatch.setattr(explanation, "check_map", lambda data, say: SimpleNamespace(
+        is_reoriented=False, excluded=np.zeros(len(GRID), bool)))
+    monkeypatch.setattr(explanation, "answer_of_check", lambda check, in_order: (
+        asked.append(in_order), Answer("", "", "", ""))[1])
+    if in_order:
+        data = data.assign(time_s=("point", np.arange(float(len(GRID)))))
+    explanation._InMemory(None, data, NOT_KEPT, None, quiet).check()
+    assert asked == [in_order]
 
 
 def test_times_that_are_not_those_of_the_rows(generator):

@@ -195,6 +195,25 @@ def test_the_sign_is_tried_before_other_axes(generator, monkeypatch):
     np.testing.assert_allclose(pose.turn, turn.as_matrix(), atol=2e-3)
 
 
+@pytest.mark.parametrize(("off", "sign"), [(10.0, 1), (1.0, -1)])
+def test_a_sign_that_fits_roughly_does_not_end_the_search(monkeypatch, off, sign):
+    """As of a quadrupole on a stage that is turned by 90 degrees, which is nearly its opposite. The
+    control fits well.
+    """
+    turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+
+    def matched(one, other, axes):
+        if len(axes) > 1:
+            return map_join._Match(Pose(turn, np.zeros(3)), 1, 1.0, 1e-5, 4000.0)
+        sign = axes[0][1]
+        return map_join._Match(Pose(np.eye(3), np.zeros(3)), sign, off if sign < 0 else 100.0,
+                               1e-4, 3000.0)
+
+    monkeypatch.setattr(map_join, "_match_of", matched)
+    _, (_, found) = map_join._places([None, None])
+    assert found == sign
+
+
 def test_a_reversed_map_of_a_symmetric_magnet(generator):
     """It fitted beside the other map, face to face: two components of three agree there. That it
     is turned half round, or mirrored, is as likely as its sign, which is simpler.

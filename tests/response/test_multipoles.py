@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from halbach_fe import api
+from halbach_fe.core.arrays import radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError
+from halbach_fe.geometry.coils import distance_from_axis, points_in_winding
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
 from halbach_fe.measurement.observation import observe
@@ -29,6 +31,7 @@ from halbach_fe.response.multipoles import (
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.session import NOT_KEPT
 from halbach_fe.stats.gaussian import Gaussian
+from halbach_fe.study.magnet import External
 from halbach_fe.study.reader import parse_study
 from halbach_fe.synthetic.bodies import magnet_of
 from halbach_fe.synthetic.magpylib_field import vacuum_field
@@ -225,9 +228,25 @@ def test_the_integral_of_external_fields(session):
     assert abs(at_z.matrix[0, -1]) == pytest.approx(1e-3, rel=1e-9)
 
 
+ACROSS = {"kind": "polygon", "current_A": 5.0, "points_m": [
+    [-1.5, 0.003, 1.5], [1.5, 0.003, 1.5], [1.5, 2.06, 1.5], [-1.5, 2.06, 1.5]]}
+
+
+def test_how_far_windings_are_from_the_axis():
+    """Of 200 points of a long loop none was in a circle that its wire crosses, the control."""
+    wire, sheet, thick = External(coils=[ACROSS, {
+        "kind": "round", "radius_m": 0.1, "section_m": [0.0, 0.02], "current_A": 5.0}, {
+        "kind": "round", "radius_m": 0.1, "section_m": [0.01, 0.02], "current_A": 5.0,
+        "centre_m": [0.1, 0.0, 0.0]}]).coils
+    found = [distance_from_axis(coil, 1e-5) for coil in (wire, sheet, thick)]
+    assert found == pytest.approx([0.003, 0.1, -0.005], abs=1e-5)
+    assert radii_of(points_in_winding(wire)).min() > 0.02
+
+
 @pytest.mark.parametrize(("external", "named"), [
     ({"coils": [{"kind": "round", "radius_m": 0.1, "section_m": [0, 0], "current_A": 5.0,
                  "centre_m": [0.01, 0, 0.4], "rotation_deg": [0, 90, 0]}]}, r"coils\[1\]"),
+    ({"coils": [ACROSS]}, r"coils\[1\]"),
     ({"dipoles": [{"position_m": [0.0, 0.01, 1.0], "moment_A_m2": [0, 3, 0]}]}, r"dipoles\[1\]")])
 def test_an_integral_that_has_sources_within_its_circle(session, external, named):
     """It is no multipole series: a wire across the axis made multipoles of all orders. On a circle
@@ -277,6 +296,33 @@ def test_a_wire_just_beyond_the_circle(session):
     found = at_z.offset * np.exp(-1j * at_z.turn * order)
     np.testing.assert_allclose(found, on_circle(2000), rtol=1e-6)
     assert np.abs(found / on_circle(45) - 1).max() > 0.01
+
+
+def test_a_wire_just_beyond_the_circles_of_a_study(session):
+    """What 32 angles mistake of it was in c_10 of a solved field and of an update: a quarter of it.
+    Truth and control: by many angles, and by these alone.
+    """
+    radius, order = 0.02, np.arange(1, 11)
+    study = parse_study(changed(
+        DIPOLE, array__recoil_permeability=1.0, dimension=3, array__ring_length_m=0.1,
+        external=loop_beside_the_axis(0.0225), observation__positions={
+            "kind": "circles", "radius_m": radius, "angles": 32}))
+    points, ring = points_from(study.observation.positions), build_magnet(study)
+    (solved, _), = solved_circles(ring, points, ring.field_T(points), np.zeros(3 * len(points)))
+    observation = observe(study, points, np.ones_like(points, bool))
+    updated, = circle_models(ring, observation, response_matrix(ring, observation, session))
+
+    def by(angles):
+        angle = 2 * np.pi * np.arange(angles) / angles
+        places = radius * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+        radial = np.einsum("nc,nc->n", ring.field_T(places), places) / radius
+        return 2j * np.exp(-1j * np.outer(order, angle)) @ radial / angles
+
+    for model in (solved, updated):
+        found = (model.offset + model.matrix @ model.nominal)[1:] * np.exp(
+            -1j * model.turn * order)
+        np.testing.assert_allclose(found[4:], by(2000)[4:], rtol=1e-5)
+    assert np.abs(by(32) / by(2000) - 1)[-1] > 0.2
 
 
 @pytest.mark.parametrize(("external", "named"), [
@@ -458,7 +504,7 @@ def test_few_angles_do_not_mistake_high_orders_for_low_ones(
     errors = {}
     for name in ("without", "with"):
         if name == "with":
-            monkeypatch.setattr(multipoles, "_aliases", lambda *arguments: 0.0)
+            monkeypatch.setattr(multipoles, "_aliases", lambda *arguments: (0.0, 0.0))
         models = circles_of(study, session)
         main = None
         for model in sorted(models, key=lambda one: abs(one.z)):

@@ -73,8 +73,9 @@ WITHOUT_AXIS = ("length", "width")
 DIRECTION = re.compile(r"(?:mag(?:neti[sz]ation)?|easy|j|m)?(?:direction|dir|axis|u|n|e)[xyz]")
 """Names, without spaces and marks, of columns of a direction beside a length of J."""
 TURN = re.compile(
-    r"(?i)\W*(?:rot(?:at(?:ion|ed))?|turn(?:ed)?|angles?|phi|theta|euler|roll|pitch|yaw|tilt(?:ed)?|"
-    r"azimuth(?:al)?|orient(?:ation|ed)?)(?:[xyz]|angles?|deg|vec|about.*)?(?:[\W\d_].*)?")
+    r"(?i)\W*(?:rot(?:at(?:ion(?:al)?|ed))?|turn(?:ed)?|angles?|phi|theta|euler|roll|pitch|yaw|"
+    r"tilt(?:ed)?|azimuth(?:al)?|orient(?:ation|ed)?)(?:[xyz]|angles?|deg|rad|vec)*(?:m(?:ag)?)?"
+    r"(?:about.*|[\W\d_].*)?")
 """Names of columns that say how a block lies; a rotor and the turns of a coil do not."""
 LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
 KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys(

@@ -351,7 +351,8 @@ def _remarks(
             ] if by_axis and not declared.columns else []
     shared = [columns[used[name]].text for name, unit in unit_of.items()
               if name not in names.NOISE and not columns[used[name]].unit and not declared.unit_of(
-                  _kind(name)) and unit != "hhmmss" and not table.length_unit]
+                  _kind(name)) and unit != "hhmmss" and not (
+                      table.length_unit and _kind(name) == "length")]
     if shared:
         said.append(f"{_quoted(shared)} {'was' if len(shared) == 1 else 'were'} read in the unit "
                     "of the column beside.")
@@ -676,7 +677,8 @@ def _units(
     if option and not own and not missing:
         raise _contradiction(table, "header", f"no column of this kind ({kind})",
                              f"--{kind}-unit {option}")
-    shared = _unit_of_all(columns, {used[name] for name in own if name not in names.NOISE})
+    shared = "" if kind == "length" and table.length_unit else _unit_of_all(
+        columns, {used[name] for name in own if name not in names.NOISE})
     for name in own:
         text = columns[used[name]].unit or ("" if name in names.NOISE else shared)
         if units.states_no_unit(text):
