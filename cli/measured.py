@@ -528,16 +528,21 @@ class _Explanation:
         return said
 
     def check(self) -> None:
-        """Check the map by itself, and go on with the map in the right axes if it is not."""
+        """Check the map by itself, and go on with the map in the right axes if it is not, or with
+        what its answer says to use.
+        """
         try:
-            self.run("check", "check", self.map)
+            found = self.run("check", "check", self.map)
         except MeasurementError as error:
             if not self.map.is_file():
                 raise
             common.say(f"The map cannot be checked by itself: {error}")
             return
         oriented = self.arguments.output / "check" / "oriented_map.csv"
-        if oriented.exists():
+        corrected = oriented.with_name("corrected_map.csv")
+        if corrected.name in found.command:
+            self.map = InputFile(corrected)
+        elif oriented.exists():
             self.map = InputFile(oriented)
 
     def infer(self, folder: str) -> bool:

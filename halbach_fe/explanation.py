@@ -28,7 +28,7 @@ from halbach_fe.measurement.total_check import check_total
 from halbach_fe.report import diagnosis_answer, inference_answer, registration
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.map_check import answer as answer_of_check
-from halbach_fe.report.map_check import are_in_order
+from halbach_fe.report.map_check import are_in_order, corrected
 from halbach_fe.solver.session import NOT_KEPT, Session, alone
 
 
@@ -171,8 +171,11 @@ class _InMemory:
         except MeasurementError as error:
             self.say(f"The map cannot be checked by itself: {error}")
             return
-        self._answered("check", answer_of_check(self.checked, are_in_order(self.data)))
-        if self.checked.is_reoriented or self.checked.excluded.any():
+        said = answer_of_check(self.checked, are_in_order(self.data))
+        self._answered("check", said)
+        if "corrected_map" in said.command:
+            self.data = corrected(self.data, self.checked)
+        elif self.checked.is_reoriented or self.checked.excluded.any():
             self.data = oriented(self.data, self.checked)
 
     def infer(self, name: str) -> bool:

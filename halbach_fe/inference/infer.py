@@ -430,7 +430,7 @@ class _Search:
         magnet, last = self.magnet, self.last
         of_blocks = self.of_blocks if self.prior is None else None
         readings, whole = last.readings, last.whole
-        prior, posterior = last.prior, whole
+        prior, posterior, before = last.prior, whole, last.predicted(last.prior)
         if len(whole.mean) > len(last.model.parameters):
             prior, posterior = of_the_first([prior, whole], len(last.model.parameters))
         return InferenceResult(
@@ -438,9 +438,10 @@ class _Search:
             observation=readings.observation, readings=readings.values,
             noise=last.magnitudes.with_bend(readings.noise), parts=readings.parts,
             regions=readings.regions, maps=readings.maps, response=last.model,
-            prior=prior, posterior=posterior, prediction_prior=last.predicted(last.prior),
+            prior=prior, posterior=posterior, prediction_prior=before,
             prediction_posterior=last.predicted(whole),
-            prediction_exact=last.predicted(last.prior, exact=True),
+            prediction_exact=before if self.shared_error is None or not self.shared_error.size
+            else last.predicted(last.prior, exact=True),
             prior_conflict=last.update.prior_conflict,
             parameters_learnt=last.update.parameters_learnt,
             log_evidence=last.update.log_evidence,

@@ -90,6 +90,30 @@ NEAR = replace(BAD, command="halbach-fe diagnose STUDY --measurements MAP -o DIR
 UNKNOWN = replace(BAD, changes_study=False)
 
 
+@pytest.mark.parametrize("used", ["corrected_map.csv", "oriented_map.csv", "MAP"])
+def test_the_map_that_check_says_to_use_is_used(study, tmp_path, monkeypatch, used):
+    """Both are written: what changed during the scan may be in the map in the right axes."""
+    maps = []
+
+    def answered(arguments):
+        maps.append(getattr(arguments, "measurements", None))
+        arguments.output.mkdir(parents=True)
+        answer = replace(GOOD, command=f"halbach-fe infer STUDY --measurements DIR/{used} -o DIR")
+        write_record(arguments.output / "page.html", "", answer, (), (), {}, None)
+        for name in ("corrected_map.csv", "oriented_map.csv") if used != "MAP" else ():
+            (arguments.output / name).write_text("x")
+        return 0
+
+    for verb in ("check", "infer"):
+        monkeypatch.setitem(VERBS, verb, replace(VERBS[verb], run=answered))
+    monkeypatch.setitem(VERBS, "report", replace(VERBS["report"], run=lambda arguments: 0))
+    (tmp_path / "map.csv").write_text("x")
+    assert main(["explain", str(study), str(tmp_path / "map.csv"), "-o",
+                 str(tmp_path / "out")]) == 0
+    updated = maps[1] if isinstance(maps[1], list) else [maps[1]]
+    assert [str(one).endswith("map.csv" if used == "MAP" else used) for one in updated] == [True]
+
+
 @pytest.mark.parametrize(("answers", "steps", "joined"), [
     ({"inferred": GOOD}, "check inferred", "check inferred"),
     ({"inferred": BAD, "registered": REGISTERED, "updated": GOOD},
