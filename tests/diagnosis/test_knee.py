@@ -56,7 +56,7 @@ def test_a_knee_is_named_with_its_parameters(session, generator):
     # the cells of both programs differ, which the error bars of the solver state
     assert abs(MU_0 * coercivity - COERCIVITY_T) < 2.5 * MU_0 * sd[0]
     assert abs(squareness - SQUARENESS) < 2.5 * sd[1]
-    # 0.051 were measured, of which the error that cells share makes a tenth
+    # 0.051 were measured, with the error that cells share
     assert MU_0 * sd[0] < 0.06 * COERCIVITY_T
     assert found.converged
     assert found.after.prior_conflict < found.after.conflict_limit < found.before.prior_conflict
