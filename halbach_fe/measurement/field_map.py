@@ -126,7 +126,7 @@ def field_map(
                                        f"what is none: {error}")) from None
     rows: list[list[Any]] = [np.asarray(index).tolist() for index in (
         getattr(each, "index", None) for each in (points_m, B_T, sigma_T))
-        if hasattr(index, "equals") and np.ndim(index) == 1]  # of pandas, or made of it
+        if index is not None and hasattr(index, "equals") and np.ndim(index) == 1]  # of pandas
     if any(rows[0] != each and set(rows[0]) == set(each) for each in rows[1:]):
         raise MeasurementError(must_be(
             "points_m, B_T and sigma_T", "field_map", "rows in the same order, as those of one "
