@@ -95,9 +95,9 @@ NO_BETTER_ON_A_LINE = 1e-4
 
 SEEN = 0.1
 """Combinations of blocks' deviations are left out whose effect on all readings together is below
-this many noises of a reading. Which ones are left out changes with the pose: with an rms effect of a
-tenth of the noise, 5.7 noises on 3 300 readings, chi-squared jumped by several units from step to
-step, and the fit of the MRI magnet's map did not come to rest."""
+this many noises of a reading. Which ones are left out changes with the pose: with an rms effect of
+a tenth of the noise, 5.7 noises on 3 300 readings, chi-squared jumped by several units from step
+to step, and the fit of the MRI magnet's map did not come to rest."""
 
 LONGEST_SD = 1.0
 """Longest step of an open key, in prior standard deviations."""
