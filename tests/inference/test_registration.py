@@ -16,6 +16,7 @@ from halbach_fe.cli import main
 from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.geometry.magnet import build_magnet
+from halbach_fe.inference import pose_fit
 from halbach_fe.inference.campaign_registration import _of_known_probe
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.pose_fit import PoseFit
@@ -334,12 +335,19 @@ def test_a_large_map_is_fitted_by_a_few_readings_first(magnet, generator, tmp_pa
     field = turn.inv().apply(blocks.getB(turn.apply(points) + middle))
     data = field_map(points, field + NOISE_T * generator.standard_normal(field.shape))
     counts, rest = [], PoseFit._come_to_rest
+    left, largest = [], pose_fit.largest_directions
+
+    def of_largest(columns, least):
+        found = largest(columns, least)
+        left.append(np.linalg.norm(columns - (columns @ found) @ found.T, 2))
+        return found
 
     def counted(self, *arguments):
         counts.append(len(self.points))
         return rest(self, *arguments)
 
     monkeypatch.setattr(PoseFit, "_come_to_rest", counted)
+    monkeypatch.setattr(pose_fit, "largest_directions", of_largest)
     found = register(magnet, data, Session.open(tmp_path), most=1)[0]
     assert counts[0] < len(points) / 2
     assert counts[1] == len(points)
@@ -350,6 +358,9 @@ def test_a_large_map_is_fitted_by_a_few_readings_first(magnet, generator, tmp_pa
     assert found.log_evidence == pytest.approx(whole.log_evidence, abs=1.0)
     assert found.translation_sd_m == pytest.approx(whole.translation_sd_m, rel=0.02)
     assert (np.abs(found.middle_m - middle) < 4 * found.translation_sd_m).all()
+    # combinations of blocks that all readings together show are not left out: a tenth of the noise
+    # of each, which was, are 5 noises of these
+    assert max(left) < 0.2 * NOISE_T
 
 
 def test_readings_that_the_study_excludes_are_not_fitted(magnet, generator, tmp_path):
