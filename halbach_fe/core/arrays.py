@@ -46,7 +46,7 @@ def polygon_area(corners: Floats) -> float:
 
 
 def face_vectors(triangles: Floats) -> Floats:
-    """Return vectors (n, 3) across triangles (n, 3, 3), twice as long as these are large."""
+    """Return normals (n, 3) of triangles (n, 3, 3); their length is twice the area."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 

@@ -187,7 +187,8 @@ class _Update:
     matrix : Rows
         Derivatives (readings, parameters) by all parameters.
     exact : Rows
-        The same without what the solver is wrong by, see `_Search._beside`.
+        The same for a solver without the error that readings share, see `_Search._beside`: its
+        columns are 0.
     prior : Gaussian
     residual : ndarray, shape (readings,), in T
         Readings less what the model reads of the nominal magnet.
@@ -440,8 +441,8 @@ class _Search:
             regions=readings.regions, maps=readings.maps, response=last.model,
             prior=prior, posterior=posterior, prediction_prior=before,
             prediction_posterior=last.predicted(whole),
-            prediction_exact=before if self.shared_error is None or not self.shared_error.size
-            else last.predicted(last.prior, exact=True),
+            prediction_exact=last.predicted(last.prior, exact=True)
+            if last.model.shared_error.any() else before,
             prior_conflict=last.update.prior_conflict,
             parameters_learnt=last.update.parameters_learnt,
             log_evidence=last.update.log_evidence,
@@ -473,7 +474,9 @@ def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) 
 
 
 def _seen(columns: Floats, readings: Readings) -> Floats:
-    """Return the modes (n, k) in T of columns (n, m) in T, but those that no reading shows."""
+    """Return columns (n, k) in T with the covariance of others (n, m) in T, without those that are
+    lost in the noise of all readings together.
+    """
     left, sizes, _ = np.linalg.svd(columns.reshape(len(readings.values), -1), full_matrices=False)
     least_size = 0.1  # in noises, over all readings together
     seen = sizes > least_size * float(np.median(readings.noise.sd))

@@ -12,9 +12,8 @@ from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.threads import compiled
 from halbach_fe.solver.prism_kernel import NOTHING, Six, added, prism_field
 
-Flags = Bools
 Singles = NDArray[np.float32]
-CellArrays = tuple[Floats, Floats, Floats, Floats, Flags]
+CellArrays = tuple[Floats, Floats, Floats, Floats, Bools]
 """Of all cells the centres, axes, vertices and half heights, and whether they are cuboids."""
 
 
@@ -222,7 +221,7 @@ def _part(base: Floats, r0: float, r1: float, s0: float, s1: float, out: Floats)
 
 
 @compiled
-def touching(targets: Ints, sources: Ints, centre: Floats, radius: Floats, ratio: float) -> Flags:
+def touching(targets: Ints, sources: Ints, centre: Floats, radius: Floats, ratio: float) -> Bools:
     """Tell which pairs of cells are nearer than ``ratio`` times the sum of their radii."""
     found = np.empty(len(targets), np.bool_)
     for pair in range(len(targets)):
