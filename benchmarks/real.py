@@ -193,7 +193,8 @@ def _note_second(note: Note, name: str, raw: str, checked: Path, both: Path) -> 
         note(f"{name}.left_out_over_floor_{one['name']}",
              one["rms_T"] / own["floor_rms_T"], "ratio",
              f"{one['readings']} readings of the whole map, predicted by the update with the other "
-             f"one to {1e6 * one['rms_T']:.0f} µT; {one['over_noise']:.2g} times the noise that is "
+             f"one to {1e6 * one['rms_T']:.0f} µT, where its error bars allow "
+             f"{1e6 * one['allowed_T']:.0f} µT; {one['over_noise']:.2g} times the noise that is "
              f"stated, chi² per reading {one['chi2']:.2g}; asked: 2 at most")
     floor = json.loads((checked / "check.json").read_text())["floor_rms_T"]
     rows, readings, mean = _held_out(both, "fringe")

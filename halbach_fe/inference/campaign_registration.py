@@ -54,7 +54,8 @@ def register_maps(
     say : callable, optional
         Called with a description of each step before it starts.
     joined : Joined, optional
-        Where overlaps of the maps have them, without a magnet. A pose that contradicts it says so.
+        Where overlaps of the maps have them, without a magnet. A pose that contradicts it says so,
+        and if all of them do, so does that of the map in whose frame they lie.
 
     Returns
     -------
@@ -90,11 +91,16 @@ def register_maps(
             () if found else open_keys, say, blocks, pose)
         blocks = found[one.name][0].blocks
         probes.setdefault(one.probe, found[one.name][0])
-    for name, by_overlap in known_poses.items():
-        assert joined is not None
-        best, *others = found[name]
-        found[name] = [replace(best, apart=contradictions(
-            best, by_overlap, found[joined[0]][0])), *others]
+    if joined is not None:
+        frame = found[joined[0]][0]
+        apart = {name: contradictions(found[name][0], by_overlap, frame)
+                 for name, by_overlap in known_poses.items()}
+        if all(apart.values()):  # the frame may be the one that lies wrong
+            nearest = min(apart.values(), key=lambda terms: terms[0].distance)
+            apart[joined[0]] = tuple(replace(term, value=-term.value) for term in nearest)
+        for name, terms in apart.items():
+            best, *others = found[name]
+            found[name] = [replace(best, apart=terms), *others]
     return found
 
 

@@ -112,8 +112,11 @@ def left_out(
             len(rows), response.shape[1])], axis=0)
         fitted = linear_gaussian.update(response, residual[index], noise, updated).distribution
         off = off - response[:, own] @ (fitted.mean - updated.mean)[own]
-        found.append(LeftOut(name, len(index), _rms(off), _rms(noise.sd), float(np.mean(white**2)),
-                             _stretches(readings.observation.places[index], off, noise.sd)))
+        allowed = np.hypot(np.linalg.norm(np.where(own, 0.0, response) @ updated.root, axis=1),
+                           noise.sd)
+        found.append(LeftOut(name, len(index), _rms(off), _rms(noise.sd), _rms(allowed),
+                             float(np.mean(white**2)), _stretches(
+                                 readings.observation.places[index], off, noise.sd)))
     return tuple(found)
 
 

@@ -44,6 +44,7 @@ from halbach_fe.measurement.doubted_terms import (
     doubts,
     factor_of,
     likeness_of,
+    trade_offs,
     words_of,
 )
 from halbach_fe.measurement.field_map import is_total_field, points_of
@@ -63,6 +64,7 @@ from halbach_fe.measurement.instrument_terms import (
     by_terms,
     field_at_sensors,
     seen,
+    sensors_apart,
     with_terms,
 )
 from halbach_fe.measurement.observation import (
@@ -327,9 +329,11 @@ class PoseFit:
                 pose, values = near.pose, near.values
         (pose, values, state, columns), at_rest = self._come_to_rest(start, pose, values, pace)
         scaled = self.scaled(pose, values, start)
-        sd = state.step(rows, scaled)[1]
         updated, log_evidence, mean, covariance = state.updated(rows, scaled)
-        blocks = self._blocks(columns.directions, mean, covariance)
+        count = len(mean)
+        blocks = self._blocks(columns.directions, mean, covariance[:count, :count])
+        of_terms = covariance[count:, count:] * np.outer(state.prior_sd, state.prior_sd)
+        sd = np.sqrt(np.diag(of_terms))
         return Registration(
             self._study_to_update(pose, values, sd[:6]), self.instrument(pose, values),
             pose[:3], sd[:3], sd[3:6], self.pose_sd,
@@ -339,7 +343,9 @@ class PoseFit:
             _mean_square(updated / state.sigma, self.held_out),
             _rms(updated, self.training), _rms(state.residual, self.training),
             _rms(updated, self.held_out), _rms(state.residual, self.held_out),
-            log_evidence, at_rest, _probe_sd(self._of_probe(sd[6:6 + PROBE])), blocks,
+            log_evidence, at_rest, _probe_sd(self._of_probe(sd[6:6 + PROBE])),
+            sensors_apart(of_terms), trade_offs(
+                [name for name, _ in self._named], of_terms, state.prior_sd), blocks,
             self._doubts(scaled, blocks), *self._factor(pose, values), total=self.total)
 
     @cached_property
@@ -450,16 +456,21 @@ class PoseFit:
 
         ``scaled`` (p,) are its parameters less their prior means, in prior standard deviations.
         """
+        sd = np.concatenate([self.pose_sd, self.prior_sd()])
+        terms = [Term(*name, float(away * one), float(one))
+                 for name, away, one in zip(self._named, scaled, sd, strict=True)]
+        count = 3 * len(self.magnet.blocks)
+        return doubts(terms, count) + block_doubts(
+            self.magnet, blocks.mean, self.prior.mean, self.prior.sd)
+
+    @cached_property
+    def _named(self) -> list[tuple[str, str]]:
+        """Words and unit of all parameters, see `halbach_fe.measurement.doubted_terms.Term`."""
         named = [words_of(name) for name in NAMES[STEADY]]
         for each in self.open:
             unit = each.key.rpartition("_")[2]
             named.append((f"`{each.key}`", unit if unit in UNITS else ""))
-        sd = np.concatenate([self.pose_sd, self.prior_sd()])
-        terms = [Term(*name, float(away * one), float(one))
-                 for name, away, one in zip(named, scaled, sd, strict=True)]
-        count = 3 * len(self.magnet.blocks)
-        return doubts(terms, count) + block_doubts(
-            self.magnet, blocks.mean, self.prior.mean, self.prior.sd)
+        return named
 
     def _factor(self, pose: Floats, values: Floats) -> tuple[float, float]:
         """Return how many times the readings are what a probe without errors reads of the magnet,
@@ -758,7 +769,9 @@ class _State:
     def updated(
         self, rows: NDArray[np.bool_], scaled: Floats
     ) -> tuple[Floats, float, Floats, Floats]:
-        """Return residual (n, 3) in T and log evidence, and mean and covariance of the blocks."""
+        """Return residual (n, 3) in T, log evidence, mean (k,) of the blocks, and the covariance
+        (k + p, k + p) of blocks and parameters, in prior standard deviations.
+        """
         residual, derivative, blocks = self._whitened(rows)
         design = np.hstack([blocks, derivative * self.prior_sd])
         inner = design.T @ design
@@ -773,7 +786,7 @@ class _State:
         chi2 = float(left @ left + np.sum((solution + start)**2))
         return updated, -chi2 / 2 - float(np.log(np.diag(factor[0])).sum()) - float(
             np.log(self.sigma.ravel()[rows]).sum()), solution[:count], cho_solve(
-                factor, np.eye(len(inner)))[:count, :count]
+                factor, np.eye(len(inner)))
 
 
 def _make_room(known: dict[bytes, Any], most: int) -> None:

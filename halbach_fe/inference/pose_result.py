@@ -252,6 +252,12 @@ class Registration:
         Whether the fit came to rest.
     probe : ProbePrior
         Standard deviations of the probe, rms over its terms of each kind.
+    covariance : ndarray, shape (p, p)
+        Of shifts in m and turns in rad, the probe's terms, of which places of sensors are from the
+        mean of all, and the open keys.
+    trade_offs : tuple of tuple of str
+        Terms that the map hardly tells one by one, in words, see
+        `halbach_fe.measurement.doubted_terms.trade_offs`.
     blocks : Gaussian
         Magnetizations in A/m, and amplitudes of variations, as this map updates them in this pose.
         They serve to register another map of the same magnet: what permeable blocks answer to a
@@ -290,6 +296,8 @@ class Registration:
     log_evidence: float
     at_rest: bool
     probe: ProbePrior
+    covariance: Floats
+    trade_offs: tuple[tuple[str, ...], ...]
     blocks: Gaussian = dataclasses.field(repr=False)
     doubts: tuple[Term, ...] = ()
     factor: float = 1.0

@@ -295,6 +295,8 @@ class LeftOut:
         Rms difference from the prediction, with the pose and the probe that only this map has.
     noise_T : float
         Rms of noise and solver error of these readings.
+    allowed_T : float
+        Rms of noise and error bars of the prediction, without that pose and that probe.
     chi2 : float
         Chi-squared per reading, by the covariance of prediction, noise and instruments.
     stretches : tuple of Stretch
@@ -305,6 +307,7 @@ class LeftOut:
     readings: int
     rms_T: float
     noise_T: float
+    allowed_T: float
     chi2: float
     stretches: tuple[Stretch, ...] = ()
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.special as special
+from scipy.sparse.csgraph import connected_components
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.numbers import decimals, in_a_row
@@ -33,6 +34,14 @@ FACTORS = {
     10.0: "as if numbers in G were taken for mT", 1e3: "as if numbers in mT were taken for T",
     1e4: "as if numbers in G were taken for T"}
 """Ratios of readings to fields that errors of a file make."""
+
+WELL_TOLD, HARDLY_TOLD = 0.05, 0.5
+"""Bars, in units of the prior's, below which a term is known well with whatever else it trades off,
+and above which the readings say little of it."""
+
+NOT_APART = 0.9
+"""Correlation of the errors of two terms from which they are called hardly told apart: the bar of
+each is 2.3 times as long as it would be if the other were known."""
 
 ALL_BLOCKS = "strength of all blocks together"
 """Name of the median deviation of all blocks, and of the mean one."""
@@ -125,6 +134,37 @@ def doubts_in_words(found: Sequence[Term]) -> str:
     named = "; ".join(one.in_words for one in found[:MOST_NAMED])
     return ("To agree with the readings, these would have to be changed far beyond what was known "
             f"before: {named}{f'; and {more} more' if more > 0 else ''}.")
+
+
+def trade_offs(
+    names: Sequence[str], covariance: Floats, prior_sd: Floats
+) -> tuple[tuple[str, ...], ...]:
+    """Return the names of terms that readings hardly tell one by one, only together.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of n terms.
+    covariance : ndarray, shape (n, n)
+        After the fit.
+    prior_sd : ndarray, shape (n,)
+        Before it. Of what it leaves nearly as open, or knows well whatever the others are, there is
+        nothing to say.
+    """
+    sd = np.sqrt(np.diag(covariance))
+    told = np.flatnonzero((sd > WELL_TOLD * prior_sd) & (sd < HARDLY_TOLD * prior_sd))
+    correlation = covariance[np.ix_(told, told)] / np.outer(sd[told], sd[told])
+    count, group = connected_components(np.abs(correlation) > NOT_APART)
+    return tuple(tuple(names[one] for one in told[group == number])
+                 for number in range(count) if np.sum(group == number) > 1)
+
+
+def trade_offs_in_words(found: Sequence[tuple[str, ...]]) -> str:
+    """Say which terms readings hardly tell one by one; nothing if there are none."""
+    return "" if not found else (
+        f"The map hardly tells apart {'; or '.join(in_a_row(names) for names in found)}: it knows "
+        "them better together than one by one, and if one is off, so is the other. Take none of "
+        "these numbers for a finding by itself.")
 
 
 def shared_in_words(found: Sequence[Term], cross_section: bool) -> str:

@@ -86,6 +86,15 @@ def with_terms(instrument: Instrument, middle: Floats, changes: Floats) -> Instr
         sensor_position_m=tuple(map(tuple, sensors.tolist())))
 
 
+def sensors_apart(covariance: Floats) -> Floats:
+    """Return a covariance (p, p), whose first terms are those of `STEADY`, with the places of
+    sensors from the mean of all.
+    """
+    matrix = np.eye(len(covariance))
+    matrix[SENSORS, SENSORS] = np.kron(APART, np.eye(3))
+    return np.asarray(matrix @ covariance @ matrix.T)
+
+
 def field_at_sensors(
     field: Callable[[Floats], Floats], sensors: Floats
 ) -> tuple[Floats, Floats]:

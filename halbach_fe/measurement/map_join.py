@@ -176,7 +176,7 @@ class Layer:
     place_m : float
         What the map says, along this axis.
     points : int
-        Rows of the map there, all of which were left out.
+        Rows there, all of which were left out; of a map that is joined in part, of that part.
     off_m, off_sd_m : float
         Where they were along this axis, by the readings of all maps, less where they should be,
         with the standard deviation that noise makes. The field that was fitted follows such rows:

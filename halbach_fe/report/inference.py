@@ -143,6 +143,7 @@ def left_out_table(result: InferenceResult) -> Rows:
     return [{
         "left out": each.name or "ends of the map", "readings": str(each.readings),
         "rms difference": f"{decimals(1e3 * each.rms_T)} mT",
+        "error bars and noise allow": f"{decimals(1e3 * each.allowed_T)} mT",
         "over noise": decimals(each.over_noise),
         "chi²/reading": decimals(each.chi2)} for each in result.regions_left_out]
 

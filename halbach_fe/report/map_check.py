@@ -632,9 +632,11 @@ def joined_sentences(joined: JoinedMaps) -> list[str]:
               for one in joined.overlaps if not one.agrees]
     found += [f"Where {one.name} says {one.axis} = {decimals(round(1e3 * one.place_m, 2))}\u00a0"
               f"mm, the stage was some {decimals(1e3 * one.off_m, 2)}\u00a0mm from there along "
-              f"{one.axis}, by all other readings. These {one.points} rows were left out of the "
-              "join: leave them out of the map for register and infer, too. A stage that comes "
-              "from the other side does that (backlash)." for one in joined.displaced]
+              f"{one.axis}, by all other readings. {one.points} rows of that place were left out "
+              "of the join. Leave all that the map has there out for register and infer, too, by "
+              "their numbers: excluded_readings of [inference], or of [maps.inference] if the "
+              "study lists maps. A stage that comes from the other side does that (backlash)."
+              for one in joined.displaced]
     return found
 
 

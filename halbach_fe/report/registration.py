@@ -30,6 +30,7 @@ from halbach_fe.measurement.doubted_terms import (
     doubts_in_words,
     factor_in_words,
     known_factor,
+    trade_offs_in_words,
 )
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
@@ -45,7 +46,7 @@ from halbach_fe.measurement.instrument import (
     row_order_note,
     turn_of,
 )
-from halbach_fe.measurement.instrument_terms import CROSSTALK
+from halbach_fe.measurement.instrument_terms import CROSSTALK, PROBE
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -145,7 +146,7 @@ def answer(
         said = f"That is not found yet. The best answer so far: {within_a_sentence(said)}"
     if best.explains:
         said = _component(found) + said
-        trust.insert(0, _verdict(found, name))
+        trust.insert(0, _verdict(found))
     else:
         said = (f"This magnet does not explain the map. The least bad answer{least_bad}: "
                 f"{within_a_sentence(said)}")
@@ -155,6 +156,8 @@ def answer(
             "than the study says, or the study lacks something. As no pose explains the map, none "
             "has odds."))
     trust[1:1] = _doubts(best)
+    if best.explains and best.at_rest and best.apart:
+        trust.insert(1, _apart(best, name))
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *_next_step(best, name, stated), sound=is_sound(best),
@@ -176,7 +179,7 @@ def _apart(best: Registration, name: str) -> str:
         unit, _ = UNITS[one.unit]
         said.append(f"{with_unit(one.value, one.prior_sd, unit)} {where} "
                     f"{axis} of the stage ({decimals(one.distance, 2)} standard deviations)")
-    return (f"No. The magnet's model wants map {name} {in_a_row(said)} from where its overlap with "
+    return (f"The magnet's model wants map {name} {in_a_row(said)} from where its overlap with "
             f"the other maps has it. {MOVES_A_SECTION}")
 
 
@@ -218,7 +221,7 @@ def _are_alike(best: Registration) -> bool:
     return abs(best.likeness) >= UNLIKE
 
 
-def _verdict(found: Sequence[Registration], name: str) -> str:
+def _verdict(found: Sequence[Registration]) -> str:
     """Say in a sentence whether the first pose, which explains the map, may be used."""
     best = found[0]
     if not best.at_rest:
@@ -226,7 +229,7 @@ def _verdict(found: Sequence[Registration], name: str) -> str:
     if best.doubts:
         return DOUBTED
     if best.apart:
-        return _apart(best, name)
+        return "No."
     decided = all(is_symmetric_to(best, each) for each in rivals(found))
     return AT_REST if decided else UNDECIDED
 
@@ -457,11 +460,12 @@ def sentences(found: Sequence[Registration]) -> list[str]:
             "known before (the prior, or another map on the same stage) holds "
             f"{'it' if len(best.undetermined) == 1 else 'them'}, with the standard deviations of "
             "the table.")
+    said.append(trade_offs_in_words(best.trade_offs) if best.explains else "")
     if len(by_hypothesis(found)) > 1 and best.explains:
         said.append("Odds of what is open: " + "; ".join(
             f"{name} {100 * value:.3g} %" for name, value in by_hypothesis(found).items()) + ".")
-    said += filter(None, [row_order_note(best.study)])
-    return said + [f"{key} is {value:.5g} ± {sd:.1g}."
+    said.append(row_order_note(best.study) or "")
+    return [*filter(None, said)] + [f"{key} is {value:.5g} ± {sd:.1g}."
                    for key, (value, sd) in best.open_keys.items()]
 
 
@@ -512,26 +516,27 @@ def place_table(found: Sequence[Registration]) -> Rows:
 
 def probe_table(best: Registration) -> Rows:
     """Return rows of text: what the fit says about the sensors of the map, with their sd."""
-    instrument, sd = best.instrument, best.probe
+    instrument, sd = best.instrument, np.sqrt(np.diag(best.covariance))[PROBE]
 
     def row(what: str, value: float, bar: float, unit: str) -> dict[str, str]:
         return {"of the probe": what, "value": with_unit(value, bar, unit)}
 
     def sensor(name: str, number: int) -> Rows:
-        return [row(f"gain of {name}", instrument.gain[number], sd.gain, "%"),
-                row(f"offset of {name}", instrument.offset_T[number], sd.offset_T, "mT")]
+        return [row(f"gain of {name}", instrument.gain[number], sd[6 + number], "%"),
+                row(f"offset of {name}", instrument.offset_T[number], sd[9 + number], "mT")]
 
     if best.total:
         return sensor("|B|", 0)
     there = _measured(best)
-    rows = [row(f"B{name[0]} sees B{name[1]}", value, sd.crosstalk, "mrad")
-            for name, value in instrument.crosstalk.items() if name[0] in there]
+    rows = [row(f"B{name[0]} sees B{name[1]}", value, bar, "mrad")
+            for (name, value), bar in zip(instrument.crosstalk.items(), sd[:6], strict=True)
+            if name[0] in there]
     for number, name in enumerate(COMPONENTS):
         if name in there:
             rows += sensor(f"B{name}", number) + [
-                row(f"place of the B{name} sensor, {axis}", value, sd.sensor_m, "mm")
-                for axis, value in zip(COMPONENTS, instrument.sensor_position_m[number],
-                                       strict=True)]
+                row(f"place of the B{name} sensor, {axis}", value, bar, "mm")
+                for axis, value, bar in zip(COMPONENTS, instrument.sensor_position_m[number],
+                                            sd[12:].reshape(3, 3)[number], strict=True)]
     return rows
 
 
@@ -557,6 +562,7 @@ def registration_summary(found: Sequence[Registration]) -> Plain:
         "at_rest": each.at_rest, "explains": each.explains, "sound": is_sound(each),
         "doubts": [one.plain() for one in each.doubts], "factor": each.factor,
         "apart": [one.plain() for one in each.apart],
+        "trade_offs": [list(names) for names in each.trade_offs],
         **({"component": each.component} if each.component else {}),
         "undetermined": list(each.undetermined), "chi2": each.chi2,
         "held_out_chi2": None if np.isnan(each.held_out_chi2) else each.held_out_chi2,
@@ -608,7 +614,7 @@ def page(
                      "is turned about the axes of the magnet, once its own axes were put along "
                      "those above.", Table(
                          places, "turned" if len(places) <= most_turned else "numbers")]),
-            Section(["± is the standard deviation: rms over all terms of a kind. “Bx sees By” is "
+            Section(["± is the standard deviation. “Bx sees By” is "
                      "the angle by which the Bx sensor is turned towards y. A sensor's place is "
                      "from the probe's own point.", Table(probe_table(best))],
                     "The probe, in pose 1")],

@@ -91,6 +91,8 @@ def test_two_maps_find_their_poses_and_agree(generator, tmp_path):
     assert [each.name for each in result.regions_left_out] == ["body", "fringe"]
     for left in result.regions_left_out:
         assert left.readings > 500
+        assert left.noise_T < left.allowed_T
+        assert 0.3 < left.rms_T / left.allowed_T < 2  # of a few blocks that the others hardly see
         assert left.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / left.readings))
         assert not left.disagreement
     assert {score.region for score in result.scores} == {"body", "fringe"}
@@ -247,6 +249,7 @@ def test_the_ends_of_a_single_map_are_left_out(generator, tmp_path, stretch):
     assert left.readings == 25 * 6 * 3  # of 16 places along z, three at each end
     right = stretch == 1.0
     assert (left.chi2 == pytest.approx(1.0, abs=5 * np.sqrt(2 / left.readings))) == right
+    assert (left.rms_T < 2 * left.allowed_T) == right
     assert (not left.disagreement) == right
     assert answer(result).sound == right
     assert (left.in_words in answer(result).trust) == right or left.disagreement in (
@@ -515,9 +518,15 @@ def test_a_campaign_on_one_stage_is_registered(generator, tmp_path, monkeypatch,
         assert ("from where its overlap with the other maps has it" in said) == bool(off_m)
         best, *_ = json.loads((tmp_path / "joined" / "fringe" / "registration.json").read_text())[
             "poses"]
-        assert [one["name"] for one in best["apart"]] == (["along_z"] if off_m else [])
-        assert best["sound"] == (not off_m)
+        # if there is no other overlap, the map in whose frame it lies may be the one that is wrong
+        frame, *_ = json.loads((tmp_path / "joined" / "body" / "registration.json").read_text())[
+            "poses"]
+        for one in (best, frame):
+            assert [term["name"] for term in one["apart"]] == (["along_z"] if off_m else [])
+            assert one["sound"] == (not off_m)
+        assert said.count("The overlap needs no magnet") == 2 * bool(off_m)
     (apart,) = best["apart"]  # the model wants the map before where the overlap has it
+    assert frame["apart"][0]["value"] == -apart["value"]
     assert apart["value"] == pytest.approx(-4e-4, abs=4 * apart["prior_sd"])
     assert apart["prior_sd"] < 1e-4
     for text, sentence in (('{"frame": "body", "poses": [{"name": "x"}]}', "a joined.json that"),

@@ -41,6 +41,8 @@ from halbach_fe.measurement.doubted_terms import (
     factor_in_words,
     known_factor,
     likeness_of,
+    trade_offs,
+    trade_offs_in_words,
     words_of,
 )
 from halbach_fe.measurement.field_map import (
@@ -162,6 +164,27 @@ def test_every_term_has_words():
     assert words_of("sensor_x_z_m") == ("place of the Bx sensor along z", "m")
     assert words_of("drift_y_T") == ("drift of By", "T")
     assert len({words_of(name)[0] for name in NAMES}) == len(NAMES)
+
+
+def test_terms_that_readings_hardly_tell_one_by_one():
+    """Readings of the sum of two terms, and of the third; controls: they tell the two apart, or so
+    well that it does not matter, or hardly anything of their sum.
+    """
+    names, prior_sd = ("a", "b", "c"), np.array([0.1, 0.03, 0.03])
+
+    def told(*rows):
+        design = np.array([row for row, _ in rows]) / np.array([sd for _, sd in rows])[:, None]
+        return trade_offs(names, np.linalg.inv(design.T @ design + np.diag(prior_sd**-2)), prior_sd)
+
+    together, third = ((1, 1, 0), 1e-3), ((0, 0, 1), 1e-3)
+    weakly = ((1, 0, 0), 1e-2)
+    assert told(together, third, weakly) == (("a", "b"),)
+    assert told(together, third, ((1, 0, 0), 1e-3)) == ()
+    assert told(((1, 1, 0), 1e-5), third, ((1, 0, 0), 1e-3)) == ()
+    assert told(((1, 1, 0), 5e-2), third) == ()
+    said = trade_offs_in_words((("a", "b"), ("c", "d", "e")))
+    assert "hardly tells apart a and b; or c, d and e:" in said
+    assert trade_offs_in_words(()) == ""
 
 
 @pytest.mark.parametrize(("factor", "said"), [

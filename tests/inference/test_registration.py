@@ -30,7 +30,9 @@ from halbach_fe.inference.registration import (
     register,
     turn_from_axes,
 )
+from halbach_fe.measurement.doubted_terms import Term
 from halbach_fe.measurement.field_map import field_map, write_map
+from halbach_fe.measurement.instrument_terms import NAMES
 from halbach_fe.report.registration import (
     AT_REST,
     NOT_AT_REST,
@@ -41,6 +43,8 @@ from halbach_fe.report.registration import (
     place_table,
     pose_table,
     probe_table,
+    registration_summary,
+    sentences,
     stated_odds,
 )
 from halbach_fe.solver.session import Session
@@ -165,6 +169,13 @@ def test_a_map_that_lies_as_assumed_changes_no_study(magnet, generator, tmp_path
         assert answer([again]).changes_study
         # a study that states that already is confirmed
         assert not answer([again], assumed=again.instrument).changes_study
+    # what contradicts the overlap with another map is said, with what else is doubted
+    apart = (Term("along_z", "m", 3e-4, 5e-5),)
+    for doubted in ((), (Term("gain of Bx", "", 0.05, 0.003),)):
+        trust = answer([replace(best, apart=apart, doubts=doubted)], name="fringe").trust
+        assert trust.startswith("No.")
+        assert trust.count("wants map fringe 0.300\u00a0±\u00a00.050\u00a0mm along z") == 1
+        assert ("gain of Bx by" in trust) == bool(doubted)
     # a map that lies where the study says but is not explained is for the study to explain
     unexplained = replace(best, chi2=50.0)
     assert "diagnose STUDY" in answer([unexplained]).command
@@ -189,6 +200,34 @@ def test_sensors_that_a_map_does_not_have_are_not_in_its_table(magnet, generator
     alone = replace(best, rms_T=np.array([1e-5, np.nan, np.nan]))
     assert not any(name in row["of the probe"] for row in probe_table(alone)
                    for name in ("of By", "of Bz", "the By", "the Bz", "By sees", "Bz sees"))
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0])
+def test_what_a_map_tells_together_only_is_said_once(magnet, generator, tmp_path, scale):
+    """In the middle the field is nearly uniform along x: of the sensors across it, how they see
+    each other is told by its small rest. Control: the whole bore tells them apart. Bars of either
+    map hold.
+    """
+    points = scale * (GRID - GRID.mean(axis=0))
+    mixing = np.eye(3)
+    mixing[0, 2], mixing[2, 0] = 0.02, -0.01
+    field = truth(generator).getB(points) @ mixing.T
+    data = field_map(points, field + NOISE_T * generator.standard_normal(field.shape))
+    found = register(magnet, data, Session.open(tmp_path))
+    best, pair = found[0], "turn of the Bx sensor towards z and turn of the Bz sensor towards x"
+    said = " ".join(sentences(found))
+    assert said.count(pair) == (scale < 1)
+    summary = registration_summary(found)["poses"][0]
+    assert bool(summary["trade_offs"]) == (scale < 1)
+    sd = np.sqrt(np.diag(best.covariance))
+    for name, right in (("crosstalk_xz", 0.02), ("crosstalk_zx", -0.01)):
+        number = NAMES.index(name)
+        assert best.instrument.crosstalk[name[-2:]] == pytest.approx(right, abs=4 * sd[number])
+    # of the table, too, each bar is its own
+    bars = {row["of the probe"]: float(re.search(r"±\s*([\d.]+)", row["value"])[1])
+            for row in probe_table(best)}
+    assert bars["Bx sees Bz"] == pytest.approx(1e3 * sd[NAMES.index("crosstalk_xz")], rel=0.06)
+    assert bars["Bz sees Bx"] == pytest.approx(1e3 * sd[NAMES.index("crosstalk_zx")], rel=0.06)
 
 
 def test_a_map_in_mm_is_refused_before_the_search(magnet, generator, tmp_path):
