@@ -94,9 +94,12 @@ def answer(check: MapCheck, in_order: bool = True) -> Answer:
     used, named = ("DIR/oriented_map.csv",
                    "oriented_map.csv, which has the right axes and no broken rows") if better else (
         "MAP", "this map")
-    if in_order and any(term.found and _is_change(term) for term in check.terms):
+    if in_order and (changed := [term for term in check.terms if term.found and _is_change(term)]):
+        fitted = all("offset" in term.name for term in changed)
         used, named = "DIR/corrected_map.csv", (
-            "corrected_map.csv, without what changed during the scan: an update does not fit that")
+            "corrected_map.csv, without what changed during the scan: an update " + (
+                "fits that only if drift_T in [instrument_sd] of the study allows it" if fitted
+                else "does not fit that"))
     said = f"{verdict(check)} {_noise(check, keys=True)}"
     if check.is_displaced:
         return Answer(question, said, trust, "Look for rows, axes and units of the positions that "

@@ -303,6 +303,11 @@ def test_what_explains_a_map_as_well_is_told_beside_it(generator):
     (drift,) = [term for term in control.terms if term.found]
     assert drift.name == "change of the gain from start to end"
     assert abs(drift.value - 0.4) < 4 * drift.sd
+    assert "an update does not fit that" in answer(control).step
+    # a drift of the offset can be stated in a study
+    of_offset = replace(control, terms=(replace(
+        drift, name="change of the offset of Bx from start to end"),))
+    assert "only if drift_T in [instrument_sd]" in answer(of_offset).step
 
 
 def test_what_is_found_of_a_change_is_corrected_beside_rivals():
