@@ -169,7 +169,7 @@ def field(magnet: hf.Magnet, arguments: argparse.Namespace) -> object:
             write_text(folder / "kick_map.txt", kick_map(
                 found.lines.length, offsets, (kicks[0][0], kicks[1][0])))
     write_text(folder / "integrals.csv", csv_text(columns))
-    doubt = disagreement_of(read)
+    doubt = disagreement_of(read, magnet)
     if arguments.json:
         common.print_json({"lines": len(lines.points), "points_per_line": lines.count,
                            "reservation": doubt or None, "folder": str(folder),

@@ -463,7 +463,7 @@ def multipoles(
     distributions = known or {"prior": assembled_prior(magnet, models[0].nominal)}
     return MultipoleTables(magnet, [
         (model, {name: model.of(distribution) for name, distribution in distributions.items()})
-        for model in models], disagreement_of(posterior), left_out)
+        for model in models], disagreement_of(posterior, magnet), left_out)
 
 
 @alone
@@ -571,7 +571,7 @@ def homogeneity(
     if MAP in of_map and (remark := of_other_size(of_map[MAP], list(by_name.values())[-1])):
         remarks = (*remarks, remark)
     return HomogeneityResult(
-        magnet, model, by_name, distributions, disagreement_of(posterior),
+        magnet, model, by_name, distributions, disagreement_of(posterior, magnet),
         stray_field(magnet, session, list(distributions.values())[-1]),
         of_map, misfit, remarks)
 

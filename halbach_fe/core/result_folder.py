@@ -161,6 +161,10 @@ class Results:
             raise ValueError(f"it has more than {most_bytes} bytes")
         return content
 
+    def removed(self) -> list[str]:
+        """Return the results that somebody has removed."""
+        return [name for name in self.record.files if not (self.folder / name).exists()]
+
     def changed(self) -> list[str]:
         """Return the results that somebody has changed, or put something else in place of."""
         found = []

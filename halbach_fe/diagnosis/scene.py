@@ -23,7 +23,7 @@ from halbach_fe.inference.instrument_fit import OpenTerms
 from halbach_fe.inference.result import InstrumentTerms
 from halbach_fe.measurement.block_table import BlockTable
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import is_total_field, points_of
+from halbach_fe.measurement.field_map import has_times, is_total_field, points_of
 from halbach_fe.measurement.instrument import (
     check_components,
     check_total_field,
@@ -139,7 +139,7 @@ class Campaign:
                 one.name, one.probe, one.pose, number if listed else None, one.is_validation,
                 points, map_time(one.data), slice(first, first + len(points)),
                 np.isnan(one.data["B_T"].values), is_total_field(one.data),
-                "time_s" in one.data))
+                has_times(one.data)))
             first += len(points)
         return cls(tuple(found), data)
 

@@ -210,6 +210,13 @@ class MagnetBlock:
         return self.area * (self.z_max - self.z_min)
 
     @property
+    def thickness(self) -> float:
+        """Twice the volume by the surface in m: a third of a cube's side, or that of a plate."""
+        height = self.z_max - self.z_min
+        around = sum(edge.length for edge in self.outline)
+        return 2 * self.area * height / (2 * self.area + around * height)
+
+    @property
     def polarization(self) -> Floats:
         """The remanence (3,) in T along the easy axis."""
         return np.array(self.easy_axis) * self.remanence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -118,27 +119,55 @@ def crosses_disc(coil: AnyCoil, radius: float, z: float) -> bool:
 
 def points_in_winding(coil: AnyCoil) -> Floats:
     """Return points (n, 3) in m of the magnet all along a winding: in its middle and its edges."""
-    if coil.kind == "polygon":
-        own = _along(closed_polygon(coil))
-    else:
-        # bodies in a thick winding hold points in it themselves, those that a sheet cuts do not
-        just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 97)
-        own = np.vstack([
-            np.column_stack([_turn(coil, across), np.full(POINTS_OF_TURN, height)])
-            for across in np.unique(just_inside * coil.section_m[0])
-            for height in np.unique(just_inside * coil.section_m[1])])
-    axes = rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist()))
-    return np.asarray(own @ axes.T + coil.centre_m)
+    at = np.linspace(0.0, 1.0, POINTS_OF_TURN)
+    return _from_axes(coil, np.vstack([turn(at) for _, turn in _turns(coil)]))
+
+
+def points_near(coil: AnyCoil, middle: Floats, reach: float, apart: float) -> Floats:
+    """Return points (n, 3) in m of the magnet along the part of a winding that comes near a place.
+
+    They are ``apart`` m from each other along the turns, 1/10000 of the first points' distance at
+    least, and contain all of these within ``reach`` m of ``middle`` (3,) in m.
+    """
+    at = np.linspace(0.0, 1.0, POINTS_OF_TURN)
+    found = [np.empty((0, 3))]
+    for length, turn in _turns(coil):
+        step = length / (POINTS_OF_TURN - 1)
+        off = np.linalg.norm(_from_axes(coil, turn(at)) - middle, axis=1)
+        near = np.flatnonzero(np.minimum(off[:-1], off[1:]) < reach + step / 2)
+        within = np.linspace(0.0, at[1], 1 + int(np.ceil(min(step / apart, 1e4))))
+        found.append(turn((at[near, None] + within).ravel()))
+    return _from_axes(coil, np.vstack(found))
+
+
+def _from_axes(coil: AnyCoil, points: Floats) -> Floats:
+    """Return points (n, 3) in m of the magnet from those in the coil's own axes."""
+    return np.asarray(points @ rotation_matrix(tuple(np.radians(coil.rotation_deg).tolist())).T
+                      + coil.centre_m)
 
 
 POINTS_OF_TURN = 200
-"""Points of a turn that are kept clear of blocks, iron and other coils."""
+"""Points of a turn by which windings are first seen; near bodies they lie closer."""
+
+Turn = Callable[[Floats], Floats]
+"""Takes places (n,) from 0 to 1 along a closed turn, and returns points (n, 3) in m."""
 
 
-def _turn(coil: RoundCoil | Racetrack, across: float) -> Floats:
-    """Return points (200, 2) in m of a turn, ``across`` m off the middle of the section.
+def _turns(coil: AnyCoil) -> list[tuple[float, Turn]]:
+    """Return the lengths in m of turns in the middle of a winding and its edges, and the turns."""
+    if coil.kind == "polygon":
+        return [_polygon(closed_polygon(coil))]
+    # bodies in a thick winding hold points in it themselves, those that a sheet cuts do not
+    just_inside = np.linspace(-0.49, 0.49, 3 if all(coil.section_m) else 97)
+    return [_arcs(coil, across, height)
+            for across in np.unique(just_inside * coil.section_m[0]).tolist()
+            for height in np.unique(just_inside * coil.section_m[1]).tolist()]
 
-    They lie on its arcs, not on chords: those would reach into what touches the winding.
+
+def _arcs(coil: RoundCoil | Racetrack, across: float, height: float) -> tuple[float, Turn]:
+    """Return a turn ``across`` and ``height`` m off the middle of the section, and its length.
+
+    Points lie on its arcs, not on chords: those would reach into what touches the winding.
     """
     if coil.kind == "round":
         middle, radius = np.zeros(2), coil.radius_m + across
@@ -150,13 +179,17 @@ def _turn(coil: RoundCoil | Racetrack, across: float) -> Floats:
     angles = np.pi / 2 * np.array([0, 1, 1, 2, 2, 3, 3, 4, 4])
     place = np.cumsum([0.0, *np.linalg.norm(np.diff(centres, axis=0), axis=1)
                        + radius * np.diff(angles)])
-    at = np.linspace(0.0, place[-1], POINTS_OF_TURN)
-    angle, x, y = (np.interp(at, place, part) for part in (angles, *centres.T))
-    return np.column_stack([x + radius * np.cos(angle), y + radius * np.sin(angle)])
+
+    def turn(at: Floats) -> Floats:
+        angle, x, y = (np.interp(at * place[-1], place, part) for part in (angles, *centres.T))
+        return np.column_stack([x + radius * np.cos(angle), y + radius * np.sin(angle),
+                                np.full(len(at), height)])
+
+    return float(place[-1]), turn
 
 
-def _along(corners: Floats) -> Floats:
-    """Return points (200, 3) at equal distances along a line with the corners (m, 3)."""
+def _polygon(corners: Floats) -> tuple[float, Turn]:
+    """Return a closed line with the corners (m, 3), and its length in m."""
     place = np.cumsum([0.0, *np.linalg.norm(np.diff(corners, axis=0), axis=1)])
-    at = np.linspace(0.0, place[-1], POINTS_OF_TURN)
-    return np.column_stack([np.interp(at, place, part) for part in corners.T])
+    return float(place[-1]), lambda at: np.column_stack([
+        np.interp(at * place[-1], place, part) for part in corners.T])

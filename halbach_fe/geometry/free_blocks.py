@@ -146,10 +146,7 @@ TURN = ("rotation_x_deg", "rotation_y_deg", "rotation_z_deg")
 
 def beside_blocks(magnet: Magnet) -> list[str]:
     """Return in words what a magnet has besides blocks, which no table of blocks contains."""
-    external = magnet.external
-    return [name for name, given in (
-        ("iron", magnet.iron), ("coils", external.coils), ("neighbours", external.neighbours),
-        ("dipoles", external.dipoles), ("the background", any(external.background_T))) if given]
+    return [*(["iron"] if magnet.iron else []), *magnet.external.stated]
 
 
 def blocks_table(magnet: Magnet) -> dict[str, list[Any]]:

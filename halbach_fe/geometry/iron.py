@@ -148,6 +148,12 @@ class IronSolid:
         length = self.z_max - self.z_min
         return area * length, 2 * area + rim * length, 2 * rim + corners * length
 
+    @property
+    def thickness(self) -> float:
+        """Twice the volume by the surface in m: a third of a cube's side, or that of a wall."""
+        volume, surface, _ = self.measures
+        return 2 * volume / surface
+
     def _rounded(self, volume: float) -> float:
         """Return the volume in m^3 with circles, from that with the chords of the triangles."""
         def share(chords: int) -> float:

@@ -21,7 +21,7 @@ from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
-from halbach_fe.geometry.coils import in_winding, points_in_winding
+from halbach_fe.geometry.coils import distance_in_magnet, in_winding, points_in_winding, points_near
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import at_heights, points_on
 from halbach_fe.geometry.overlaps import (
@@ -468,6 +468,13 @@ def _check_neighbours(
         taken += blocks
 
 
+WIDER = 1.1
+"""Size of a sphere around a body, relative to that around points of it: arcs reach beyond them."""
+
+NEAR = 0.1
+"""Distance of the points of a winding that are tested, relative to what they must not cross."""
+
+
 @lru_cache(maxsize=128)
 def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
     """Refuse coils in the winding of another one; they may touch.
@@ -483,8 +490,10 @@ def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
     for number, coil in enumerate(coils):
         apart = np.linalg.norm(middles[:number] - middles[number], axis=1)
         for other in np.flatnonzero(apart < sizes[:number] + sizes[number]).tolist():
-            if len(in_winding(coil, windings[other])) or len(
-                    in_winding(coils[other], windings[number])):
+            if any(len(in_winding(one, points_near(
+                    two, middles[of], sizes[of] * WIDER, NEAR * min(one.section_m))))
+                   for of, one, two in ((number, coil, coils[other]), (other, coils[other], coil))
+                   if one.kind != "polygon" and all(one.section_m)):
                 raise StudyError(must_be(
                     f"`external.coils[{number + 1}]`", "study", "clear of other coils",
                     f"a winding in that of `external.coils[{other + 1}]`",
@@ -509,9 +518,7 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
     if dimension == 2:
         coils = tuple(coil.model_copy(update={"centre_m": (*coil.centre_m[:2], 0.0)})
                       for coil in coils)
-    windings = [points_in_winding(coil) for coil in coils]
-    if dimension == 2:
-        reach = 1e-3 + max(float(np.abs(one[:, 2]).max()) for one in windings)
+        reach = 1e-3 + max(float(np.abs(points_in_winding(coil)[:, 2]).max()) for coil in coils)
         blocks = tuple(replace(block, z_min=-reach, z_max=reach) for block in blocks)
         solids = tuple(replace(solid, z_min=-reach, z_max=reach) for solid in solids)
     if not blocks and not solids:
@@ -521,23 +528,18 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
         for number, solid in enumerate(solids)]
     owner = np.repeat(np.arange(len(bodies)), [len(points) for _, _, points in bodies])
     everywhere = np.vstack([points for _, _, points in bodies])
-    tree, coil_of = KDTree(np.vstack(windings)), np.repeat(
-        np.arange(len(coils)), [len(points) for points in windings])
-    found = [(number, int(owner[inside[0]])) for number, coil in enumerate(coils)
-             if len(inside := in_winding(coil, everywhere))]
-    for number, (_, body, points) in enumerate(bodies) if not found else ():
-        middle = points.mean(axis=0)
-        size = 1.1 * np.linalg.norm(points - middle, axis=1).max()  # arcs reach beyond points
-        near = np.array(tree.query_ball_point(middle, size), int)
-        inside = near[body.contact(np.asarray(tree.data)[near]).inside] if len(near) else near
-        if len(inside):
-            found = [(int(coil_of[inside[0]]), number)]
-            break
-    if found:
-        coil, number = found[0]
-        raise StudyError(must_be(
-            f"`external.coils[{coil + 1}]`", "study", "clear of blocks and iron",
-            f"a winding in {bodies[number][0]}", "Move the coil, or what is in its winding."))
+    middles = np.array([points.mean(axis=0) for _, _, points in bodies])
+    sizes = WIDER * np.array([np.linalg.norm(points - middle, axis=1).max()
+                              for (_, _, points), middle in zip(bodies, middles, strict=True)])
+    for number, coil in enumerate(coils, start=1):
+        inside = owner[in_winding(coil, everywhere)].tolist()
+        near = np.flatnonzero(distance_in_magnet(coil, middles) < sizes).tolist()
+        cut = (one for one in near if bodies[one][1].contact(points_near(
+            coil, middles[one], sizes[one], NEAR * bodies[one][1].thickness)).inside.any())
+        if (body := next(iter(inside), next(cut, None))) is not None:
+            raise StudyError(must_be(
+                f"`external.coils[{number}]`", "study", "clear of blocks and iron",
+                f"a winding in {bodies[body][0]}", "Move the coil, or what is in its winding."))
 
 
 @lru_cache(maxsize=128)  # a diagnosis builds the same magnets hundreds of times

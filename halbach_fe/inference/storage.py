@@ -23,6 +23,7 @@ from halbach_fe.inference.result import PREDICTION_COLUMNS, InferenceResult, Res
 from halbach_fe.measurement.instrument import row_order_note
 from halbach_fe.response.block_variation import distribution_of, magnetized
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
+from halbach_fe.study.inference import InstrumentSd
 from halbach_fe.study.model import Study, differences, magnet_description
 
 
@@ -84,15 +85,39 @@ def distributions_of(
         posterior.items(), key=lambda item: item[0] == "posterior")}
 
 
-def disagreement_of(posterior: Mapping[str, Gaussian] | InferenceResult | None) -> str | None:
+def disagreement_of(
+    posterior: Mapping[str, Gaussian] | InferenceResult | None, magnet: Magnet
+) -> str | None:
     """Return how the update of a posterior disagrees with its map; None if that is not known.
 
     If it agrees, that is its reservation, which is empty if it is sound. A posterior that is read
     from a file knows it as the result of `infer` does.
     """
     if isinstance(posterior, InferenceResult):
-        return posterior.disagreement or posterior.reservation
+        return _with_version(posterior.disagreement or posterior.reservation, magnet,
+                             posterior.study)
     return getattr(posterior, "disagreement", None)
+
+
+def _with_version(disagreement: str, magnet: Magnet, study: Study) -> str:
+    """Return a disagreement with its map, with a word if a study's update is not the magnet's.
+
+    An update that estimated terms of the instrument or of the surroundings is that of the study
+    with what it found, too.
+    """
+    if disagreement and not isinstance(disagreement, Reservation):
+        return disagreement
+    keys = {"noise", "prior", "inference"}
+    if not study.uncertain and all(one in (None, InstrumentSd()) for one in (
+            study.instrument_sd, *(each.instrument_sd for each in study.maps))):
+        keys |= {"instrument", "external", "maps"}
+    now, then = (one.model_dump(mode="json", include=keys) for one in (magnet.study, study))
+    for each in (now, then):  # which blocks may change places is nothing that an update knows
+        each["prior"].pop("types")
+    if (key := next(iter(differences(then, now)), None)) is None:
+        return disagreement
+    return Reservation(f"{disagreement} Only of another version of the study, with another "
+                       f"`{key}`.".lstrip())
 
 
 class StoredPosterior(dict[str, Gaussian]):
@@ -164,6 +189,8 @@ def read_posterior(magnet: Magnet, path: Path) -> StoredPosterior:
             "--posterior", str(path), "a posterior.h5 that halbach-fe infer wrote",
             reason or "a file that cannot be read as such")) from None
     check_same_magnet(magnet, study, own, "--posterior", str(path))
+    if distributions.disagreement is not None:
+        distributions.disagreement = _with_version(distributions.disagreement, magnet, study)
     return distributions
 
 

@@ -319,6 +319,11 @@ def readings_sha256(data: xr.Dataset) -> str:
     return hashlib.sha256(np.ascontiguousarray(values + 0.0).astype("<f8").tobytes()).hexdigest()
 
 
+def has_times(data: xr.Dataset) -> bool:
+    """Tell whether a map says when its readings were taken; the same time of all says nothing."""
+    return "time_s" in data and bool(np.ptp(data["time_s"].values) > 0)
+
+
 def points_of(data: xr.Dataset) -> Floats:
     """Return the positions (n, 3) in m of a map."""
     return np.column_stack([data[name].values for name in POSITION_COLUMNS])

@@ -28,6 +28,7 @@ from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
     TOTAL_COLUMNS,
     check_magnitudes,
+    has_times,
     points_of,
     refuse_undirected,
 )
@@ -244,7 +245,7 @@ def map_time(data: xr.Dataset) -> Floats:
     equal intervals.
     """
     count = data.sizes["point"]
-    time = (data["time_s"].values if "time_s" in data else np.arange(count)).astype(float)
+    time = (data["time_s"].values if has_times(data) else np.arange(count)).astype(float)
     return np.asarray((time - time.min()) / (np.ptp(time) or 1.0))
 
 

@@ -33,6 +33,7 @@ from halbach_fe.measurement.doubted_terms import doubted_from
 from halbach_fe.measurement.field_map import (
     check_magnitudes,
     checked_map,
+    has_times,
     points_of,
     refuse_total_field,
     refuse_undirected,
@@ -581,7 +582,7 @@ def _rms(residual: Floats) -> Floats:
 
 def _order(data: xr.Dataset) -> str:
     """Return what tells when each reading was taken, see `MapCheck.order`."""
-    return "time_s" if "time_s" in data else order_of(data)
+    return "time_s" if has_times(data) else order_of(data)
 
 
 def order_of(data: xr.Dataset) -> str:

@@ -85,7 +85,7 @@ class Chapter:
     record : Record
     pages : tuple of Page
     changed : tuple of str
-        Results that somebody has changed since.
+        Results that somebody has changed or, but for figures, removed since.
     """
 
     folder: Path
@@ -171,11 +171,11 @@ def _chapter(results: Results, label: str) -> Chapter:
         try:
             said = PageRecord.model_validate_json(results.read(name, MOST_RECORD_BYTES))
         except ValidationError:
-            raise refused(f"results with a sound {PAGE_RECORD}", "whose is damaged or of another "
-                          "version of halbach-fe") from None
+            raise refused(f"results with a sound {PAGE_RECORD}", "whose own is damaged or of "
+                          "another version of halbach-fe") from None
         except (OSError, ValueError) as error:
             raise refused(f"results with a sound {PAGE_RECORD}",
-                          f"whose cannot be read ({error})") from None
+                          f"whose own cannot be read ({error})") from None
         if said.study is not None and said.study.name != record.study:
             raise refused(f"results of study {record.study}", f"with a page of {said.study.name}")
         path = PurePath(name).parent / said.page
@@ -188,7 +188,8 @@ def _chapter(results: Results, label: str) -> Chapter:
                                       f"{results.folder}, of `{record.command}`, which writes "
                                       "tables alone", "Leave it out."))
         raise refused("results with a page", f"which has no {PAGE_RECORD}")
-    return Chapter(results.folder, label, record, tuple(pages), tuple(results.changed()))
+    removed = [f"{name} (removed)" for name in results.removed() if not name.endswith(".png")]
+    return Chapter(results.folder, label, record, tuple(pages), (*results.changed(), *removed))
 
 
 def _picture(results: Results, folder: PurePath, said: PageRecord) -> Picture | None:

@@ -362,7 +362,7 @@ def page(found: HomogeneityResult) -> Page:
                 "Spherical harmonics", about=harmonics),
             *sections_of_stray(found.stray_field, drawn=True)],
         {f"The field in {region}": rows, "Spherical harmonics in ppm of the mean field": harmonics,
-         "Outside of the magnet": stray_rows(found.stray_field)},
+         stray_title(found.stray_field): stray_rows(found.stray_field)},
         figures={**figures, **stray_pictures(found.stray_field)}, files=files)
 
 
@@ -386,13 +386,25 @@ def sections_of_stray(
     said = stray.unknown or (
         f"The largest distances at which |B| reaches {decimals(1e3 * stray.limit_T)}\u00a0mT, the "
         "usual limit of access to rooms of MRI magnets. The field is that of the magnet alone, "
-        "without shields or external fields." + ("" if not any(
+        f"without shields or external fields. {_left_out(stray)}".rstrip() + ("" if not any(
             reach.sd_m for reach in (stray.radial, stray.axial) if reach) else
         " Without ± the standard deviation is below 0.5 mm."))
     rows = stray_rows(stray)
     figure = [Drawn(STRAY_FIGURE)] if drawn and rows else []
     return [Section([*warning, said, Table(rows), *figure],
                     f"Outside of the magnet: the {line_name(stray)}")]
+
+
+def _left_out(stray: StrayField) -> str:
+    """Say that the study has other sources; empty if it has none."""
+    return (f"The study has {' and '.join(stray.left_out)} besides, with which it may reach "
+            "farther." if stray.left_out else "")
+
+
+def stray_title(stray: StrayField | None) -> str:
+    """Return the title of the table of `stray_rows`."""
+    return "Outside of the magnet" + (
+        f", without {' and '.join(stray.left_out)}" if stray and stray.left_out else "")
 
 
 def stray_rows(stray: StrayField | None) -> Rows:

@@ -17,7 +17,7 @@ from halbach_fe.core.numbers import EMPTY_CELL
 from halbach_fe.inference.result import HELD_OUT_MAP, TRAINING, InferenceResult
 from halbach_fe.inference.storage import distributions_of, inference_summary, write_inference
 from halbach_fe.measurement.instrument import row_order_note
-from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
+from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows, stray_title
 from halbach_fe.report.inference_answer import along_easy_axes, answer, easy_axes
 from halbach_fe.report.magnet_view_3d import colours_in_words, view_of_inference
 from halbach_fe.report.multipoles import MultipoleTable, multipole_csv, sections_of_circles
@@ -369,7 +369,7 @@ def page(result: InferenceResult) -> Page:
          "Where the maps lie in the magnet": pose_table(result),
          "Maps where they overlap": overlap_table(result),
          "Where nobody measured": left_out_table(result),
-         "Magnetic centre, axis and roll": axis, "Outside of the magnet": stray_rows(stray)},
+         "Magnetic centre, axis and roll": axis, stray_title(stray): stray_rows(stray)},
         figures=figures, shown=tuple([*profiles][:1]), files=files, stored=False, stem="report",
         remarks=[order],
         new_study=None if result.terms is None and result.study_as_found is result.study else (

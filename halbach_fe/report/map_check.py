@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.core.numbers import first_of
-from halbach_fe.measurement.field_map import points_of, readings_sha256, write_map
+from halbach_fe.measurement.field_map import has_times, points_of, readings_sha256, write_map
 from halbach_fe.measurement.map_check import (
     SCATTERED_M,
     VIOLATED,
@@ -94,9 +94,12 @@ def answer(check: MapCheck, in_order: bool = True) -> Answer:
     used, named = ("DIR/oriented_map.csv",
                    "oriented_map.csv, which has the right axes and no broken rows") if better else (
         "MAP", "this map")
-    if in_order and any(term.found and _is_change(term) for term in check.terms):
+    if in_order and (changed := [term for term in check.terms if term.found and _is_change(term)]):
+        fitted = all("offset" in term.name for term in changed)
         used, named = "DIR/corrected_map.csv", (
-            "corrected_map.csv, without what changed during the scan: an update does not fit that")
+            "corrected_map.csv, without what changed during the scan: an update " + (
+                "fits that only if drift_T in [instrument_sd] of the study allows it" if fitted
+                else "does not fit that"))
     said = f"{verdict(check)} {_noise(check, keys=True)}"
     if check.is_displaced:
         return Answer(question, said, trust, "Look for rows, axes and units of the positions that "
@@ -444,7 +447,7 @@ OF_SORTED_ROWS = (
 
 def doubt_of_times(data: xr.Dataset) -> str:
     """Return a sentence if the clock of a map jumped, or its times are rather not of these rows."""
-    if "time_s" not in data:
+    if not has_times(data):
         return ""
     times = np.asarray(data["time_s"].values, float)
     if order_of(data.isel(point=np.argsort(times, kind="stable"))) == "none":
@@ -467,7 +470,7 @@ more falling times."""
 
 def are_in_order(data: xr.Dataset) -> bool:
     """Tell whether the rows of a map may be judged in the order in which they were read."""
-    return "time_s" in data or not is_sorted(points_of(data))
+    return has_times(data) or not is_sorted(points_of(data))
 
 
 def page(data: xr.Dataset, check: MapCheck) -> Page:

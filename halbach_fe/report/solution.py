@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from halbach_fe.core.arrays import Floats
 from halbach_fe.report.answer import Answer
-from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows
+from halbach_fe.report.homogeneity import sections_of_stray, stray_pictures, stray_rows, stray_title
 from halbach_fe.report.magnet_view_3d import field_points, view_of_nominal_magnet
 from halbach_fe.report.multipoles import (
     MultipoleTable,
@@ -151,7 +151,7 @@ def page(solution: Solution) -> Page:
                 " ± is the standard deviation that the solver's error allows."),
             *last_sections(figures, magnet_rows(magnet))],
         {"The field at the study's positions": rows,
-         "Outside of the magnet": stray_rows(solution.stray_field)},
+         stray_title(solution.stray_field): stray_rows(solution.stray_field)},
         figures=figures, shown=("field.png",), files=files, stored=False, stem="report",
         provenance={"GetDP": solution.getdp, "method": study.solver.method,
                     "points, readings": f"{len(solution.points)}, {len(solution.readings)}"})

@@ -100,6 +100,8 @@ class StrayField:
         The planes across x, y and z.
     unknown : str
         Why the field outside is not computed; empty if it is.
+    left_out : tuple of str
+        The study's other sources, which are no part of it, in words.
     """
 
     limit_T: float
@@ -109,10 +111,12 @@ class StrayField:
     axial: Reach | None = None
     planes: tuple[StrayPlane, ...] = ()
     unknown: str = ""
+    left_out: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, object]:
         """Return the distances as plain data for JSON."""
         return {"limit_T": self.limit_T, "unknown": self.unknown or None,
+                "left_out": list(self.left_out),
                 "radial": None if self.radial is None else asdict(self.radial),
                 "axial": None if self.axial is None else asdict(self.axial)}
 
@@ -184,7 +188,8 @@ def stray_field(
             start + distance, _sd(magnet, field, magnetizations, point, outwards), vector(point))
         for start, (distance, point), outwards in (
             (radius, found[0], np.array([1.0, 1.0, 0.0])), (half, found[1], np.array([0, 0, 1.0]))))
-    return StrayField(limit_T, radius, half, radial, axial, planes)
+    return StrayField(limit_T, radius, half, radial, axial, planes,
+                      left_out=tuple(magnet.external.stated))
 
 
 def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) -> Field:

@@ -636,11 +636,13 @@ def conjugate_gradients(
 
 
 def newton(
-    problem: Any, source: Any, start: Any = None
+    problem: Any, source: Any, start: Any = None,
+    advance: Callable[[float], None] = lambda share: None,
 ) -> tuple[Any, tuple[float, ...]]:
     """Solve for the total potential (..., 1) in T m by Newton's method.
 
-    ``problem`` is a `Problem`, or that of `halbach_fe.solver.iron_bodies`.
+    ``problem`` is a `Problem`, or that of `halbach_fe.solver.iron_bodies`. ``advance`` is told how
+    far the residual has fallen, from 0 to 1, by its logarithm.
 
     A step is halved until the energy no longer rises steeply at its end; the energy is convex.
 
@@ -669,6 +671,7 @@ def newton(
         scale, size = (float(problem.dot(vector, tangent.precondition(vector))[0])
                        for vector in (right, residual))
         norms.append(float(np.sqrt(max(size, 0.0) / scale)) if scale > 0 else 0.0)
+        advance(float(np.clip(np.log(max(norms[-1], tolerance)) / np.log(tolerance), 0.0, 1.0)))
         if norms[-1] <= tolerance:
             return total, tuple(norms)
         if len(norms) > most_steps or not np.isfinite(norms[-1]):

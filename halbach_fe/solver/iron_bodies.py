@@ -410,7 +410,10 @@ def solve_bodies(
         Factor to the sizes of elements.
     """
     def advance(share: int) -> None:
-        """Report the percentage of the time that is over: as measured, if sources are few."""
+        """Report the percentage of the time that is over: as measured, if sources are few.
+
+        Without the coarser mesh the problem may be at hand: the time counts from Newton's method.
+        """
         if session.progress is not None:
             session.progress(share, 100)
 
@@ -420,13 +423,14 @@ def solve_bodies(
         _check_memory(magnet, coarseness)
     coarse = solve_bodies(magnet, source, quiet.within("coarse"), False,
                           coarseness=COARSER * coarseness) if estimate else None
-    advance(8)
+    advance(8 * estimate)
     problem = start.problem if start else assemble_bodies(magnet, quiet, coarseness)
-    advance(50)
+    advance(50 * estimate)
     own = problem.source_potential(source(problem.points)[..., None])
-    advance(70)
-    total, residuals = newton(problem, own, start.total if start else None)
-    advance(100)
+    before = 70 * estimate
+    advance(before)
+    total, residuals = newton(problem, own, start.total if start else None,
+                              lambda share: advance(before + int((100 - before) * share)))
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
 
 

@@ -132,6 +132,13 @@ class External(StudyModel):
     dipoles: tuple[PointDipole, ...] = ()
     coils: Annotated[tuple[AnyCoil, ...], Field(max_length=1000)] = ()
 
+    @property
+    def stated(self) -> list[str]:
+        """The kinds of sources that are stated, in words."""
+        return [name for name, given in (
+            ("coils", self.coils), ("neighbours", self.neighbours), ("dipoles", self.dipoles),
+            ("the background", any(self.background_T))) if given]
+
 
 def check_apart(external: External, points: Floats, study: str) -> None:
     """Refuse points (n, 3) in m at a dipole, where its field is infinite.

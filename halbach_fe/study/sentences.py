@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import types
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -79,7 +80,8 @@ WRONG_UNITS = (
     ("coercivity_A_per_m", "kilooersted", KILOOERSTED),
     ("_A_per_m", "kiloamperes per metre", 1e3), ("_m", "millimetres", 1e-3),
     ("_T", "millitesla", 1e-3), ("_T", "gauss", 1e-4),
-    ("_rad", "degrees", math.pi / 180), ("coefficient_per_K", "per cent per kelvin", 1e-2),
+    ("_A_m2", "A mm²", 1e-6), ("_rad", "degrees", math.pi / 180),
+    ("coefficient_per_K", "per cent per kelvin", 1e-2),
     ("coefficient_per_K", "the other sign", -1.0),
     ("coefficient_per_K", "per cent per kelvin and with the other sign", -1e-2),
     *((key, "per cent", 1e-2) for key in ("squareness", "gain", "magnitude_sd", "common_mode_sd")),
@@ -105,7 +107,7 @@ def wrong_unit(key: str, value: float, limits: Mapping[str, Any]) -> str:
     most_kilooersted = 45.0
     least_square = 0.3  # smallest squareness of a magnet
     max_wrong_unit = 1e12  # values from this size on are not explained by a wrong unit
-    key = key.rstrip("[]0123456789") if key.endswith("]") else key  # of lists in tables of a list
+    key = re.sub(r"(\[\d+\])+$", "", key)  # of lists in tables of a list
     if not abs(value) < max_wrong_unit:  # an integer may be beyond floats
         return ""
     if key.endswith(DEVIATIONS_FROM_1) and abs(value - 1) <= limits.get("le", 0.0):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import magpylib
@@ -13,6 +14,7 @@ import pytest
 
 from halbach_fe.cli import main
 from halbach_fe.core.errors import StudyError
+from halbach_fe.design import demagnetization
 from halbach_fe.design.demagnetization import cut, demagnetization_map, knee
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.magnets import magnet_of_blocks
@@ -62,6 +64,23 @@ def test_vacuum_against_magpylib(short_dipole, session):
     np.testing.assert_allclose(found.along, expected, atol=1e-5 * scale)
     wrong_axis = along(found, np.cross([0.0, 0.0, 1.0], strength))
     assert np.abs(found.along - wrong_axis).max() > 0.1 * scale
+
+
+def test_more_cells_than_fit_into_memory_are_refused(monkeypatch):
+    """With 20 cells across two cubes have 16 000, of 800 bytes each; 0.01 GiB hold 13 400. One cube
+    alone, and 10 across, are the controls.
+    """
+    monkeypatch.setattr(demagnetization, "available_memory", lambda: 0.01)
+    for heights, across, refused in (
+            ([0.0, 0.03], 20, True), ([0.0], 20, False), ([0.0, 0.03], 10, False)):
+        one = {"shape": "cuboid", "x_m": 0.0, "y_m": 0.0, "remanence_x_T": 1.3,
+               "remanence_y_T": 0.0, "remanence_z_T": 0.0,
+               **{f"size_{axis}_m": 0.02 for axis in "xyz"}}
+        blocks = magnet_of_blocks({key: [value] * len(heights) for key, value in one.items()}
+                                  | {"z_m": heights}).blocks
+        with pytest.raises(StudyError, match="for some 0.016 million cells and") if refused else (
+                nullcontext()):
+            cut(blocks, range(len(heights)), across)
 
 
 def test_a_flat_block(session):

@@ -12,11 +12,13 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference import mcmc
 from halbach_fe.inference.infer import infer
 from halbach_fe.inference.mcmc import _Run
-from halbach_fe.inference.storage import read_posterior, write_inference
+from halbach_fe.inference.result import Reservation
+from halbach_fe.inference.storage import disagreement_of, read_posterior, write_inference
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.response import matrix as matrix_module
 from halbach_fe.response.matrix import response_matrix
 from halbach_fe.solver.exact_block_field import field_of
+from halbach_fe.solver.session import NOT_KEPT
 from tests.conftest import circle
 
 NOISE = {"regions": [{"name": "bore", "sigma_T": 1e-4}]}
@@ -42,6 +44,27 @@ def test_posterior_of_the_same_magnet(inferred):
         external={"background_T": [1e-5, 0, 0]})
     found = read_posterior(build_magnet(study), path)
     np.testing.assert_array_equal(found["posterior"].mean, update.posterior.mean)
+
+
+@pytest.mark.parametrize(("changes", "key"), [
+    ({"instrument__rotation_rad": (0.0, 0.0, 0.01)}, "instrument.rotation_rad"),
+    ({"noise__regions": [{"name": "all", "sigma_T": 2e-3}]}, "noise.regions"),
+    ({"external__background_T": (1e-4, 0.0, 0.0)}, "external.background_T"),
+    ({"prior__magnitude_sd": 0.002}, "prior.magnitude_sd"),
+    ({"mesh__block_size_m": 0.01, "prior__types": {"a": [*range(1, 17)]}, "name": "other"}, None)])
+def test_posterior_of_another_version_of_the_study_says_so(inferred, generator, changes, key):
+    """What was inferred of another place of the map, say, is no update of this study."""
+    update, path = inferred
+    field = field_of(update.magnet.blocks, circle(0.07, 24))
+    field += NOISE["regions"][0]["sigma_T"] * generator.standard_normal(field.shape)
+    field[:, 2] = np.nan
+    update = infer(update.magnet, field_map(circle(0.07, 24), field), NOT_KEPT)
+    write_inference(update, path.parent)
+    magnet = build_magnet(update.study.with_(**changes))
+    for said in (read_posterior(magnet, path).disagreement, disagreement_of(update, magnet)):
+        assert isinstance(said, Reservation)
+        assert said == ("" if key is None else (
+            f"Only of another version of the study, with another `{key}`."))
 
 
 @pytest.mark.parametrize(("changes", "key"), [

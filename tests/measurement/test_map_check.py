@@ -29,6 +29,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.formats.declared import DeclaredFormat
 from halbach_fe.measurement.formats.files import export_map, import_map
 from halbach_fe.measurement.harmonic_field import Charges, fit_fields, solid_harmonic_fields
+from halbach_fe.measurement.instrument import map_time, remove_nonlinear_part
 from halbach_fe.measurement.map_check import MapCheck, check_map, scan_lines
 from halbach_fe.measurement.probe_in_field import ProbeModel, noise_of, scatter_of
 from halbach_fe.measurement.scan_lines import held_out_lines, is_sorted, motion
@@ -47,6 +48,7 @@ from halbach_fe.report.map_check import (
 )
 from halbach_fe.report.map_check import page as page_of_check
 from halbach_fe.solver.session import NOT_KEPT
+from halbach_fe.study.measurement import Instrument
 from tests.support.hard_maps import ERRORS, GAIN, gain_of, hard_map
 from tests.support.short_dipole import FRINGE, sectors, truth
 
@@ -303,6 +305,11 @@ def test_what_explains_a_map_as_well_is_told_beside_it(generator):
     (drift,) = [term for term in control.terms if term.found]
     assert drift.name == "change of the gain from start to end"
     assert abs(drift.value - 0.4) < 4 * drift.sd
+    assert "an update does not fit that" in answer(control).step
+    # a drift of the offset can be stated in a study
+    of_offset = replace(control, terms=(replace(
+        drift, name="change of the offset of Bx from start to end"),))
+    assert "only if drift_T in [instrument_sd]" in answer(of_offset).step
 
 
 def test_what_is_found_of_a_change_is_corrected_beside_rivals():
@@ -829,6 +836,19 @@ def test_explain_corrects_no_change_during_the_scan_in_sorted_rows(monkeypatch, 
         data = data.assign(time_s=("point", np.arange(float(len(GRID)))))
     explanation._InMemory(None, data, NOT_KEPT, None, quiet).check()
     assert asked == [in_order]
+
+
+@pytest.mark.parametrize("at_s", [0.0, 1.7e9])
+def test_the_same_time_of_all_rows_says_nothing(generator, at_s):
+    """A stated drift was idle beside it, and the check took the scan for none at all."""
+    plain = field_map(GRID, read_by(generator))
+    same = plain.assign(time_s=("point", np.full(len(GRID), at_s)))
+    np.testing.assert_array_equal(map_time(same), map_time(plain))
+    assert np.ptp(map_time(same)) == 1.0
+    instrument = Instrument(drift_T=(1e-3, 0.0, 0.0))
+    np.testing.assert_array_equal(*(remove_nonlinear_part(instrument, one)
+                                    for one in (same, plain)))
+    assert [check_map(one).order for one in (same, plain)] == ["rows", "rows"]
 
 
 def test_times_that_are_not_those_of_the_rows(generator):

@@ -345,6 +345,8 @@ def other_results(home):
      "two holds. Run halbach-fe sort again, or leave out what does not belong to it."),
     (lambda home: (home / "field" / "solve.png").write_text("x"),
      "Changed since the run in field: solve.png."),
+    (lambda home: (home / "inferred" / "posterior.h5").unlink(),
+     "Changed since the run in inferred: posterior.h5 (removed)."),
     (another_posterior, "ppm is out of date: it was computed with another posterior.h5 than "
      "inferred holds."),
     (another_map, "check and inferred read different files called map.csv."),

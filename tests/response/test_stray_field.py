@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.errors import MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
-from halbach_fe.report.homogeneity import stray_figure
+from halbach_fe.report.homogeneity import sections_of_stray, stray_figure, stray_title
 from halbach_fe.response.magnetic_axis import magnetic_axis
 from halbach_fe.response.stray_field import NEAREST, stray_field
 from halbach_fe.solver.session import NOT_KEPT, Session
@@ -184,6 +184,9 @@ def test_coils_are_no_part_of_the_magnet_beside_iron(tmp_path):
                     Session.open(tmp_path))
         for keys in ({"iron": iron}, {"iron": iron, "external": {"coils": [coil]}}, {}))
     np.testing.assert_allclose(beside.radial.distance_m, alone.radial.distance_m, rtol=1e-12)
+    assert stray_title(alone) == "Outside of the magnet"
+    assert stray_title(beside) == "Outside of the magnet, without coils"  # in the terminal too
+    assert "coils besides" in str(sections_of_stray(beside)[0].parts)
     assert abs(bare.axial.distance_m / alone.axial.distance_m - 1) > 0.01
 
 

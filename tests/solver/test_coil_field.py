@@ -240,6 +240,35 @@ def test_windings_in_one_another_are_refused():
             build_magnet(study)
 
 
+@pytest.mark.parametrize(("across_mm", "refused"), [(0.0, True), (9.9, True), (10.1, False)])
+@pytest.mark.parametrize("section_m", [(0.0, 0.0), (1e-4, 1e-4), (0.0, 1e-4)])
+def test_large_loops_through_small_bodies_are_refused(across_mm, refused, section_m):
+    """A loop of 9 m radius, whose 200 points are 0.3 m apart, passes through a block of 20 mm or
+    beside it, and so through the section of a small coil.
+    """
+    away = 2.0  # in rad about the loop's own axis, between two of its points
+    x, y = 9 * np.cos(away), 9 * np.sin(away)
+    loop = {"kind": "round", "current_A": 1.0, "radius_m": 9.0, "section_m": section_m,
+            "centre_m": [-x, -y, 1e-3 * across_mm]}
+    cube = {"name": ["a"], "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0],
+            **{f"size_{axis}_m": [0.02] for axis in "xyz"}, "remanence_x_T": [0.0],
+            "remanence_y_T": [0.0], "remanence_z_T": [1.3]}
+    plain = {"name": "one", "array": {"multipole_order": 1, "free_blocks": cube},
+             "mesh": {"block_size_m": 0.01},
+             "observation": {"quantity": "flux_density", "positions": {
+                 "kind": "points", "points_m": [[0.0, 0.0, 0.1]]}}}
+    with pytest.raises(StudyError, match=r"coils\[1\].* in block a") if refused else (
+            nullcontext()):
+        build_magnet(parse_study(plain | {"external": {"coils": [loop]}}))
+    small = {"kind": "round", "current_A": 1.0, "radius_m": 0.05, "section_m": [0.02, 0.02],
+             "centre_m": [0.05, 0.0, 1.0]}  # its section is about (0, 0, 1)
+    high = loop | {"centre_m": [-x, -y, 1.0 + 1e-3 * across_mm]}
+    for coils in ([small, high], [high, small]):
+        with pytest.raises(StudyError, match=r"coils\[2\].* clear of other coils") if refused else (
+                nullcontext()):
+            build_magnet(parse_study(plain | {"external": {"coils": coils}}))
+
+
 @pytest.mark.parametrize(("inner", "outer"), [
     ({"kind": "round", "radius_m": 0.3}, {"radius_m": 0.302}),
     ({"kind": "racetrack", "size_m": [0.5, 0.4], "corner_radius_m": 0.1},

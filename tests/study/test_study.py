@@ -51,6 +51,8 @@ HOT = DEMAGNETIZATION | {"intrinsic_coercivity_A_per_m": 955e3, "temperature_C":
     ({"array__block": {"shape": "sector", "angular_gap": 1}}, "Did you mean `angular_gap_deg`?"),
     ({"array__inner_radius_m": 104}, "Was it meant in millimetres? Then write 0.104."),
     ({"array__inner_radius_m": 10}, "Was it meant in millimetres? Then write 0.01."),
+    ({"external__dipoles": [{"position_m": [0, 0, 1], "moment_A_m2": [0, 0, 2e6]}]},
+     "Was it meant in A mm²? Then write 2."),
     ({"array__remanence_T": 1060}, "Was it meant in millitesla? Then write 1.06."),
     ({"array__remanence_T": 13000}, "Was it meant in gauss? Then write 1.3."),
     ({"array__remanence_T": 13}, "Was it meant in kilogauss? Then write 1.3."),
@@ -447,6 +449,22 @@ def test_blocks_of_tons_are_asked_about(tmp_path, outer, asked):
     path = tmp_path / "study.toml"
     path.write_text(tomlkit.dumps(changed(DIPOLE, array__inner_radius_m=0.1,
                                           array__outer_radius_m=float(outer))))
+    with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
+        read_study(path)
+
+
+@pytest.mark.parametrize(("keys", "asked"), [
+    ("background_T = [0, 0.5, 0]", r"500 mT, 10000 times the earth's field.* 1 G is 1e-4 T"),
+    ("background_T = [0.03, 0.03, 0.03]", "52 mT, "), ("background_T = [0, 5e-5, 1e-3]", ""),
+    ("dipoles = [{position_m = [0, 0, 0.5], moment_A_m2 = [0, 0, 2e5]}]", "up to 320 mT at the"),
+    ("dipoles = [{position_m = [0, 0, 0.5], moment_A_m2 = [0, 0, 20]}]", "")])
+def test_fields_that_no_surroundings_have_are_asked_about(tmp_path, keys, asked):
+    """0.5 G, 30 uT or 0.2 A m2 in the unit of another program; 1 mT and 20 A m2 are the controls.
+
+    On its axis a dipole of 2e5 A m2 makes 2e-7 * 2e5 / 0.5^3 T at 0.5 m.
+    """
+    path = tmp_path / "study.toml"
+    path.write_text(tomlkit.dumps(DIPOLE) + f"\n[external]\n{keys}\n")
     with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
         read_study(path)
 
