@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import gc
 import os
 import subprocess
@@ -17,7 +18,7 @@ from hypothesis import settings
 from matplotlib.figure import Figure
 
 from halbach_fe.report import page
-from halbach_fe.report.page import png_of
+from halbach_fe.report.page import png_of, save
 from halbach_fe.solver.getdp import GetDP, find_getdp
 from halbach_fe.solver.getdp_cache import LIMIT_VARIABLE
 from halbach_fe.solver.session import Session
@@ -137,28 +138,38 @@ def changed(document: dict[str, Any], **changes: Any) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def drawn_pictures() -> dict[tuple[Any, ...], bytes]:
-    """The pictures that were drawn, by their sizes and labels."""
+def drawn_figures() -> dict[str, Figure]:
+    """The figures that were drawn, by the names of their files."""
     return {}
 
 
 @pytest.fixture(autouse=True)
-def similar_pictures_once(request, monkeypatch, drawn_pictures):
-    """Draw pictures of the same kind once, but in the tests of pages.
+def similar_figures_once(request, monkeypatch, drawn_figures):
+    """Draw figures of the same name once, but in the tests of pages.
 
-    To lay out their texts again and again would take a third of the time of all tests.
+    To lay out their texts again and again would take a third of the time of all tests, and to draw
+    them a seventh of that of commands. Tests marked with ``every_figure`` draw what is to be
+    written, and write the first of its name.
     """
     if request.path.parent.name == "report":
         return
+    every = request.node.get_closest_marker("every_figure")
 
-    def once(figure: Figure) -> bytes:
-        kind = (*figure.get_size_inches().round(1), *(
-            (axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes))
-        if kind not in drawn_pictures:
-            drawn_pictures[kind] = png_of(figure)
-        return drawn_pictures[kind]
+    def once(figures, folder):
+        for name, (draw, _) in figures.items():
+            if name not in drawn_figures or every:
+                drawn_figures.setdefault(name, draw())
+        return save({name: (drawn_figures[name], caption)
+                     for name, (_, caption) in figures.items()}, folder)
 
-    monkeypatch.setattr(page, "png_of", once)
+    monkeypatch.setattr(page, "save", once)
+    monkeypatch.setattr(page, "png_of", picture_of)
+
+
+@functools.cache
+def picture_of(figure: Figure) -> bytes:
+    """The content of a PNG file."""
+    return png_of(figure)
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import linalg
 
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.diagnosis.flexible_causes import Family, Fitted, fit_family, largest_factor
@@ -32,7 +33,7 @@ from halbach_fe.diagnosis.model_selection import (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Term:
     """A family in an explanation.
 
@@ -118,16 +119,20 @@ class Competition:
         self._by_column: dict[int, Floats] = {}
         self._by_term: dict[int, Floats] = {}
         self._extensions: dict[tuple[int, ...], Explanation] = {}
+        # the terms that were integrated out last, and what this came to
+        self._last: tuple[tuple[Term, ...], tuple[Ints, Floats, Floats]] | None = None
 
-    def _of_terms(self, rows: Ints) -> Floats:
-        """Return the information between some terms of any shape."""
-        found = np.empty((len(rows), len(rows)))
-        family = np.searchsorted([part[-1] for part in self._parts], rows)
-        for one in np.unique(family).tolist():
-            for other in np.unique(family).tolist():
-                here, there = np.flatnonzero(family == one), np.flatnonzero(family == other)
+    def _of_terms(self, rows: Ints, columns: Ints) -> Floats:
+        """Return the information between some terms of any shape and others."""
+        found = np.empty((len(rows), len(columns)))
+        lasts = [part[-1] for part in self._parts]
+        families = [np.searchsorted(lasts, numbers) for numbers in (rows, columns)]
+        for one in np.unique(families[0]).tolist():
+            for other in np.unique(families[1]).tolist():
+                here, there = np.flatnonzero(families[0] == one), np.flatnonzero(
+                    families[1] == other)
                 found[np.ix_(here, there)] = self._product(one, other)[np.ix_(
-                    rows[here] - self._parts[one][0], rows[there] - self._parts[other][0])]
+                    rows[here] - self._parts[one][0], columns[there] - self._parts[other][0])]
         return found
 
     def _product(self, one: int, other: int) -> Floats:
@@ -161,14 +166,24 @@ class Competition:
             self._by_term |= dict(zip(missing.tolist(), found, strict=True))
         return np.array([self._by_term[row] for row in rows.tolist()])
 
+    def _integrated(self, terms: Sequence[Term]) -> tuple[Ints, Floats, Floats]:
+        """Return the columns (d,) of terms, the prior standard deviations of their amplitudes, and
+        the Cholesky factor (d, d) of the precision of these amplitudes, whose unit is the latter.
+        """
+        key = tuple(terms)
+        if self._last is None or self._last[0] != key:
+            rows = np.concatenate([term.columns for term in terms])
+            scale = np.concatenate([term.deviations for term in terms])
+            precision = self._of_terms(rows, rows) * scale * scale[:, None] + np.eye(len(rows))
+            self._last = key, (rows, scale, linalg.cholesky(precision, lower=True))
+        return self._last[1]
+
     def evidence_beside(self, terms: Sequence[Term]) -> Evidence:
         """Return the evidence of all effects with terms integrated out."""
         if not terms:
             return self.evidence
-        rows = np.concatenate([term.columns for term in terms])
-        scale = np.concatenate([term.deviations for term in terms])
-        precision = self._of_terms(rows) * scale * scale[:, None] + np.eye(len(rows))
-        return self.evidence.beside(precision, self._cross_of_all(rows) * scale[:, None],
+        rows, scale, root = self._integrated(terms)
+        return self.evidence.beside(root, self._cross_of_all(rows) * scale[:, None],
                                     self._score[rows] * scale)
 
     def _joint_evidence(
@@ -179,16 +194,18 @@ class Competition:
         """
         family = np.zeros(0, int) if family is None else family
         index = np.asarray(columns, int)
-        added = np.concatenate([family, *(term.columns for term in terms)])
-        scale = np.concatenate([np.ones(len(family)), *(term.deviations for term in terms)])
-        cross = (self._cross(added, index) * scale[:, None]).T
-        own = self._of_terms(added) * scale * scale[:, None]
+        cross = self._cross(family, index)
         evidence = Evidence.of(
-            np.block([[self.evidence.part(index), cross], [cross.T, own]]),
-            np.concatenate([self.evidence.score[index], self._score[added] * scale]),
+            np.block([[self.evidence.part(index), cross.T],
+                      [cross, self._of_terms(family, family)]]),
+            np.concatenate([self.evidence.score[index], self._score[family]]),
             self.evidence.chi2, self.evidence.readings)
-        kept = len(index) + len(family)
-        return evidence.given(range(kept, len(index) + len(added))).only(range(kept))
+        if not terms:
+            return evidence
+        rows, scale, root = self._integrated(terms)
+        beside = np.hstack([self._cross(rows, index), self._of_terms(rows, family)])
+        return evidence.beside(root, beside * scale[:, None], self._score[rows] * scale).only(
+            range(len(index) + len(family)))
 
     def _evidence_of(
         self, effects: Sequence[int], terms: Sequence[Term]

@@ -264,21 +264,43 @@ def fit_family(family: Family, evidence: Evidence) -> Fitted:
             kept = np.flatnonzero(
                 (SIZES[-1] * spectrum)**2 * np.diag(information) > negligible)
             weights = spectrum[kept]
-            values, vectors = np.linalg.eigh(
-                weights[:, None] * information[np.ix_(kept, kept)] * weights)
-            score = vectors.T @ (weights * evidence.score[used[kept]])
-            grown = SIZES[:, None]**2 * np.maximum(values, 0.0)
-            shrunk = SIZES[:, None]**2 * score / (1 + grown)
-            some = (shrunk @ score - np.log1p(grown).sum(axis=1)) / 2
+            whitened = weights[:, None] * information[np.ix_(kept, kept)] * weights
+            score = weights * evidence.score[used[kept]]
+            some = _log_evidences(whitened, score)
             factors += some.tolist()
             top = int(np.argmax(some))
             if best is None or some[top] > best[0]:
                 deviations, mean = np.zeros(len(family.axis)), np.zeros(len(family.axis))
                 deviations[used] = SIZES[top] * spectrum
-                mean[used[kept]] = weights * (vectors @ shrunk[top])
+                mean[used[kept]] = weights * linalg.solve(
+                    whitened + np.eye(len(kept)) / SIZES[top]**2, score, assume_a="pos")
                 best = float(some[top]), axes, smooth, deviations, mean
     assert best is not None
     return Fitted(float(special.logsumexp(factors) - np.log(len(factors))), *best)
+
+
+def _log_evidences(information: Floats, score: Floats) -> Floats:
+    """Return the log evidences (sizes,) of terms whose amplitudes have each of `SIZES` as their
+    prior standard deviation, over that of none.
+
+    A tridiagonal form of their information (k, k) serves all sizes, and takes a quarter of the time
+    of eigenvectors.
+    """
+    count, variances = len(score), SIZES**2
+    if count < 2:
+        grown = variances * information.sum()
+        return (variances * (score @ score) / (1 + grown) - np.log1p(grown)) / 2
+    reduced, along, beside, reflections, _ = linalg.lapack.dsytrd(
+        information, lower=1, lwork=32 * count)
+    turned = np.append(score[:1], linalg.lapack.dormqr(
+        "L", "T", reduced[1:, :-1], reflections, score[1:, None], lwork=32 * count)[0])
+    found = np.empty(len(variances))
+    for number, variance in enumerate(variances):
+        pivots, _, mean, failed = linalg.lapack.dptsv(
+            1 + variance * along, variance * beside, turned)
+        assert not failed
+        found[number] = (variance * (turned @ mean) - np.log(pivots).sum()) / 2
+    return found
 
 
 def _axes_seen(family: Family, evidence: Evidence) -> list[tuple[int, ...]]:

@@ -119,22 +119,23 @@ class Evidence:
         index = np.asarray(chosen, int)
         if not len(index):
             return self
-        return self.beside(self.part(index) + np.diag(self.prior[index]),
-                           self.rows(index), self.score[index])
+        precision = self.part(index) + np.diag(self.prior[index])
+        return self.beside(linalg.cholesky(precision, lower=True), self.rows(index),
+                           self.score[index])
 
-    def beside(self, precision: Floats, cross: Floats, score: Floats) -> Evidence:
+    def beside(self, root: Floats, cross: Floats, score: Floats) -> Evidence:
         """Return the evidence with the amplitudes of other columns integrated out.
 
         Parameters
         ----------
-        precision : ndarray, shape (d, d)
-            The matrix A of these columns, plus their prior precisions on its diagonal.
+        root : ndarray, shape (d, d)
+            The lower Cholesky factor of the matrix A of these columns, plus their prior precisions
+            on its diagonal.
         cross : ndarray, shape (d, k)
             Their rows of the matrix A.
         score : ndarray, shape (d,)
             Their vector b.
         """
-        root = linalg.cholesky(precision, lower=True)
         taken, own = (linalg.solve_triangular(root, part, lower=True) for part in (cross, score))
         return replace(
             self, score=self.score - own @ taken, chi2=self.chi2 - float(own @ own),

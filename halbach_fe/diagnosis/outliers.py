@@ -313,8 +313,12 @@ class _Neighbourhood:
         terms, values = self.terms * good[:, :, None], difference[self.nearest] * good
         root = good.astype(float)
         for _ in range(fits):
-            inverse = np.linalg.pinv(terms * root[:, :, None], rcond=1e-6) * root[:, None]
-            rest = values - np.einsum("kij,kjl,kl->ki", terms, inverse, values, optimize=True)
+            weighted = np.swapaxes(terms, 1, 2) * root[:, None]**2
+            sizes, vectors = np.linalg.eigh(weighted @ terms)
+            # neighbours in a plane or on a line determine some combinations only
+            sizes = np.where(sizes > 1e-12 * sizes[:, -1:], sizes, np.inf)
+            inverse = (vectors / sizes[:, None]) @ (np.swapaxes(vectors, 1, 2) @ weighted)
+            rest = values - (terms @ (inverse @ values[..., None]))[..., 0]
             typical = np.nanmedian(np.where(good, np.abs(rest), np.nan), axis=1)[:, None]
             root = good / np.hypot(1, rest / np.maximum(cauchy_scale * MAD_TO_SD * typical, 1e-300))
         weights = inverse[:, 0]

@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -441,10 +442,12 @@ def _route(magnet: Magnet, points: Floats, problems: Sequence[Problem]) -> str:
     return EXACT_FIELD_ONLY if magnet.is_vacuum else choose_route(magnet, points)
 
 
+@cache
 def machine_speed() -> float:
-    """Return the present speed of this machine relative to the reference machine.
+    """Return the speed of this machine relative to the reference machine.
 
-    It is measured by the shortest time of three factorizations of a sparse matrix of fixed size.
+    It is measured once, by the shortest time of three factorizations of a sparse matrix of fixed
+    size.
     """
     # side of the grid whose factorization measures the speed of a machine, and the processor time
     # in s that the factorization took on the reference machine

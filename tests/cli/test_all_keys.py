@@ -23,7 +23,6 @@ from halbach_fe.geometry.symmetry import as_meant, mountings
 from halbach_fe.inference.block_prior import types_of
 from halbach_fe.measurement.block_table import BlockTable, read_blocks, write_blocks
 from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
-from halbach_fe.response.resource_estimate import machine_speed
 from halbach_fe.solver.exact_block_field import field_of
 from halbach_fe.solver.getdp_cache import FOLDER_VARIABLE, LIMIT_VARIABLE
 from halbach_fe.study.array import Array
@@ -220,6 +219,8 @@ PAIRS = [(name, command) for name in STUDIES for command in COMMANDS
          or (name == "free-types" and command in OF_TYPES)
          or (command in BRIEF and name not in SLOW
              and not (command == "diagnose" and name.startswith("iron")))]
+DRAWN = [pytest.param(*pair, marks=pytest.mark.every_figure) if pair[0] in WHOLE else pair
+         for pair in PAIRS]
 
 UNLIKE = "Where rings differ, list the blocks as `array.free_blocks`"
 REFUSED: dict[tuple[str, str], str] = {
@@ -254,16 +255,15 @@ class Case:
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(getdp, tmp_path_factory):
-    """Find GetDP once, and measure once how fast this machine is, which estimates ask for.
+    """Find GetDP once.
 
     Elements of iron are three times as large as usual: only keys are tried here. Commands share
     their runs of GetDP by a cache: one that passes over a key asks for another run than `solve`.
     """
-    speed, fine = machine_speed(), Sizes.of
+    fine = Sizes.of
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(FOLDER_VARIABLE, str(tmp_path_factory.mktemp("cache")))
         patch.setenv(LIMIT_VARIABLE, "1")
-        patch.setattr("halbach_fe.response.resource_estimate.machine_speed", lambda: speed)
         patch.setattr("halbach_fe.solver.getdp.find_getdp", lambda path=None: getdp)
         patch.setattr(Sizes, "of", lambda mesh, coarseness=1.0: fine(mesh, 3.0 * coarseness))
         yield
@@ -341,7 +341,7 @@ def run(case: Case, command: str, capsys: pytest.CaptureFixture[str]) -> tuple[i
     return code, shown.out if code == 0 else shown.err, folder
 
 
-@pytest.mark.parametrize(("name", "command"), PAIRS)
+@pytest.mark.parametrize(("name", "command"), DRAWN)
 def test_all(case, capsys, name, command):
     here = case(name)
     code, said, folder = run(here, command, capsys)

@@ -24,8 +24,8 @@ from halbach_fe.report import page
 IMPORTED = ["halbach_fe.api", "halbach_fe.cli.verbs", "halbach_fe.report.page",
             "matplotlib.pyplot", "scipy.stats", "magpylib", __name__]
 
-PICTURE = page.png_of(Figure(figsize=(1, 1)))
-"""Every picture of a page: to draw them takes as long as the rest, and tests of pages do so."""
+FIGURE = Figure(figsize=(1, 1))
+"""Every figure of a page: to draw them takes as long as the rest, and tests of pages do so."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,9 @@ def _run(code: str | list[str], folder: Path, environment: dict[str, str], stdou
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
     sys.stdout, sys.stderr = (open(number, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
                               for number in (1, 2))
-    page.png_of = lambda figure: PICTURE
+    save = page.save
+    page.save = lambda figures, folder: save(
+        {name: (FIGURE, caption) for name, (_, caption) in figures.items()}, folder)
     if isinstance(code, list):
         sys.argv = ["halbach-fe", *code]
         sys.exit(main(code))

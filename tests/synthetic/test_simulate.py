@@ -30,7 +30,6 @@ from halbach_fe.synthetic.reaction import lone_moment_matrix
 from halbach_fe.synthetic.simulate import real_places, simulate_campaign, write_campaign
 from tests.conftest import DIPOLE, changed
 from tests.support.pages import page
-from tests.support.warm_process import PICTURE
 
 NOISE = {"regions": [{"name": "all", "sigma_T": 1e-4}]}
 RINGS = {"array__recoil_permeability": 1.0, "noise": NOISE, "observation__positions": {
@@ -68,7 +67,7 @@ common_mode_sd = 0.005
 
 
 @pytest.fixture(autouse=True)
-def similar_pictures_once():
+def similar_figures_once():
     """All pictures are drawn, because files are compared."""
 
 
@@ -90,12 +89,11 @@ def campaigns(tmp_path_factory):
 def inferred(study, readings, blocks, out, capsys):
     """Summary of an inference, and its magnetizations and standard deviations.
 
-    The study's response is solved once for all maps, and no picture is drawn.
+    The study's response is solved once for all maps.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(FOLDER_VARIABLE, str(study.parent / "cache"))
         patch.setenv(LIMIT_VARIABLE, "1")
-        patch.setattr("halbach_fe.report.page.png_of", lambda figure: PICTURE)
         assert main(["infer", str(study), "--measurements", str(readings), "--blocks", str(blocks),
                      "-o", str(out), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
