@@ -40,8 +40,10 @@ WELL_TOLD, HARDLY_TOLD = 0.05, 0.5
 and above which the readings say little of it."""
 
 NOT_APART = 0.9
-"""Correlation of the errors of two terms from which they are called hardly told apart: the bar of
-each is 2.3 times as long as it would be if the other were known."""
+"""Correlation of the errors of two terms, by themselves or with all others held, from which they
+are called hardly told apart: the bar of each is 2.3 times as long as if the other were known. In
+the uniform field of an MRI magnet a turn, the angle of a sensor and its offset were told as a sum,
+with correlations of 0.2 to 0.6, which are 0.99 with the third one held."""
 
 ALL_BLOCKS = "strength of all blocks together"
 """Name of the median deviation of all blocks, and of the mean one."""
@@ -154,7 +156,11 @@ def trade_offs(
     sd = np.sqrt(np.diag(covariance))
     told = np.flatnonzero((sd > WELL_TOLD * prior_sd) & (sd < HARDLY_TOLD * prior_sd))
     correlation = covariance[np.ix_(told, told)] / np.outer(sd[told], sd[told])
-    count, group = connected_components(np.abs(correlation) > NOT_APART)
+    inverse = np.linalg.inv(correlation)
+    scale = np.sqrt(np.diag(inverse))
+    partial = inverse / np.outer(scale, scale)  # with all others held, but for the sign
+    count, group = connected_components(np.maximum(
+        np.abs(correlation), np.abs(partial)) > NOT_APART)
     return tuple(tuple(names[one] for one in told[group == number])
                  for number in range(count) if np.sum(group == number) > 1)
 

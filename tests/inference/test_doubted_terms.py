@@ -182,6 +182,9 @@ def test_terms_that_readings_hardly_tell_one_by_one():
     assert told(together, third, ((1, 0, 0), 1e-3)) == ()
     assert told(((1, 1, 0), 1e-5), third, ((1, 0, 0), 1e-3)) == ()
     assert told(((1, 1, 0), 5e-2), third) == ()
+    # of three of which the sum is told, no two are like each other
+    assert told(((1, 1, 1), 1e-3), ((1, 0, 0), 1e-2), ((0, 1, 0), 1e-2), ((0, 0, 1), 1e-2)) == (
+        ("a", "b", "c"),)
     said = trade_offs_in_words((("a", "b"), ("c", "d", "e")))
     assert "hardly tells apart a and b; or c, d and e:" in said
     assert trade_offs_in_words(()) == ""
