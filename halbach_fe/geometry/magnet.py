@@ -423,7 +423,9 @@ def _doubt_metres(magnet: Magnet) -> None:
 
 
 def _check_external(study: Study) -> None:
-    """Refuse neighbouring magnets and coils in the place of the magnet."""
+    """Refuse neighbouring magnets and coils in the place of the magnet; warn of strong fields."""
+    for doubt in study.external.doubts:
+        warnings.warn(f"Study {study.name}: {doubt}", HalbachWarning, stacklevel=3)
     if study.external.neighbours:
         _check_neighbours(study.dimension, study.array, study.iron_ring, study.iron,
                           study.external.neighbours)

@@ -202,6 +202,7 @@ def test_a_quadrupole_of_free_blocks_whose_order_was_forgotten(session, order):
     assert ("multipole_order = 2 below [array]" in said.step) == (order == 1)
 
 
+@pytest.mark.filterwarnings("ignore:.*earth's field")
 def test_the_integral_of_external_fields(session):
     """That of a uniform one is infinite, and left out; a dipole's is a plane dipole's, wherever it
     is. The control is the circle at z, which has the uniform field.
@@ -325,6 +326,7 @@ def test_a_wire_just_beyond_the_circles_of_a_study(session):
     assert np.abs(by(32) / by(2000) - 1)[-1] > 0.2
 
 
+@pytest.mark.filterwarnings("ignore:.*earth's field")
 @pytest.mark.parametrize(("external", "named"), [
     (loop_beside_the_axis(0.0199), r"coils\[1\]"),
     ({"coils": [{"kind": "racetrack", "size_m": [0.012, 0.008], "section_m": [0, 0.004],
