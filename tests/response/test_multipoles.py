@@ -19,7 +19,6 @@ from halbach_fe.measurement.positions import points_from
 from halbach_fe.report.multipoles import answer
 from halbach_fe.response import multipoles
 from halbach_fe.response.matrix import Response, response_matrix
-from halbach_fe.response import multipoles
 from halbach_fe.response.multipoles import (
     UNITS,
     MultipoleReference,
