@@ -356,13 +356,16 @@ class Magnet(ShownInNotebook):
 
     def with_(self, **changes: Any) -> Magnet:
         """Return the magnet of the same study with other values of some keys, see `Study.with_`."""
-        return self.with_study(self.study.with_(**changes))
+        study = self.study.with_(**changes)
+        if study.external != self.external:
+            _doubt_external(study)
+        return self.with_study(study)
 
     def with_study(self, study: Study) -> Magnet:
         """Return the magnet of another study; blocks are built again only if they may differ."""
         same = all(getattr(study, key) == getattr(self.study, key) for key in MAGNET_KEYS)
         if not same:
-            return build_magnet(study)
+            return _built(study)
         _check_external(study)
         return Magnet(study, self.blocks)
 
@@ -391,6 +394,18 @@ def build_magnet(study: Study) -> Magnet:
     >>> hf.build_magnet(hf.read_study("dipole.toml")).blocks[0].name
     'r01s01'
     """
+    _doubt_external(study)
+    return _built(study)
+
+
+def _doubt_external(study: Study) -> None:
+    """Warn of fields from outside that no surroundings have; a search may try them."""
+    for doubt in study.external.doubts:
+        warnings.warn(f"Study {study.name}: {doubt}", HalbachWarning, stacklevel=4)
+
+
+def _built(study: Study) -> Magnet:
+    """Return the magnet of a study, see `build_magnet`."""
     magnet = Magnet(study, blocks_of_array(study.array, study.dimension))
     strongest = max(abs(block.remanence) for block in magnet.blocks)
     # smallest remanence in T of a magnet's strongest block; results are relative to it

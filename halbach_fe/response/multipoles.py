@@ -786,8 +786,12 @@ def _integrals_of_coils(
     places = [0.0, *(one.position_m[2] for one in external.dipoles),
               *(one.centre_m[2] for one in external.coils)]
     relative_error = 1e-10  # far below what is known of external fields
-    found, error = quad_vec(harmonics, -np.inf, np.inf, epsrel=relative_error, epsabs=0.0,
-                            norm="max", points=sorted(set(places)))
+    # of a coaxial coil all integrals are 0, to which no relative error is ever reached
+    strongest = max(float(np.abs(external_field(alone, at_heights(circle, z))).max())
+                    for z in places)
+    found, error = quad_vec(
+        harmonics, -np.inf, np.inf, epsrel=relative_error,
+        epsabs=relative_error * strongest * closest, norm="max", points=sorted(set(places)))
     return found[:highest] + 1j * found[highest:], float(error)
 
 

@@ -139,6 +139,25 @@ class External(StudyModel):
             ("coils", self.coils), ("neighbours", self.neighbours), ("dipoles", self.dipoles),
             ("the background", any(self.background_T))) if given]
 
+    @property
+    def doubts(self) -> list[str]:
+        """Sentences about fields that are stronger than surroundings make them."""
+        strong_t = 0.02  # 400 times the earth's field; some rooms of MRI magnets have that
+        found = []
+        if (size := float(np.linalg.norm(self.background_T))) > strong_t:
+            found.append(
+                f"`external.background_T` is {1e3 * size:.3g} mT, {size / 5e-5:.0f} times the "
+                "earth's field of 5e-5 T. Was another unit than tesla meant? 1 G is 1e-4 T.")
+        for number, one in enumerate(self.dipoles, start=1):
+            distance = max(float(np.linalg.norm(one.position_m)), 1e-6)
+            field = 2e-7 * float(np.linalg.norm(one.moment_A_m2)) / distance**3  # on its axis
+            if field > strong_t:
+                found.append(
+                    f"`external.dipoles[{number}]` makes up to {1e3 * field:.3g} mT at the origin, "
+                    f"{field / 5e-5:.3g} times the earth's field. Are position_m in metres and "
+                    "moment_A_m2 in A m²? 1 A mm² is 1e-6 A m².")
+        return found
+
 
 def check_apart(external: External, points: Floats, study: str) -> None:
     """Refuse points (n, 3) in m at a dipole, where its field is infinite.

@@ -30,7 +30,6 @@ from halbach_fe.study import materials, sentences
 from halbach_fe.study.free_blocks import MAX_PATH
 from halbach_fe.study.free_blocks_file import free_blocks_of_file
 from halbach_fe.study.iron import Iron, IronBody, IronCurve, TableCurve, closed_surface, read_stl
-from halbach_fe.study.magnet import External
 from halbach_fe.study.model import Study, iron_of
 
 
@@ -135,28 +134,12 @@ def _doubted_units(study: Study) -> list[str]:
             if largest < small_iron_m:
                 found.append(f"`iron.bodies[{number}]` is only {1e3 * largest:.3g} mm large. Were "
                              "metres meant? Then set its unit_m = 1.")
-    found += _doubted_sources(study.external)
     found += _doubted_curves(study)
     found += (f"`array{key}`: {doubt}" for key, one in (
         ("", study.array), *((f".ring[{number}]", ring)
                              for number, ring in enumerate(study.array.ring, start=1)))
         if (doubt := one.doubt))
     return found
-
-
-def _doubted_sources(external: External) -> Iterator[str]:
-    """Yield sentences about fields from outside that are stronger than surroundings make them."""
-    strong_T = 2e-3  # 40 times the earth's field, 4 times what is allowed beside MRI magnets
-    if (size := float(np.linalg.norm(external.background_T))) > strong_T:
-        yield (f"`external.background_T` is {1e3 * size:.3g} mT, {size / 5e-5:.0f} times the "
-               "earth's field of 5e-5 T. Was another unit than tesla meant? 1 G is 1e-4 T.")
-    for number, one in enumerate(external.dipoles, start=1):
-        distance = max(float(np.linalg.norm(one.position_m)), 1e-6)
-        field = 2e-7 * float(np.linalg.norm(one.moment_A_m2)) / distance**3  # on its axis
-        if field > strong_T:
-            yield (f"`external.dipoles[{number}]` makes up to {1e3 * field:.3g} mT at the origin, "
-                   f"{field / 5e-5:.3g} times the earth's field. Are position_m in metres and "
-                   "moment_A_m2 in A m²? 1 A mm² is 1e-6 A m².")
 
 
 def _doubted_curves(study: Study) -> Iterator[str]:

@@ -309,6 +309,7 @@ def test_iron_of_any_shape_needs_the_method_reaction(tmp_path):
 SPHERES = [{"kind": "sphere", "radius_m": 0.01, "centre_m": [0.0, 0.0, z]} for z in (0.5, 0.56)]
 
 
+@pytest.mark.filterwarnings("ignore:.*earth's field")
 def test_two_spheres_pull_one_another(tmp_path):
     """In a uniform field, far from the block: nearly as two dipoles 60 mm apart."""
     found = found_of(beside(*SPHERES, external={"background_T": [0.0, 0.0, 0.5]}, growth=1.8),

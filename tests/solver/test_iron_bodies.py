@@ -319,6 +319,7 @@ def test_the_updated_magnet_is_extrapolated_as_the_model_is(session, coarse_mesh
         infer(magnet, field_map(points, model), session.within("update"))
 
 
+@pytest.mark.filterwarnings("ignore:.*earth's field")
 def test_external_field_acts_on_the_iron(session, coarse_mesh):
     """The sphere's dipole is added to the background; the field of the block is negligible."""
     background = [0.0, 0.0, 0.5]

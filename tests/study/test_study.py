@@ -465,8 +465,11 @@ def test_fields_that_no_surroundings_have_are_asked_about(tmp_path, keys, asked)
     """
     path = tmp_path / "study.toml"
     path.write_text(tomlkit.dumps(DIPOLE) + f"\n[external]\n{keys}\n")
-    with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
-        read_study(path)
+    study = read_study(path)
+    for made in (lambda: build_magnet(study),
+                 lambda: build_magnet(parse_study(DIPOLE)).with_(external=study.external)):
+        with pytest.warns(HalbachWarning, match=asked) if asked else contextlib.nullcontext():
+            made()
 
 
 @pytest.mark.parametrize(("line", "said"), [
