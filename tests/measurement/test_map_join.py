@@ -16,10 +16,16 @@ from halbach_fe.core.errors import MeasurementError, StudyError
 from halbach_fe.core.pace import Pace
 from halbach_fe.measurement import map_join
 from halbach_fe.measurement.campaign import refuse_shared
-from halbach_fe.measurement.field_map import field_map, points_of, read_map, write_map
+from halbach_fe.measurement.field_map import (
+    field_map,
+    points_of,
+    read_map,
+    readings_sha256,
+    write_map,
+)
 from halbach_fe.measurement.harmonic_field import Charges
 from halbach_fe.measurement.joined_probe import TERMS, JoinedModel, Pose
-from halbach_fe.measurement.map_check import InstrumentTerm, scan_of
+from halbach_fe.measurement.map_check import InstrumentTerm, check_map, scan_of
 from halbach_fe.measurement.map_join import join_checked, join_maps, read_joined
 from halbach_fe.measurement.probe_in_field import LAG
 from halbach_fe.report.map_check import joined_answer as answer
@@ -36,6 +42,24 @@ from tests.support.joined_campaigns import (
 )
 
 QUIET = Pace(lambda _: None)
+
+
+@pytest.fixture(autouse=True)
+def checked_once(monkeypatch, checks):
+    """Check a map once, whatever it is joined with."""
+    def once(data, *told):
+        key = readings_sha256(data)
+        if key not in checks:
+            checks[key] = check_map(data, *told)
+        return checks[key]
+
+    monkeypatch.setattr(map_join, "check_map", once)
+
+
+@pytest.fixture(scope="module")
+def checks():
+    """What was found, by the readings."""
+    return {}
 
 
 def joined_of(maps):
