@@ -71,16 +71,20 @@ def main(folder: Path) -> None:
 def measured_plates(page: str) -> Figure:
     """Draw the mean flux densities of the table of TEAM problem 13 on the page of accuracy."""
     table = page[page.index("| section | at |"):].split("\n\n")[0].splitlines()[2:]
-    rows = np.array([[line.split("|")[column] for column in (1, 3, 4)] for line in table], float)
+    rows = np.array([[line.split("|")[column] for column in (1, 3, 4, 5, 8)] for line in table],
+                    float)
     figure = Figure(figsize=(9.2, 3.6), layout="constrained")
     axis = figure.subplots()
     axis.plot(rows[:, 0], rows[:, 1], "k_", ms=14, mew=2, label="measured")
-    axis.plot(rows[:, 0], rows[:, 2], "o", color="#1f77b4", ms=5, label="computed")
+    axis.errorbar(rows[:, 0], rows[:, 2], rows[:, 3], fmt="o", color="#1f77b4", ms=4, capsize=3,
+                  label="computed, with bars")
+    axis.plot(rows[:, 0], rows[:, 4], "x", color="#d62728", ms=5, zorder=3,
+              label="NGSolve, published")
     for last, name in ((0, "plate"), (7, "arm of the channel"), (18, "back")):
         axis.axvline(last + 0.5, color="#999999", lw=0.6)
         axis.text(last + 0.7, 0.05, name)
     axis.set(xlabel="section", ylabel="mean flux density in T", ylim=(0, 1.6), xlim=(0.5, 25.5))
-    axis.legend(loc="lower right")
+    axis.legend(loc="upper right")
     axis.grid(alpha=0.3)
     return figure
 
