@@ -59,7 +59,7 @@ StudyMaker = Callable[..., Study]
 
 LONGEST = [
     "cli/test_all_keys.py", "docs/test_docs.py", "diagnosis/test_diagnose.py",
-    "response/test_nonlinear.py", "solver/test_iron_bodies.py", "cli/test_killed.py",
+    "response/test_nonlinear.py", "solver/test_iron_bodies.py",
     "inference/test_doubted_terms.py", "measurement/test_map_join.py",
     "measurement/test_map_check.py", "diagnosis/test_unlisted_causes.py", "report/test_view.py",
     "diagnosis/test_iron_faults.py", "inference/test_infer.py", "solver/moments/test_solve.py",

@@ -26,7 +26,7 @@ from tests.support.interruption import (
 
 EXAMPLE = ROOT / "studies" / "quadrupole"
 MOMENTS = 1
-"""Of each command; `python -m benchmarks.run recovery` has more, and diagnose."""
+"""`python -m benchmarks.run recovery` has more, and other commands."""
 IMPORTS = 0.3
 """Share of a command's time that its imports take, before there is anything to lose."""
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import magpylib
 import numpy as np
 import pytest
+from scipy import special
 
 from halbach_fe.diagnosis.flexible_causes import (
+    SIZES,
     field_family,
     fit_family,
     harmonic_fields,
     instrument_families,
     sensor_errors,
 )
-from halbach_fe.diagnosis.marginal_evidence import Marginal
+from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 from tests.conftest import circle
 
 STEP = 1e-5
@@ -76,6 +80,31 @@ def factors(field):
         kind = "field" if family.acts_on == "field" else "instrument"
         found[kind] = max(found.get(kind, -np.inf), fit_family(family, evidence).log_bayes_factor)
     return found["field"], found["instrument"]
+
+
+@pytest.mark.parametrize("count", [1, 2, 60])
+def test_the_evidence_of_a_family_is_that_of_the_distribution_of_the_readings(count):
+    """Averaged over sizes and spectra. Control: without the price of the amplitudes."""
+    generator = np.random.default_rng(4)
+    readings, columns = generator.standard_normal(40), generator.standard_normal((40, count))
+    family = replace(field_family(POINTS, SIGMA), axis=np.full(count, -1),
+                     spectra=np.array([np.ones(count), 0.5**np.arange(count)]),
+                     smooth=(True, False))
+    every = []
+    for spectrum in family.spectra:
+        for size in SIZES:
+            whole = np.eye(40) + (columns * (size * spectrum)**2) @ columns.T
+            gain = (readings @ readings - readings @ np.linalg.solve(whole, readings)) / 2
+            every.append((gain, gain - np.linalg.slogdet(whole)[1] / 2))
+    by_likelihood, expected = special.logsumexp(every, axis=0) - np.log(len(every))
+    found = fit_family(family, Evidence.of(
+        columns.T @ columns, columns.T @ readings, float(readings @ readings), 40))
+    # rounding of the factors of a covariance of 1e8
+    assert found.log_bayes_factor == pytest.approx(expected, abs=1e-6)
+    assert found.log_bayes_factor != pytest.approx(by_likelihood, abs=0.1)
+    used = columns * found.deviations
+    mean = found.deviations * np.linalg.solve(used.T @ used + np.eye(count), used.T @ readings)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-6 * np.abs(mean).max())
 
 
 def test_a_coil_is_a_field():
