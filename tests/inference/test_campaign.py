@@ -201,6 +201,31 @@ def test_changes_of_terms_that_are_too_large_are_halved(generator, tmp_path, mon
         infer(magnet, maps, Session.open(tmp_path / "control"))
 
 
+def test_terms_that_wander_within_their_bars_are_at_rest(generator, tmp_path, monkeypatch):
+    """Derivatives of half their size make every change twice too large: terms that are nearly right
+    go to and fro for ever, and the readings do not tell which is better.
+
+    Controls: without the rule of `LEVEL` they never rest, and far from the truth they are no rest.
+    """
+    maps = two_maps(generator)
+    near = infer(build_magnet(campaign_study()), maps, Session.open(tmp_path / "near"))
+    columns = infer_module.OpenTerms.columns
+    monkeypatch.setattr(infer_module.OpenTerms, "columns",
+                        lambda self, *arguments: 0.5 * columns(self, *arguments))
+    monkeypatch.setattr(infer_module, "AT_REST", 1e-4)
+    monkeypatch.setattr(infer_module, "ROUNDS", 5)
+
+    def wandering(magnet, folder):
+        return infer(magnet, maps, Session.open(tmp_path / folder)).terms.at_rest
+
+    assert wandering(build_magnet(near.magnet.study), "wandering")
+    with pytest.warns(HalbachWarning, match="not come to rest"):
+        assert not wandering(build_magnet(campaign_study()), "far")
+    monkeypatch.setattr(infer_module, "LEVEL", np.inf)
+    with pytest.warns(HalbachWarning, match="not come to rest"):
+        assert not wandering(build_magnet(near.magnet.study), "never")
+
+
 def test_one_probe_is_estimated_from_both_maps(generator, tmp_path):
     maps = two_maps(generator, mixing=MIXING)
     open_terms = {"crosstalk": 0.02, "gain": 0.003}
