@@ -337,10 +337,11 @@ def at_temperature(magnet: Magnet, material: Demagnetization) -> Magnet:
 def cut(blocks: Sequence[MagnetBlock], numbers: Sequence[int], across: int) -> Cells:
     """Divide the blocks with the given numbers into cells, ``across`` the radial thickness."""
     parts: list[Cut] = []
+    count = 0
     for number in numbers:
         parts.append(_cut_block(blocks[number], across))
-        # the other blocks are mostly like those before
-        _check_memory(sum(len(part[3]) for part in parts) * len(numbers) // len(parts), across)
+        count += len(parts[-1][3])
+        _check_memory(count, across)
     vertices, corners, middles, volumes = _joined(parts)
     return Cells(vertices, corners, np.repeat(numbers, [len(part[3]) for part in parts]),
                  middles, volumes)

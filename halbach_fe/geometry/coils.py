@@ -123,21 +123,26 @@ def points_in_winding(coil: AnyCoil) -> Floats:
     return _from_axes(coil, np.vstack([turn(at) for _, turn in _turns(coil)]))
 
 
-def points_near(coil: AnyCoil, middle: Floats, reach: float, apart: float) -> Floats:
-    """Return points (n, 3) in m of the magnet along the part of a winding that comes near a place.
+def runs_into(coil: AnyCoil, distance: Callable[[Floats], Floats], apart: float) -> bool:
+    """Tell whether a turn of a winding runs through something.
 
-    They are ``apart`` m from each other along the turns, 1/10000 of the first points' distance at
-    least, and contain all of these within ``reach`` m of ``middle`` (3,) in m.
+    ``distance`` takes points (n, 3) in m and returns (n,) in m how far it is away at least,
+    negative within it. Pieces of turns that cannot reach it are left out, and the others halved
+    until they are ``apart`` m long.
     """
-    at = np.linspace(0.0, 1.0, POINTS_OF_TURN)
-    found = [np.empty((0, 3))]
+    pieces = POINTS_OF_TURN - 1
     for length, turn in _turns(coil):
-        step = length / (POINTS_OF_TURN - 1)
-        off = np.linalg.norm(_from_axes(coil, turn(at)) - middle, axis=1)
-        near = np.flatnonzero(np.minimum(off[:-1], off[1:]) < reach + step / 2)
-        within = np.linspace(0.0, at[1], 1 + int(np.ceil(min(step / apart, 1e4))))
-        found.append(turn((at[near, None] + within).ravel()))
-    return _from_axes(coil, np.vstack(found))
+        half = 1 / (2 * pieces)
+        middle = np.asarray(half * (1.0 + 2.0 * np.arange(pieces)), float)
+        while len(middle):
+            off = distance(_from_axes(coil, turn(middle)))
+            if (off < 0).any():
+                return True
+            if half * length < apart / 2:
+                break
+            middle, half = middle[off <= half * length], half / 2
+            middle = np.concatenate([middle - half, middle + half])
+    return False
 
 
 def _from_axes(coil: AnyCoil, points: Floats) -> Floats:

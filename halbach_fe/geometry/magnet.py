@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from importlib import import_module
 from typing import Any
 
@@ -21,7 +21,13 @@ from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
 from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
-from halbach_fe.geometry.coils import distance_in_magnet, in_winding, points_in_winding, points_near
+from halbach_fe.geometry.coils import (
+    closest,
+    distance_in_magnet,
+    in_winding,
+    points_in_winding,
+    runs_into,
+)
 from halbach_fe.geometry.iron import IronSolid, check_iron_ring, iron_solids
 from halbach_fe.geometry.outline import at_heights, points_on
 from halbach_fe.geometry.overlaps import (
@@ -30,7 +36,7 @@ from halbach_fe.geometry.overlaps import (
     overlapping_blocks,
     points_of_block,
 )
-from halbach_fe.geometry.surface import Surroundings, surroundings
+from halbach_fe.geometry.surface import Body, Surroundings, surroundings
 from halbach_fe.study.array import Array
 from halbach_fe.study.iron import Iron, IronRing
 from halbach_fe.study.magnet import AnyCoil, External, Neighbour
@@ -484,7 +490,8 @@ def _check_neighbours(
 
 
 WIDER = 1.1
-"""Size of a sphere around a body, relative to that around points of it: arcs reach beyond them."""
+"""Size of a sphere or a box around a body, relative to that around points of it: arcs reach beyond
+them."""
 
 NEAR = 0.1
 """Distance of the points of a winding that are tested, relative to what they must not cross."""
@@ -499,20 +506,44 @@ def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
     StudyError
     """
     windings = [points_in_winding(coil) for coil in coils]
+    steps = [np.median(np.linalg.norm(np.diff(points, axis=0), axis=1)) for points in windings]
     middles = np.array([points.mean(axis=0) for points in windings])
     sizes = np.array([np.linalg.norm(points - middle, axis=1).max()
                       for points, middle in zip(windings, middles, strict=True)])
-    for number, coil in enumerate(coils):
+
+    def meet(one: int, other: int) -> bool:
+        winding = coils[one]
+        if winding.kind == "polygon" or not all(winding.section_m):
+            return False
+        near = distance_in_magnet(winding, windings[other]).min() < steps[other]
+        return bool(near) and runs_into(
+            coils[other], partial(_distance_from_winding, winding), NEAR * min(winding.section_m))
+
+    for number in range(len(coils)):
         apart = np.linalg.norm(middles[:number] - middles[number], axis=1)
         for other in np.flatnonzero(apart < sizes[:number] + sizes[number]).tolist():
-            if any(len(in_winding(one, points_near(
-                    two, middles[of], sizes[of] * WIDER, NEAR * min(one.section_m))))
-                   for of, one, two in ((number, coil, coils[other]), (other, coils[other], coil))
-                   if one.kind != "polygon" and all(one.section_m)):
+            if meet(number, other) or meet(other, number):
                 raise StudyError(must_be(
                     f"`external.coils[{number + 1}]`", "study", "clear of other coils",
                     f"a winding in that of `external.coils[{other + 1}]`",
                     "Move one of them, or join both in one coil of more turns."))
+
+
+def _distance_from_winding(coil: AnyCoil, points: Floats) -> Floats:
+    """Return how far points (n, 3) in m are from a winding, negative within it; it may touch."""
+    return distance_in_magnet(coil, points) + closest(coil)
+
+
+def _distance_from_body(body: Body, surface: Floats, points: Floats) -> Floats:
+    """Return how far points (n, 3) in m are at least from a body, negative within it.
+
+    ``surface`` (m, 3) are points of it, around which it lies in a box.
+    """
+    low, high = surface.min(axis=0), surface.max(axis=0)
+    off = np.abs(points - (low + high) / 2) - WIDER * (high - low) / 2
+    found = np.linalg.norm(np.maximum(off, 0.0), axis=1)
+    found[body.contact(points).inside] = -1.0
+    return np.asarray(found)
 
 
 @lru_cache(maxsize=128)
@@ -549,8 +580,8 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
     for number, coil in enumerate(coils, start=1):
         inside = owner[in_winding(coil, everywhere)].tolist()
         near = np.flatnonzero(distance_in_magnet(coil, middles) < sizes).tolist()
-        cut = (one for one in near if bodies[one][1].contact(points_near(
-            coil, middles[one], sizes[one], NEAR * bodies[one][1].thickness)).inside.any())
+        cut = (one for one in near if runs_into(
+            coil, partial(_distance_from_body, *bodies[one][1:]), NEAR * bodies[one][1].thickness))
         if (body := next(iter(inside), next(cut, None))) is not None:
             raise StudyError(must_be(
                 f"`external.coils[{number}]`", "study", "clear of blocks and iron",

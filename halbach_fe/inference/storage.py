@@ -109,11 +109,14 @@ def _with_version(disagreement: str, magnet: Magnet, study: Study) -> str:
         return disagreement
     keys = {"noise", "prior", "inference"}
     if not study.uncertain and all(one in (None, InstrumentSd()) for one in (
-            study.instrument_sd, *(each.instrument_sd for each in study.maps))):
+            study.instrument_sd, *(each.instrument_sd for each in study.maps))) and not any(
+            any(each.stage_shift_sd_m) for each in study.maps):
         keys |= {"instrument", "external", "maps"}
     now, then = (one.model_dump(mode="json", include=keys) for one in (magnet.study, study))
     for each in (now, then):  # which blocks may change places is nothing that an update knows
         each["prior"].pop("types")
+        for one in each.get("maps", ()):  # which is relative to the folder of a study
+            one.pop("file")
     if (key := next(iter(differences(then, now)), None)) is None:
         return disagreement
     return Reservation(f"{disagreement} Only of another version of the study, with another "

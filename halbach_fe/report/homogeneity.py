@@ -20,6 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from halbach_fe.api import HomogeneityResult
 from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.core.numbers import in_a_row
 from halbach_fe.design.ring_catalogue import obstacle
 from halbach_fe.inference.map_homogeneity import HELD_OUT_PART, POOR
 from halbach_fe.report.answer import Answer, agreement, of_a_conflict
@@ -397,14 +398,14 @@ def sections_of_stray(
 
 def _left_out(stray: StrayField) -> str:
     """Say that the study has other sources; empty if it has none."""
-    return (f"The study has {' and '.join(stray.left_out)} besides, with which it may reach "
+    return (f"The study has {in_a_row(stray.left_out)} besides, with which it may reach "
             "farther." if stray.left_out else "")
 
 
 def stray_title(stray: StrayField | None) -> str:
     """Return the title of the table of `stray_rows`."""
     return "Outside of the magnet" + (
-        f", without {' and '.join(stray.left_out)}" if stray and stray.left_out else "")
+        f", without {in_a_row(stray.left_out)}" if stray and stray.left_out else "")
 
 
 def stray_rows(stray: StrayField | None) -> Rows:

@@ -439,9 +439,9 @@ def weighted_note(check: MapCheck) -> str:
 
 
 OF_SORTED_ROWS = (
-    "The map states no times, and its rows are sorted by their coordinates. If that is not the "
-    "order in which they were read, it does not tell whether the probe lags behind the stage, nor "
-    "what changed during the scan: keep the rows as they were read, or a column time_s.")
+    "The map states no times that differ, and its rows are sorted by their coordinates. If that is "
+    "not the order in which they were read, it does not tell whether the probe lags behind the "
+    "stage, nor what changed during the scan: keep the rows as they were read, or a column time_s.")
 """What is said of a map whose rows may have lost their order."""
 
 

@@ -46,7 +46,7 @@ from halbach_fe.measurement.instrument import (
     row_order_note,
     turn_of,
 )
-from halbach_fe.measurement.instrument_terms import CROSSTALK, PROBE
+from halbach_fe.measurement.instrument_terms import CROSSTALK, PROBE, STEADY
 from halbach_fe.report.answer import Answer
 from halbach_fe.report.page import (
     MEASURED,
@@ -155,9 +155,8 @@ def answer(
             "reading, where about 1 is expected: the map is of another magnet, its noise is larger "
             "than the study says, or the study lacks something. As no pose explains the map, none "
             "has odds."))
-    trust[1:1] = _doubts(best)
-    if best.explains and best.at_rest and best.apart:
-        trust.insert(1, _apart(best, name))
+    apart = [_apart(best, name)] if best.explains and best.at_rest and best.apart else []
+    trust[1:1] = [*_doubts(best), *apart]
     return Answer(
         f"Where does {'map ' + name if name else 'the map'} lie in the magnet?", said,
         " ".join(trust), *_next_step(best, name, stated), sound=is_sound(best),
@@ -516,7 +515,8 @@ def place_table(found: Sequence[Registration]) -> Rows:
 
 def probe_table(best: Registration) -> Rows:
     """Return rows of text: what the fit says about the sensors of the map, with their sd."""
-    instrument, sd = best.instrument, np.sqrt(np.diag(best.covariance))[PROBE]
+    sd = np.sqrt(np.diag(best.covariance))[PROBE.start:STEADY.stop]  # without open keys
+    instrument = best.instrument
 
     def row(what: str, value: float, bar: float, unit: str) -> dict[str, str]:
         return {"of the probe": what, "value": with_unit(value, bar, unit)}

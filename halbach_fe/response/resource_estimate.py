@@ -370,7 +370,8 @@ def _estimate(
     element_bytes = 2000
     # memory in bytes per unknown to solve for iron of any shape in this program: 5600 were measured
     # with 444 000 unknowns, of saturating plates
-    solved = magnet.iron and not magnet.iron_is_axisymmetric
+    solved = (magnet.iron and not magnet.iron_is_axisymmetric
+              and choose_route(magnet, points) is Route.MOMENTS)
     solving = 5600 * max((each.unknowns for each in problems), default=0) if solved else 0
     own = (PYTHON_BYTES + element_bytes * elements + solving + max(building, updating)
            + (reading_bytes * readings if parameters else 0)

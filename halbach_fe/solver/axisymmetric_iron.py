@@ -671,13 +671,14 @@ def newton(
         scale, size = (float(problem.dot(vector, tangent.precondition(vector))[0])
                        for vector in (right, residual))
         norms.append(float(np.sqrt(max(size, 0.0) / scale)) if scale > 0 else 0.0)
-        advance(float(np.clip(np.log(max(norms[-1], tolerance)) / np.log(tolerance), 0.0, 1.0)))
         if norms[-1] <= tolerance:
+            advance(1.0)
             return total, tuple(norms)
         if len(norms) > most_steps or not np.isfinite(norms[-1]):
             raise NotConvergedError(
                 f"Newton's method on the iron left a residual of {norms[-1]:.1e} after "
                 f"{len(norms) - 1} steps. Smooth the H(B) curve.", tuple(norms))
+        advance(float(np.clip(np.log(min(norms)) / np.log(tolerance), 0.0, 1.0)))
         step = tangent.solve(-residual, min(0.1, max(norms[-1], 1e-4)))
         slope = abs(float(problem.dot(residual, step)[0]))
         length = 1.0

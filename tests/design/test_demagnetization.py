@@ -83,6 +83,22 @@ def test_more_cells_than_fit_into_memory_are_refused(monkeypatch):
             cut(blocks, range(len(heights)), across)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_plate_among_cubes_is_counted_once(monkeypatch, order):
+    """It has 6 400 cells, each of four cubes 64; that all blocks had as many was believed of the
+    plate if it came first.
+    """
+    monkeypatch.setattr(demagnetization, "available_memory", lambda: 0.01)
+    sizes = [[0.01, 0.01, 0.001], *[[0.02] * 3] * 4][::order]
+    blocks = magnet_of_blocks({
+        "shape": ["cuboid"] * 5, "x_m": [0.0] * 5, "y_m": [0.0] * 5,
+        "z_m": (0.05 * np.arange(5)).tolist(), "remanence_x_T": [0.0] * 5,
+        "remanence_y_T": [0.0] * 5, "remanence_z_T": [1.3] * 5,
+        **dict(zip(("size_x_m", "size_y_m", "size_z_m"), np.transpose(sizes).tolist(),
+                   strict=True))}).blocks
+    assert len(cut(blocks, range(5), 4).volumes) == 6656
+
+
 def test_a_flat_block(session):
     """A plate 20 mm wide that is magnetized through 5 mm, where H varies most along these. The
     share of its volume past the knee is magpylib's on a fine grid, within twice what is stated; two

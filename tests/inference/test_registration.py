@@ -277,6 +277,8 @@ def test_open_keys_and_probe(magnet, generator, tmp_path):
     assert sd < 2e-4
     crosstalk = best.instrument.crosstalk
     assert crosstalk["yz"] + crosstalk["zy"] == pytest.approx(0.004, abs=1.5e-3)
+    shown = {row["of the probe"]: row["value"] for row in probe_table(best)}
+    assert len(shown) == 21  # six of crosstalk; gain, offset and three places of each sensor
     closed = register(tight, data, Session.open(tmp_path))[0]
     assert closed.log_evidence < best.log_evidence - 5  # control: without the key it fits worse
     with pytest.raises(StudyError, match=r"array\.ring_length"):

@@ -241,3 +241,11 @@ def test_memory_of_iron_of_any_shape(short_dipole):
     own = foretold.own_memory_GiB - resource_estimate.PYTHON_BYTES / resource_estimate.GIB
     assert unknowns > 50_000  # of fewer the readings take as much
     assert within(1.5, own / unknowns, (2.6 - 0.3) / 444_000)
+    # control: GetDP solves for a prism along equal rings, and this program only reads its solution
+    prism = short_dipole(iron={"relative_permeability": 1000.0, "bodies": [
+        {"kind": "prism", "outline_m": [[-0.1, 0.25], [0.1, 0.25], [0.1, 0.27], [-0.1, 0.27]]}]},
+        mesh__block_size_m=0.01)
+    control = resource_estimate.estimate_solve(build_magnet(prism), observation_of(prism), 1)
+    unknowns = max(problem.unknowns for problem in control.problems)
+    assert unknowns > 50_000
+    assert control.own_memory_GiB < 5600 * unknowns / resource_estimate.GIB
