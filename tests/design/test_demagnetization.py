@@ -89,7 +89,7 @@ def test_a_plate_among_cubes_is_counted_once(monkeypatch, order):
     plate if it came first.
     """
     monkeypatch.setattr(demagnetization, "available_memory", lambda: 0.01)
-    sizes = [[0.01, 0.01, 0.001], *[[0.02] * 3] * 4][::order]
+    sizes = [[0.001, 0.01, 0.01], *[[0.02] * 3] * 4][::order]
     blocks = magnet_of_blocks({
         "shape": ["cuboid"] * 5, "x_m": [0.0] * 5, "y_m": [0.0] * 5,
         "z_m": (0.05 * np.arange(5)).tolist(), "remanence_x_T": [0.0] * 5,
