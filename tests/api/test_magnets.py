@@ -339,6 +339,8 @@ def test_a_study_of_keys_names_all_that_are_missing():
      "a str that is none"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([[0, np.nan, 0]]),
      "values that are not finite"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([[0, 1e300, 0]]),
+     "above 1e30"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T(
         np.ma.masked_less([[0.0, -1.0, 0.0]], 0)), "values that are not finite"),
     (lambda: hf.magnet_of_blocks({"shape": "cuboid", "x_m": 0.0}), "columns by name"),
