@@ -169,7 +169,8 @@ def magnet_of_blocks(
 
 def _plain(column: Sequence[Any]) -> list[Any]:
     """Return the values of a column; those that are not there are None."""
-    return [None if isinstance(value, float) and np.isnan(value) else value
+    return [None if (isinstance(value, float) and np.isnan(value))
+            or type(value).__name__ == "NAType" else value  # pandas.NA, without pandas
             for value in np.asarray(column, dtype=object).tolist()]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arrays import Bools, Floats, polygon_area
-from halbach_fe.core.errors import StudyError
+from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.geometry.blocks import rotation_about_z, rotation_matrix
 from halbach_fe.geometry.convex_pieces import triangles_of_polygon
 from halbach_fe.geometry.free_blocks import counter_clockwise
@@ -222,6 +222,10 @@ def iron_solids(
         elif body.kind == "sphere":
             found = [IronSolid(0.0, body.radius_m, -body.radius_m, body.radius_m, sphere=True)]
         elif body.kind == "stl":
+            if body.file is not None:  # the folder that the path is relative to is not known here
+                raise StudyError(must_be("`file` of a body of iron", "study", "read together with "
+                                         "the study's own file", f"'{body.file}'",
+                                         "Use read_study, or give triangles_m in m."))
             found = [_of_triangles(closed_surface(np.array(body.triangles_m)))]
         elif body.kind == "revolved":
             found = [_revolved(np.array(body.profile_m))]

@@ -156,7 +156,9 @@ class Magnet(ShownInNotebook):
     @cached_property
     def nominal_magnetization(self) -> Floats:
         """Nominal M of all blocks, (parameters,) in A/m; two components per block in 2D."""
-        return np.concatenate([block.magnetization[:self.dimension] for block in self.blocks])
+        nominal = np.concatenate([block.magnetization[:self.dimension] for block in self.blocks])
+        nominal.flags.writeable = False  # all later answers of this magnet are of it
+        return nominal
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:

@@ -347,6 +347,8 @@ def write_map(data: xr.Dataset, path: str | Path) -> None:
 
     Raises
     ------
+    MeasurementError
+        If the map is not labelled as `read_map` does.
     OutputError
         If the suffix is unknown, or the file cannot be written or would be lost.
 
@@ -369,6 +371,7 @@ def save_map(data: xr.Dataset, path: Path) -> None:
     if path.suffix not in writers:
         raise OutputError(must_be("suffix", f"field map {path}", ".h5, .csv or .vtu",
                                   f"'{path.suffix}'"))
+    data = labelled_map(data, "map")
     with atomic(path) as temporary:
         writers[path.suffix](data, temporary)
 
@@ -462,7 +465,7 @@ def _read_hdf5(path: Path) -> xr.Dataset:
         raise MeasurementError(must_be(
             "path", where, "a file of measurements", "a posterior of halbach-fe infer",
             "Give the map that was measured; a verb with --posterior takes this file there."))
-    return _labelled(data, where)
+    return labelled_map(data, where)
 
 
 def checked_map(data: object, name: str) -> xr.Dataset:
@@ -485,23 +488,24 @@ def checked_map(data: object, name: str) -> xr.Dataset:
             "data", f"map {name}", "a Dataset", f"a {type(data).__name__}",
             "Read the file by read_map, and the maps that a study lists by read_maps."))
     name = str(data.encoding.get("source", name))
-    data = _labelled(data, f"map {name}")
+    data = labelled_map(data, f"map {name}")
     check_readings(data, name)
     return data
 
 
-def _labelled(data: xr.Dataset, where: str) -> xr.Dataset:
+def labelled_map(data: xr.Dataset, where: str) -> xr.Dataset:
     """Return a map, with sigma_T by point and component; MeasurementError if labels are wrong."""
     for name in ("B_T", *POSITION_COLUMNS):
         if name not in data.variables:
             raise MeasurementError(must_be("variable", where, f"`{name}`", "none of that name"))
-    labels = list(data["component"].values) if "component" in data.coords else []
+    labels = np.ravel(data["component"].values).tolist() if "component" in data.coords else []
     if data["B_T"].dims != ("point", "component") or labels != list(COMPONENTS):
         raise MeasurementError(must_be(
             "`B_T`", where, "labelled (point, component = x, y, z)",
             f"dimensions {data['B_T'].dims}, components {', '.join(map(str, labels)) or 'unnamed'}",
-            "In Python, data.transpose('point', 'component').sel(component=['x', 'y', 'z']) "
-            "arranges all three."))
+            "In Python, data.transpose('point', 'component').reindex(component=['x', 'y', 'z']) "
+            "arranges components x, y and z, or those that there are; choose one by a list, as in "
+            "data.sel(component=['x'])."))
     if "sigma_T" in data and data["sigma_T"].dims in ((), ("point",), ("component",)):
         data = data.assign(sigma_T=data["sigma_T"].broadcast_like(data["B_T"]).transpose(
             "point", "component"))

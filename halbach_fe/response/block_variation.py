@@ -22,6 +22,7 @@ bars and small corrections.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -31,7 +32,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from halbach_fe.core.arrays import Floats, Ints, radii_of
-from halbach_fe.core.errors import MeasurementError, StudyError, must_be
+from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
 from halbach_fe.measurement.observation import Observation
@@ -339,6 +340,11 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
     ------
     MeasurementError
         If it is none, has another number of parameters, or is of a magnet without a field.
+
+    Warns
+    -----
+    HalbachWarning
+        If it can hardly be of this magnet: a Gaussian does not say of which it is.
     """
     if not isinstance(distribution, Gaussian):
         raise MeasurementError(must_be(
@@ -348,6 +354,14 @@ def distribution_of(magnet: Magnet, distribution: object, name: str) -> Gaussian
         raise MeasurementError(must_be(
             name, f"study {magnet.name}", f"of the {expected} parameters of its magnet",
             str(len(distribution.mean)), "Is it that of another magnet?"))
+    nominal = magnet.nominal_magnetization
+    off = float(np.linalg.norm(distribution.mean[:len(nominal)] - nominal))
+    doubted = 1.2  # times nominal; none magnetized is 1, a third of the blocks upside down 1.15
+    if off > doubted * np.linalg.norm(nominal) > 0:
+        warnings.warn(f"The magnetizations of {name} are farther from the nominal ones of magnet "
+                      f"{magnet.name} than if no block were magnetized, by "
+                      f"{off / np.linalg.norm(nominal):.0%} of these. Are they those of another "
+                      "magnet?", HalbachWarning, stacklevel=2)
     return magnetized(magnet, distribution, name)
 
 

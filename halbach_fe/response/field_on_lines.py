@@ -114,7 +114,10 @@ class Lines:
         """Points (lines, count, 3) in m; lines run along the second offset first."""
         u, v = (one.ravel() for one in np.meshgrid(*self.across, indexing="ij"))
         middle = self.start + np.linspace(0, 1, self.count)[:, None] * (self.end - self.start)
-        return np.asarray((u[:, None] * self.axes[0] + v[:, None] * self.axes[1])[:, None] + middle)
+        across = u[:, None] * self.axes[0] + v[:, None] * self.axes[1]
+        found = np.asarray(across[:, None] + middle)
+        found.flags.writeable = False  # changed for a picture in mm, they would be other lines
+        return found
 
 
 @dataclass(frozen=True)

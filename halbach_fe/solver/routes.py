@@ -201,10 +201,11 @@ def field_at(magnet: Magnet, points_m: ArrayLike) -> Floats:
     except (TypeError, ValueError) as error:  # text, or rows of different lengths
         raise StudyError(must_be("points_m", magnet.name, "x, y, z in m: an array (..., 3)",
                                  f"a {type(points_m).__name__} that is none: {error}")) from None
-    if points.ndim == 0 or points.shape[-1] != 3 or not np.isfinite(points).all():
+    farthest = 1e30  # m; higher powers of it are still numbers, and infinity and NaN are not less
+    if points.ndim == 0 or points.shape[-1] != 3 or not (np.abs(points) < farthest).all():
         missing = points.ndim and points.shape[-1] == 3
         raise StudyError(must_be("points_m", magnet.name, "finite x, y, z in m: an array (..., 3)",
-                                 "values that are not finite" if missing else
+                                 "values that are not finite, or above 1e30" if missing else
                                  f"one of shape {points.shape}"))
     session = NOT_KEPT if magnet.is_vacuum else Session.temporary()  # closed forms write no file
     # as `halbach_fe.solve` has it, which extrapolates iron of any shape

@@ -223,7 +223,7 @@ class FreeBlocks(StudyModel):
             wrong = np.zeros(len(self), bool)
             wrong[members] = crossing(np.array([self.outline_m[n] for n in members]))
             self._refuse(wrong, "a prism, has an outline_m whose edges cross, or that has no "
-                         "area")
+                         "area, or goes round a part of it twice")
             sizes = np.ptp(np.array([self.outline_m[n] for n in members]), axis=1)
             wrong[members] = ((sizes < MIN_LENGTH_M) | (sizes >= MAX_LENGTH_M)).any(axis=1)
             self._refuse(wrong, f"a prism, has an outline_m that is not {MIN_LENGTH_M:g} m to "

@@ -270,7 +270,8 @@ class IronHole(StudyModel):
             raise ValueError("x_m and y_m are the middle of a round hole; leave them out beside "
                              "outline_m")
         if self.outline_m is not None and crossing(np.array([self.outline_m]))[0]:
-            raise ValueError("outline_m must have edges that do not cross, and some area")
+            raise ValueError("outline_m must have edges that do not cross, go round it once, "
+                             "and some area")
         return self
 
     @property
@@ -308,7 +309,8 @@ class IronPrism(PlacedIron):
     @model_validator(mode="after")
     def _consistent(self) -> IronPrism:
         if crossing(np.array([self.outline_m]))[0]:
-            raise ValueError("outline_m must have edges that do not cross, and some area")
+            raise ValueError("outline_m must have edges that do not cross, go round it once, "
+                             "and some area")
         if np.hypot(*np.array(self.outline_m).T).max() >= MAX_LENGTH_M:
             raise ValueError(f"outline_m must be within {MAX_LENGTH_M:g} m of the axis; is it in "
                              "mm? Then write 0.01 for 10 mm")
@@ -375,8 +377,8 @@ class IronRevolved(PlacedIron):
     def _consistent(self) -> IronRevolved:
         profile = np.array(self.profile_m)
         if crossing(profile[None])[0]:
-            raise ValueError("profile_m must have edges that do not cross, and some area; its "
-                             "corners are r and z")
+            raise ValueError("profile_m must have edges that do not cross, go round it once, "
+                             "and some area; its corners are r and z")
         on_axis = profile[:, 0] == 0
         if on_axis.any() and not (on_axis.sum() == 2 and (on_axis & np.roll(on_axis, 1)).any()):
             raise ValueError("profile_m must have no corner on the axis, r = 0, or two that follow "

@@ -9,6 +9,7 @@ from types import NoneType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -19,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.core.arrays import Bools, Floats, Ints
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.study import sentences
 
@@ -213,7 +214,9 @@ MAX_PAIRS = 2_000_000
 
 
 def crossing(polygons: Floats) -> Bools:
-    """Tell which of the polygons (n, corners, 2) have edges that cross, or no area, (n,)."""
+    """Tell which of the polygons (n, corners, 2) have edges that cross, or no area, or go round a
+    part of it twice or the other way, (n,). A slit that leads to a hole is none of these.
+    """
     count = polygons.shape[1]
     first, second = np.triu_indices(count, 1)
     apart = (second - first > 1) & (second - first < count - 1)  # neighbours share a corner
@@ -225,12 +228,39 @@ def crossing(polygons: Floats) -> Bools:
         corners = corners - corners.mean(axis=1, keepdims=True)
         ends = np.roll(corners, -1, axis=1)
         tiny = 1e-12 * np.abs(corners).max(axis=1) ** 2  # rounding of products of coordinates
-        flat = np.abs((np.conj(corners) * ends).imag.sum(axis=1)) <= tiny
+        twice_area = (np.conj(corners) * ends).imag.sum(axis=1)
+        rounds = _rounds_beside_edges(corners, ends)
+        wrong = (np.abs(twice_area) <= tiny) | (
+            (rounds != 0) & (rounds != np.sign(twice_area)[:, None])).any(axis=1)
         edges = ((corners[:, first], ends[:, first]), (corners[:, second], ends[:, second]))
         opposite = []
         for (a, b), others in (edges, edges[::-1]):
             sides = [(np.conj(b - a) * (point - a)).imag for point in others]
             opposite.append((np.minimum(*sides) < -tiny[:, None])
                             & (np.maximum(*sides) > tiny[:, None]))
-        found[start:start + step] = flat | (opposite[0] & opposite[1]).any(axis=1)
+        found[start:start + step] = wrong | (opposite[0] & opposite[1]).any(axis=1)
     return found
+
+
+def _rounds_beside_edges(
+    corners: NDArray[np.complex128], ends: NDArray[np.complex128]
+) -> Ints:
+    """Return how often polygons, of edges (n, corners) from corners to ends, go counter-clockwise
+    round a point on either side of each edge, (n, 2 corners).
+
+    The points are off the middle of their edge, where drawn outlines meet themselves, and by more
+    than rounding beside it; edges too short for that have none.
+    """
+    place, beside, shortest = 0.46, 1e-9, 1e-6  # relative to the edge, and twice to the polygon
+    along = ends - corners
+    size = np.abs(corners).max(axis=1, keepdims=True)
+    offset = np.full(along.shape, np.nan, dtype=complex)
+    np.divide(1j * beside * size * along, np.abs(along), out=offset,
+              where=np.abs(along) > shortest * size)
+    points = (corners + place * along)[:, None] + np.stack([offset, -offset], axis=1)
+    points = points.reshape(len(corners), -1, 1)
+    start, end = corners[:, None], ends[:, None]
+    left = (np.conj(end - start) * (points - start)).imag
+    below, ends_below = start.imag <= points.imag, end.imag <= points.imag
+    return np.asarray(np.sum(below & ~ends_below & (left > 0), axis=2)
+                      - np.sum(~below & ends_below & (left < 0), axis=2))

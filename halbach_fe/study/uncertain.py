@@ -47,13 +47,16 @@ def check_uncertain(study: Study) -> None:
     Raises
     ------
     ValueError
-        If one is not, or an amplitude changes both the magnet and an instrument.
+        If one is not, or an amplitude changes nothing, or both the magnet and an instrument.
     """
     names = [one.name for one in study.uncertain]
     for one in study.uncertain:
         if names.count(one.name) > 1:
             raise ValueError(f"every table [[uncertain]] needs a name of its own, but two of them "
                              f"have '{one.name}'")
+        if not any(one.change.values()):
+            raise ValueError(f"uncertain '{one.name}' changes all its numbers by 0; give the "
+                             "change of each per unit of the amplitude")
         of_instrument = [name.startswith(OF_INSTRUMENTS) for name in one.change]
         if any(of_instrument) and not all(of_instrument):
             raise ValueError(f"uncertain '{one.name}' changes both the magnet and an instrument; "

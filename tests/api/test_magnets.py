@@ -28,6 +28,24 @@ SLACK_T = 1e-8
 """magpylib's own sectors are exact to 1e-9 of their remanence or so."""
 
 
+def test_what_a_magnet_and_lines_keep_cannot_be_changed_in_place():
+    """A magnetization doubled, or mm for a picture, counted in all that was asked later."""
+    magnet = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
+    lines = hf.Lines((0, 0, -0.01), (0, 0, 0.01))
+    for kept in (magnet.nominal_magnetization, lines.points):
+        with pytest.raises(ValueError, match="read-only"):
+            kept *= 1000
+        assert (1000 * kept).flags.writeable
+
+
+def test_a_cell_that_pandas_calls_not_available_is_empty():
+    frame = pandas.DataFrame({"shape": ["cuboid"] * 2, "x_m": [-0.04, 0.04], "y_m": 0.0, "z_m": 0.0,
+                              "remanence_T": 1.3, **{f"size_{axis}_m": 0.02 for axis in "xyz"}})
+    turned = frame.assign(rotation_z_deg=pandas.array([0.0, pandas.NA], dtype="Float64"))
+    assert hf.magnet_of_blocks(turned).field_T(POINTS) == pytest.approx(
+        hf.magnet_of_blocks(frame).field_T(POINTS), rel=1e-12)
+
+
 def test_a_ring_is_a_halbach_array():
     """The field of many thin sectors is that of the continuous array, Br ln(b/a), for a dipole."""
     magnet = hf.halbach_ring(blocks=64, inner_radius_m=0.02, outer_radius_m=0.04, remanence_T=1.2)
@@ -321,6 +339,8 @@ def test_a_study_of_keys_names_all_that_are_missing():
      "a str that is none"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([[0, np.nan, 0]]),
      "values that are not finite"),
+    (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T([[0, 1e300, 0]]),
+     "above 1e30"),
     (lambda: hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04).field_T(
         np.ma.masked_less([[0.0, -1.0, 0.0]], 0)), "values that are not finite"),
     (lambda: hf.magnet_of_blocks({"shape": "cuboid", "x_m": 0.0}), "columns by name"),

@@ -378,6 +378,7 @@ def test_a_study_at_an_amplitude_of_zero_has_the_numbers_that_change_with_it(eff
     ({"noise.position_sd_m": 1.0}, r"which is 'noise.position_sd_m\[1\]'"),
     ({"array.rings": 1.0}, "which must be a number with a fraction"),
     ({"array.exceptions[2].twist_deg": 1.0}, "which must be a number with a fraction"),
+    ({"array.remanence_T": 0.0}, "'a' changes all its numbers by 0"),
     ({"array.remanence_T": 1.0, "instrument.gain[1]": 1.0}, "both the magnet and an instrument")])
 def test_names_that_a_study_does_not_have(changes, sentence):
     array = DOCUMENT["array"] | {"exceptions": [{"ring": 1}]}

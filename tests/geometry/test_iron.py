@@ -297,6 +297,19 @@ def test_triangles_are_as_a_box(short_dipole, generator):
             assert not ours.contains(points + found.outward)[found.on_face].any()
 
 
+def test_a_file_of_triangles_goes_with_a_study_file(short_dipole):
+    """In Python nobody knows the folder of its path; the triangles themselves are the control."""
+    triangles = triangles_of_box([0.1, 0.2, 0.04]).tolist()
+    magnet = magnet_of(short_dipole, {"kind": "stl", "centre_m": [0.1, 0.4, 0.5],
+                                      "triangles_m": triangles})
+    body = {"kind": "stl", "centre_m": [0.1, 0.4, 0.5]}
+    for given in ({"file": "yoke.stl"}, {"triangles_m": triangles}):
+        iron = {"relative_permeability": 100.0, "bodies": [body | given]}
+        with nullcontext() if "triangles_m" in given else pytest.raises(
+                StudyError, match=r"read together with the study's own file.*'yoke\.stl'"):
+            assert magnet.with_(iron=iron).iron
+
+
 def test_shells_of_triangles():
     """One outer shell, with cavities in it; and a row or a unit that would do nothing."""
     shell = triangles_of_box([0.1, 0.1, 0.1])

@@ -9,6 +9,7 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from halbach_fe.api import export
 from halbach_fe.core.errors import MeasurementError, OutputError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.registration import register
@@ -225,6 +226,7 @@ def made(**variables):
     (made().transpose(), "data.transpose"),
     (made().sel(component=["z", "y", "x"]), "components z, y, x"),
     (made().sel(component=["x"]), "components x"),
+    (made().sel(component="x"), "components x\\. .* choose one by a list"),
     (made().drop_vars("component"), "components unnamed"),
     (made().drop_vars("x_m"), "`x_m`"),
     (made().isel(point=slice(0)), "at least one reading"),
@@ -245,6 +247,31 @@ def test_maps_that_are_made_in_python(dipole, data, said):
     listed = dipole(maps=[{"name": "a", "file": "a.csv"}])
     with pytest.raises(MeasurementError, match=said):
         maps_of(listed, {"a": data})
+
+
+@pytest.mark.parametrize("changed", [
+    made().transpose(), made().sel(component=["z", "y", "x"]), made().sel(component="x"),
+    made().drop_vars("x_m"), made().rename(B_T="B_mT"),
+    made().assign_coords(x_m=("point", [0.0, 10.0, 20.0], {"units": "mm"}))])
+def test_maps_that_were_changed_are_not_written_under_wrong_names(tmp_path, changed):
+    written = tmp_path / "map.csv"
+    for write in (lambda: write_map(changed, written), lambda: export(changed, written),
+                  lambda: export(changed, tmp_path / "map.table", "geant4")):
+        with pytest.raises(MeasurementError, match="map must be"):
+            write()
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_refused_map_is_advised_can_be_done(tmp_path):
+    data, wanted = made(B_T=(("point", "component"), np.arange(9.0).reshape(3, 3))), ["x", "y", "z"]
+    for changed in (data.transpose(), data.sel(component=["z", "y", "x"]), data):
+        arranged = changed.transpose("point", "component").reindex(component=wanted)
+        export(arranged, tmp_path / "map.csv")
+        assert np.array_equal(read_map(tmp_path / "map.csv")["B_T"], data["B_T"])
+    one = data.sel(component=["x"]).transpose("point", "component").reindex(component=wanted)
+    export(one, tmp_path / "map.csv")
+    np.testing.assert_array_equal(read_map(tmp_path / "map.csv")["B_T"],
+                                  data["B_T"].where(data["component"] == "x"))
 
 
 def test_sigma_of_one_number_holds_for_all_components():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.errors import MeasurementError
+from halbach_fe.core.errors import HalbachWarning, MeasurementError
 from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.report.homogeneity import sections_of_stray, stray_figure, stray_title
 from halbach_fe.response.magnetic_axis import magnetic_axis
@@ -121,6 +121,19 @@ def test_a_posterior_of_other_blocks_is_refused(magnet, count):
     for question in (stray_field, magnetic_axis):
         with pytest.raises(MeasurementError, match=r"Is it that of another magnet\?"):
             question(magnet, NOT_KEPT, Gaussian(np.ones(size), np.eye(size)))
+
+
+def test_a_posterior_of_as_many_other_blocks_is_doubted(magnet):
+    """A Gaussian does not say of which magnet it is; a quarter of turned blocks may be the magnet's
+    own, the control.
+    """
+    nominal = magnet.nominal_magnetization
+    blocks = len(nominal) // 3
+    turned = np.repeat(np.where(np.arange(blocks) < blocks // 4, -1, 1), 3) * nominal
+    assert stray_field(magnet, NOT_KEPT, Gaussian(turned, np.eye(len(nominal))))
+    for question in (stray_field, magnetic_axis):
+        with pytest.warns(HalbachWarning, match="Are they those of another magnet"):
+            question(magnet, NOT_KEPT, Gaussian(np.roll(nominal, 1), np.eye(len(nominal))))
 
 
 def test_the_pictures_show_the_field(tmp_path, magnet):

@@ -116,6 +116,28 @@ def test_crossing_polygons(generator):
     assert crossing(comb)[0]
 
 
+def test_polygons_that_go_round_a_part_of_it_twice(generator):
+    """Prisms of such an outline had twice the field; a slit that leads to a hole has none."""
+    outer = [(-2, -2), (2, -2), (2, 2), (-2, 2)]
+    hole = [(-1, -1), (-1, 1), (1, 1), (1, -1)]  # clockwise
+    spike = [(0, 0), (2, 0), (2, 1), (2, 0), (2, -1), (0, -1)]
+    corner = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    wrong = {"twice": outer * 2, "hole counted twice":
+             [*outer, outer[0], *hole[:1], *hole[:0:-1], hole[0]],
+             "the other way": [(0, 0), (1, 0), (2, 1), (2, -1), (1, 0), (0, 1)],
+             "loop at a corner": [*outer, outer[0], (1, -1), (0, 0), (-1, 1)]}
+    right = {"hole": [*outer, outer[0], *hole, hole[0]], "spike": spike,
+             "corner twice": [*corner, (0, 0), (-1, 0), (-1, -1), (0, -1)],
+             "repeated corner": [*corner, corner[-1], corner[0]]}
+    angle = np.radians(generator.uniform(0, 360))
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for expected, outlines in ((True, wrong), (False, right)):
+        for name, outline in outlines.items():
+            for moved in (np.array(outline, float), 0.01 * np.array(outline) @ turn + [0.3, -0.2]):
+                assert crossing(moved[None])[0] == expected, name
+                assert crossing(moved[None, ::-1])[0] == expected, name
+
+
 def test_many_polygons_are_compared_in_parts(monkeypatch, generator):
     polygons = generator.uniform(-1, 1, (300, 4, 2))
     whole = crossing(polygons)

@@ -17,6 +17,7 @@ from halbach_fe.measurement.field_map import (
     TO_METRES,
     check_readings,
     doubt_of_metres,
+    labelled_map,
     read_map,
     save_map,
     warn_of_left_out,
@@ -193,13 +194,16 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
     Raises
     ------
     MeasurementError
-        If the format needs a regular grid and the map's points do not form one.
+        If the map is not labelled as `read_map` does, or the format needs a regular grid and its
+        points do not form one.
     OutputError
         If the file cannot be written, or has the suffix of another format.
     """
     if path.suffix not in SUFFIXES.get(name, (path.suffix,)):
         raise OutputError(must_be("suffix", f"output {path}", " or ".join(SUFFIXES[name]),
                                   f"'{path.suffix}'"))
+    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
+    data = labelled_map(data, where)
     warn_of_millimetres(data)
     others = {suffix for each in ("vtu", "openpmd") for suffix in SUFFIXES[each]}
     if name not in SUFFIXES and path.suffix in others:
@@ -208,7 +212,6 @@ def export_map(data: xr.Dataset, name: str, path: Path) -> None:
     if name not in GRIDS:
         save_map(data, path)
         return
-    where = f"map {data.encoding['source']}" if "source" in data.encoding else "map"
     content = GRIDS[name](grid_of(data, where))
     warn_of_left_out(data, ("B_T",), path)
     with atomic(path) as temporary:
