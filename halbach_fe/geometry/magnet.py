@@ -153,12 +153,14 @@ class Magnet(ShownInNotebook):
         return not self.has_losses and not self.iron and not any(
             block.is_permeable for block in self.blocks)
 
-    @cached_property
+    @property
     def nominal_magnetization(self) -> Floats:
         """Nominal M of all blocks, (parameters,) in A/m; two components per block in 2D."""
-        nominal = np.concatenate([block.magnetization[:self.dimension] for block in self.blocks])
-        nominal.flags.writeable = False  # all later answers of this magnet are of it
-        return nominal
+        return self._nominal_magnetization.copy()  # whoever changes it changes no later answer
+
+    @cached_property
+    def _nominal_magnetization(self) -> Floats:
+        return np.concatenate([block.magnetization[:self.dimension] for block in self.blocks])
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:

@@ -109,15 +109,12 @@ class Lines:
         first /= np.linalg.norm(first)
         return np.array([first, np.cross(along, first), along])
 
-    @cached_property
+    @property
     def points(self) -> Floats:
         """Points (lines, count, 3) in m; lines run along the second offset first."""
         u, v = (one.ravel() for one in np.meshgrid(*self.across, indexing="ij"))
         middle = self.start + np.linspace(0, 1, self.count)[:, None] * (self.end - self.start)
-        across = u[:, None] * self.axes[0] + v[:, None] * self.axes[1]
-        found = np.asarray(across[:, None] + middle)
-        found.flags.writeable = False  # changed for a picture in mm, they would be other lines
-        return found
+        return np.asarray((u[:, None] * self.axes[0] + v[:, None] * self.axes[1])[:, None] + middle)
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,10 @@ def test_what_a_magnet_and_lines_keep_cannot_be_changed_in_place():
     """A magnetization doubled, or mm for a picture, counted in all that was asked later."""
     magnet = hf.halbach_ring(inner_radius_m=0.02, outer_radius_m=0.04, length_m=0.03)
     lines = hf.Lines((0, 0, -0.01), (0, 0, 0.01))
-    for kept in (magnet.nominal_magnetization, lines.points):
-        with pytest.raises(ValueError, match="read-only"):
-            kept *= 1000
-        assert (1000 * kept).flags.writeable
+    for ask in (lambda: magnet.nominal_magnetization, lambda: lines.points):
+        kept = ask()
+        kept *= 1000
+        np.testing.assert_array_equal(1000 * ask(), kept)
 
 
 def test_a_cell_that_pandas_calls_not_available_is_empty():

@@ -262,7 +262,7 @@ def test_units_and_variables_of_own_hdf5_are_not_ignored(tmp_path):
             (data.assign_coords(x_m=data["x_m"].assign_attrs(units="mm")), "unit of `x_m`"),
             (data.assign(sigma=("point", np.full(6, 1e-5))), "`sigma_T`")):
         assert isinstance(changed, xr.Dataset)
-        write_map(changed, path)
+        changed.to_netcdf(path, engine="h5netcdf")
         with pytest.raises(MeasurementError, match=asked):
             read_map(path)
 
