@@ -244,8 +244,8 @@ def _similar_response(
     error = discretization_changes(similar, observation.points, parts, own)
     nominal = finite_element_part(magnet, observation.points, session, columns=False).nominal
     built = _assemble(magnet, observation, replace(
-        parts, nominal=nominal, along_nominal=nominal, sources=magnet.blocks, for_deviations=True),
-        error, path, changes)
+        parts, nominal=nominal, along_nominal=parts.along_nominal + nominal - parts.nominal,
+        sources=magnet.blocks, for_deviations=True), error, path, changes)
     # tolerance of the check that columns of a similar magnet add up to the nominal array. Readings
     # of blocks that deviate by 1 % are then wrong by 2e-6 of the largest reading: measured 1.3e-7
     # at a difference of 3.6e-5, by another inner radius in an iron tube.

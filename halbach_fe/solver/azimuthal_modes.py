@@ -109,9 +109,14 @@ def few_modes_suffice(magnet: Magnet, points: Floats) -> Bools:
 
 
 def modes_needed(magnet: Magnet, points: Floats) -> int:
-    """Return the highest mode that matters at any of the points (n, 3) in m."""
+    """Return the highest mode that matters at any of the points (n, 3) in m.
+
+    Above 4 it is a multiple of 4, so that points that move a little are served by the same runs.
+    """
     worst = float(np.clip(mode_decay(magnet, points).max(), 1e-9, 1 - 1e-9))
-    return max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
+    highest = max(1, int(np.ceil(np.log(MODE_TOLERANCE) / np.log(worst))))
+    alike = 4  # modes
+    return highest if highest <= alike else alike * -(-highest // alike)
 
 
 def mode_decay(magnet: Magnet, points: Floats) -> Floats:
