@@ -221,22 +221,14 @@ class Group:
 
 @dataclass(frozen=True)
 class Occurrence:
-    """A part in its place.
-
-    Attributes
-    ----------
-    part : Solid or Group
-    name : str
-    origin : ndarray, shape (3,), in mm
-        Place of the part's origin.
-    axes : ndarray, shape (3, 3)
-        Axes of the part as columns.
-    """
+    """A part in its place."""
 
     part: Solid | Group
     name: str
     origin: Floats = field(default_factory=lambda: np.zeros(3))
+    """Place of the part's origin. Shape (3,), in mm."""
     axes: Floats = field(default_factory=lambda: np.eye(3))
+    """Axes of the part as columns. Shape (3, 3)."""
 
 
 class _Product(NamedTuple):

@@ -38,37 +38,28 @@ SAME_SIZE = 1e-6
 
 @dataclass(frozen=True)
 class Mounts:
-    """Slots of a magnet, and the data that decide which blocks fit them.
-
-    Attributes
-    ----------
-    places : tuple of (ring, slot)
-        Ring and slot of each slot, both counted from 1.
-    frames : ndarray, shape (slots, 3, 3)
-        Rotations from the own axes of a slot's shape to the axes of the magnet.
-    turns : ndarray, shape (turns, 3, 3)
-        Rotations of a block, in its own axes, that leave some shape unchanged. The first is the
-        identity.
-    allowed : ndarray of bool, shape (turns, slots)
-        Which of them leave the shape of the block in a slot unchanged.
-    designed : ndarray, shape (slots, 3)
-        Directions of the design magnetization of each slot, in own axes.
-    current : ndarray, shape (slots, 3)
-        Directions of the nominal magnetization of the block that is in each slot now, in own axes;
-        0 where the block is missing.
-    kinds, current_kinds : ndarray of int, shape (slots,)
-        Kind of block that the design requires in each slot, and kind of the block that is there
-        now. Blocks of the same shape, remanence and recoil permeabilities are of the same kind.
-    """
+    """Slots of a magnet, and the data that decide which blocks fit them."""
 
     places: tuple[tuple[int, int], ...]
+    """Ring and slot of each slot, both counted from 1. As (ring, slot)."""
     frames: Floats
+    """Rotations from the own axes of a slot's shape to the axes of the magnet.
+    Shape (slots, 3, 3)."""
     turns: Floats
+    """Rotations of a block, in its own axes, that leave some shape unchanged. The first is the
+    identity. Shape (turns, 3, 3)."""
     allowed: Bools
+    """Which of them leave the shape of the block in a slot unchanged. Shape (turns, slots)."""
     designed: Floats
+    """Directions of the design magnetization of each slot, in own axes. Shape (slots, 3)."""
     current: Floats
+    """Directions of the nominal magnetization of the block that is in each slot now, in own axes; 0
+    where the block is missing. Shape (slots, 3)."""
     kinds: Ints
     current_kinds: Ints
+    """Kind of block that the design requires in each slot, and kind of the block that is there now.
+    Blocks of the same shape, remanence and recoil permeabilities are of the same kind.
+    Shape (slots,)."""
 
     def fits(self, directions: Floats, kinds: Ints) -> Bools:
         """Return which blocks fit which slots, shape (turns, slots, blocks).

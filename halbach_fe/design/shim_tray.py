@@ -53,25 +53,16 @@ EMPTY = -1
 
 @dataclass(frozen=True)
 class Filled:
-    """A magnet in a place of a tray.
-
-    Attributes
-    ----------
-    place : int
-        Number of the place, counted from 1.
-    position_m : tuple of float
-    magnet : ShimMagnet
-    from_radius_deg : float
-        Angle of the polarization from the radius of the place.
-    direction_deg : float
-        Angle of the polarization from the x axis of the magnet.
-    """
+    """A magnet in a place of a tray."""
 
     place: int
+    """Number of the place, counted from 1."""
     position_m: tuple[float, float, float]
     magnet: ShimMagnet
     from_radius_deg: float
+    """Angle of the polarization from the radius of the place."""
     direction_deg: float
+    """Angle of the polarization from the x axis of the magnet."""
 
 
 @dataclass(frozen=True)
@@ -238,22 +229,17 @@ def _columns(name: str, values: Floats) -> dict[str, Sequence[object]]:
 
 @dataclass(frozen=True)
 class _Choices:
-    """What each place can hold: a kind of magnet at an angle.
-
-    Attributes
-    ----------
-    tray : ShimTray
-    places : ndarray, shape (p, 3), in m
-    azimuth : ndarray, shape (p,), in rad
-    kind, angle : ndarray, shape (o,)
-        Number of the magnet and angle in degrees from the radius of each choice for a place.
-    """
+    """What each place can hold: a kind of magnet at an angle."""
 
     tray: ShimTray
     places: Floats
+    """Shape (p, 3), in m."""
     azimuth: Floats
+    """Shape (p,), in rad."""
     kind: Ints
     angle: Floats
+    """Number of the magnet and angle in degrees from the radius of each choice for a place.
+    Shape (o,)."""
 
     @classmethod
     def of(cls, tray: ShimTray, study: str) -> _Choices:

@@ -36,21 +36,14 @@ _HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E37
 
 @dataclass(frozen=True)
 class SymmetryImage:
-    """The reflection and rotation that map a source block to one of its copies.
-
-    Attributes
-    ----------
-    source : int
-        Number of the source block.
-    turn : float, in rad
-        Rotation about z, after the reflection.
-    mirrored : bool
-        Whether the source is reflected in the plane z = 0.
-    """
+    """The reflection and rotation that map a source block to one of its copies."""
 
     source: int
+    """Number of the source block."""
     turn: float = 0.0
+    """Rotation about z, after the reflection. In rad."""
     mirrored: bool = False
+    """Whether the source is reflected in the plane z = 0."""
 
     def to_source(self, points: Floats) -> Floats:
         """Return points (n, 3) moved by the inverse map, from the copy to the source."""
@@ -89,15 +82,10 @@ def unique_points(points: Floats) -> tuple[Floats, Ints]:
 
 @dataclass(frozen=True)
 class Symmetry:
-    """The blocks of a study as images of a few source blocks.
-
-    Attributes
-    ----------
-    images : tuple of SymmetryImage
-        One image per block, in the order of the blocks.
-    """
+    """The blocks of a study as images of a few source blocks."""
 
     images: tuple[SymmetryImage, ...]
+    """One image per block, in the order of the blocks."""
 
     @cached_property
     def sources(self) -> tuple[int, ...]:
@@ -284,22 +272,15 @@ Turn = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True)
 class Move:
-    """A move of many blocks from slot to slot.
-
-    Attributes
-    ----------
-    words : str
-        What is moved, and how.
-    pairs : tuple of (int, int)
-        Number from 0 of a block's slot, and of the slot from which the block that is there comes.
-    turn : tuple or None
-        Rotation of these blocks; None if each turns with the shape of its slot, see
-        `MagnetBlock.carried_from`.
-    """
+    """A move of many blocks from slot to slot."""
 
     words: str
+    """What is moved, and how."""
     pairs: tuple[tuple[int, int], ...]
+    """Number from 0 of a block's slot, and of the slot from which the block that is there comes."""
     turn: Turn | None
+    """Rotation of these blocks; None if each turns with the shape of its slot, see
+    `MagnetBlock.carried_from`."""
 
 
 @lru_cache(maxsize=4096)

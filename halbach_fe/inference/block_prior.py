@@ -61,26 +61,18 @@ MANY_SD = 5.0
 
 @dataclass(frozen=True)
 class TypeSamples:
-    """The measured blocks of one type.
-
-    Attributes
-    ----------
-    label : str
-        Name of the type.
-    deviations : ndarray, shape (n, d)
-        Relative deviations from the nominal magnetization, along `DIRECTIONS`; the deviations
-        across it are angles in rad.
-    intensity : float or None
-        Intensity of the shrinkage of the covariance, if it is estimated from the samples.
-    p : ndarray, shape (d,)
-        p-values of the Anderson-Darling test for each direction, adjusted for the number of types
-        and directions; NaN if a direction was not tested.
-    """
+    """The measured blocks of one type."""
 
     label: str
+    """Name of the type."""
     deviations: Floats
+    """Relative deviations from the nominal magnetization, along `DIRECTIONS`; the deviations across
+    it are angles in rad. Shape (n, d)."""
     intensity: float | None
+    """Intensity of the shrinkage of the covariance, if it is estimated from the samples."""
     p: Floats
+    """p-values of the Anderson-Darling test for each direction, adjusted for the number of types
+    and directions; NaN if a direction was not tested. Shape (d,)."""
 
     @property
     def normal(self) -> bool:
@@ -90,29 +82,19 @@ class TypeSamples:
 
 @dataclass(frozen=True)
 class MeasuredPrior:
-    """The prior of a study's magnetizations that follows from a table of measured blocks.
-
-    Attributes
-    ----------
-    gaussian : Gaussian
-        Prior of the parameters, block by block, in A/m.
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetization.
-    placed : bool
-        Whether the prior of a block is its own measurement, not the distribution of its type.
-    types : tuple of TypeSamples
-    far : str
-        A sentence that names single blocks far from the others; empty if there are none.
-    doubts : tuple of str
-        Sentences about why the table and the study may not be of the same blocks.
-    """
+    """The prior of a study's magnetizations that follows from a table of measured blocks."""
 
     gaussian: Gaussian
+    """Prior of the parameters, block by block, in A/m."""
     nominal: Floats
+    """Nominal magnetization. Shape (parameters,), in A/m."""
     placed: bool
+    """Whether the prior of a block is its own measurement, not the distribution of its type."""
     types: tuple[TypeSamples, ...]
     doubts: tuple[str, ...] = ()
+    """Sentences about why the table and the study may not be of the same blocks."""
     far: str = ""
+    """A sentence that names single blocks far from the others; empty if there are none."""
 
     @property
     def count(self) -> int:

@@ -124,16 +124,11 @@ def _with_version(disagreement: str, magnet: Magnet, study: Study) -> str:
 
 
 class StoredPosterior(dict[str, Gaussian]):
-    """Distributions of the magnetizations in A/m by name, ``prior`` and ``posterior``, of a file.
-
-    Attributes
-    ----------
-    disagreement : str or None
-        `InferenceResult.disagreement` of the update, or else its reservation; None if the file
-        does not state it.
-    """
+    """Distributions of the magnetizations in A/m, ``prior`` and ``posterior``, of a file."""
 
     disagreement: str | None = None
+    """`InferenceResult.disagreement` of the update, or else its reservation; None if the file does
+    not state it."""
 
 
 def write_inference(update: InferenceResult, folder: Path) -> None:

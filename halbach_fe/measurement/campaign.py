@@ -68,41 +68,27 @@ below which so many repetitions are no chance."""
 
 @dataclass(frozen=True)
 class Map:
-    """A map, and what the study says about it.
-
-    Attributes
-    ----------
-    name : str
-    data : Dataset
-    study : Study
-        The study of this map alone.
-    middle_m : ndarray, shape (3,)
-        Middle of its points in the coordinates that the map states.
-    pivot_m : ndarray, shape (3,)
-        The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
-        middle, or that of the first map on the same stage.
-    probe : str
-        Name of its probe. Maps of one probe share its terms.
-    pose : str
-        Name of the stage or of the map whose pose it shares, mostly its own.
-    offsets : str
-        Name of the map whose offsets and drift it has, mostly its own.
-    shift_sd_m : tuple of float
-        Prior standard deviations of an own shift along the axes of the stage.
-    is_validation : bool
-        Whether it is predicted but does not update the model.
-    """
+    """A map, and what the study says about it."""
 
     name: str
     data: xr.Dataset
     study: Study
+    """The study of this map alone."""
     middle_m: Floats
+    """Middle of its points in the coordinates that the map states. Shape (3,)."""
     pivot_m: Floats
+    """The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
+    middle, or that of the first map on the same stage. Shape (3,)."""
     probe: str
+    """Name of its probe. Maps of one probe share its terms."""
     pose: str
+    """Name of the stage or of the map whose pose it shares, mostly its own."""
     offsets: str
+    """Name of the map whose offsets and drift it has, mostly its own."""
     shift_sd_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Prior standard deviations of an own shift along the axes of the stage."""
     is_validation: bool = False
+    """Whether it is predicted but does not update the model."""
 
 
 def middle_of(points: Floats) -> Floats:

@@ -60,22 +60,14 @@ UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "T": ("mT", 1e3), "": ("%", 100
 
 @dataclass(frozen=True)
 class Term:
-    """A number of a fit, and what was known of it before.
-
-    Attributes
-    ----------
-    name : str
-        What it is, in words: "gain of Bx".
-    unit : str
-        Its SI unit: m, rad, T, or nothing for parts of 1.
-    value : float
-        Its change from the mean of its prior.
-    prior_sd : float
-    """
+    """A number of a fit, and what was known of it before."""
 
     name: str
+    """What it is, in words: "gain of Bx"."""
     unit: str
+    """Its SI unit: m, rad, T, or nothing for parts of 1."""
     value: float
+    """Its change from the mean of its prior."""
     prior_sd: float
 
     @property

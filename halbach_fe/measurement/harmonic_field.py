@@ -43,18 +43,13 @@ UNIFORM = 1e3
 
 @dataclass(frozen=True)
 class Charges:
-    """Charges around a region, and a uniform field.
-
-    Attributes
-    ----------
-    places : ndarray, shape (k, 3), in m
-    scale : float, in m^2
-        A charge of amplitude 1 has the field ``scale R / |R|^3`` at the distance R, which has an
-        rms of some 1/sqrt(k) in the region.
-    """
+    """Charges around a region, and a uniform field."""
 
     places: Floats
+    """Shape (k, 3), in m."""
     scale: float
+    """A charge of amplitude 1 has the field ``scale R / |R|^3`` at the distance R, which has an rms
+    of some 1/sqrt(k) in the region. In m^2."""
 
     @classmethod
     def around(cls, points: Floats, gap: float) -> Charges:
@@ -220,26 +215,18 @@ to which it is left out: the fit has 3 % of it at most."""
 
 @dataclass(frozen=True)
 class HarmonicFit:
-    """Amplitudes of charges, or of solid harmonics, that fit readings without any instrument.
-
-    Attributes
-    ----------
-    amplitudes : ndarray, shape (k,), in T
-    penalty : float
-        Ratio of the variances of the noise and of an amplitude.
-    sigma : float, in T
-        Standard deviation of the readings from the fit.
-    log_evidence : float
-        Log probability of the readings, up to a constant, at the most probable penalty and sigma.
-    used : float
-        Number of amplitudes that the readings determine.
-    """
+    """Amplitudes of charges, or of solid harmonics, that fit readings without any instrument."""
 
     amplitudes: Floats
+    """Shape (k,), in T."""
     penalty: float
+    """Ratio of the variances of the noise and of an amplitude."""
     sigma: float
+    """Standard deviation of the readings from the fit. In T."""
     log_evidence: float
+    """Log probability of the readings, up to a constant, at the most probable penalty and sigma."""
     used: float
+    """Number of amplitudes that the readings determine."""
 
 
 NO_FIT = HarmonicFit(np.zeros(0), 1.0, 1.0, 0.0, 0.0)

@@ -40,20 +40,14 @@ from halbach_fe.study.types import COMPONENTS, Axes
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Positions of a mapper's sensors and their linear response to B, for a map of n points.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3) or (3 n, 3), in m
-        Position of the probe at each point of the map. If its three sensors are apart, the position
-        of each sensor, point by point.
-    operator : sparse array, shape (3 n, 3 len(points))
-        Maps B at ``points``, flattened point by point, to the linear part of the map's values (Bx,
-        By, Bz of each point).
-    """
+    """Positions of a mapper's sensors and their linear response to B, for a map of n points."""
 
     points: Floats
+    """Position of the probe at each point of the map. If its three sensors are apart, the position
+    of each sensor, point by point. Shape (n, 3) or (3 n, 3), in m."""
     operator: sparse.csr_array
+    """Maps B at ``points``, flattened point by point, to the linear part of the map's values (Bx,
+    By, Bz of each point). Shape (3 n, 3 len(points))."""
 
 
 def in_si_and_magnet_axes(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:

@@ -44,14 +44,7 @@ LETTER, LARGEST = 0.6, 1 / 18
 
 @dataclass(frozen=True)
 class Sheet:
-    """The blocks of one drawing.
-
-    Attributes
-    ----------
-    title : str
-    blocks : sequence of AssembledBlock
-    plate : Plate or None
-    """
+    """The blocks of one drawing."""
 
     title: str
     blocks: Sequence[AssembledBlock]
@@ -104,62 +97,41 @@ def _rings(blocks: Sequence[AssembledBlock]) -> str:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A block in a drawing; lengths are in mm, and y points down.
-
-    Attributes
-    ----------
-    path : str
-        Its outline.
-    arrow : tuple of 4 floats, or None
-        Start and end of the arrow of its magnetization.
-    width : float
-        Width of the arrow.
-    label : str
-        Number of its slot, and serial number.
-    x, y, turn_deg, anchor
-        Place and direction of the label, and which of its ends is there.
-    size : float
-        Height of its letters.
-    """
+    """A block in a drawing; lengths are in mm, and y points down."""
 
     path: str
+    """Its outline."""
     arrow: tuple[float, float, float, float] | None
+    """Start and end of the arrow of its magnetization."""
     width: float
+    """Width of the arrow."""
     label: str
+    """Number of its slot, and serial number."""
     x: float
     y: float
     turn_deg: float
     anchor: str
+    """Place and direction of the label, and which of its ends is there."""
     size: float
+    """Height of its letters."""
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A sheet as the template draws it, in mm.
-
-    Attributes
-    ----------
-    title : str
-    blocks : list of Drawn
-    plate : str
-        Path of the plate and its openings.
-    engraved : str
-        Path of the bars of the engraved number.
-    number : int or None
-        Number of the plate; None without one.
-    reach : float
-        Half the size of the drawing.
-    tables : list of list of dict
-        Rows of text for the tables side by side.
-    """
+    """A sheet as the template draws it, in mm."""
 
     title: str
     blocks: list[Drawn]
     plate: str
+    """Path of the plate and its openings."""
     engraved: str
+    """Path of the bars of the engraved number."""
     number: int | None
+    """Number of the plate; None without one."""
     reach: float
+    """Half the size of the drawing."""
     tables: list[Rows]
+    """Rows of text for the tables side by side."""
 
 
 def drawing(

@@ -140,67 +140,44 @@ IDENTITY = "magnet-view"
 
 @dataclass(frozen=True)
 class Colours:
-    """Numbers that are shown as the colours of the blocks.
-
-    Attributes
-    ----------
-    values : ndarray, shape (blocks,)
-        The number of each block.
-    title : str
-        Title of the colour scale.
-    words : sequence of str
-        Text that appears when the pointer is over a block, one for each block.
-    limits : tuple of float, or None
-        Ends of an unsigned colour scale. If None, the scale is signed and symmetric about 0.
-    """
+    """Numbers that are shown as the colours of the blocks."""
 
     values: Floats
+    """The number of each block. Shape (blocks,)."""
     title: str
+    """Title of the colour scale."""
     words: Sequence[str]
+    """Text that appears when the pointer is over a block, one for each block."""
     limits: tuple[float, float] | None = None
+    """Ends of an unsigned colour scale. If None, the scale is signed and symmetric about 0."""
 
 
 @dataclass(frozen=True)
 class BlockValues:
-    """Values of the blocks that a view shows.
-
-    Attributes
-    ----------
-    magnetization : ndarray, shape (blocks, D), in A/m
-        Magnetization vectors, drawn as arrows.
-    colours : Colours or None
-        Colours of the blocks. If None, all blocks are grey (before a measurement).
-    """
+    """Values of the blocks that a view shows."""
 
     magnetization: Floats
+    """Magnetization vectors, drawn as arrows. Shape (blocks, D), in A/m."""
     colours: Colours | None = None
+    """Colours of the blocks. If None, all blocks are grey (before a measurement)."""
 
 
 @dataclass(frozen=True)
 class ViewPoints:
-    """Points of a field map, coloured by the magnitude of a value at each point.
-
-    Attributes
-    ----------
-    positions : ndarray, shape (n, 3), in m
-    values : ndarray, shape (n,)
-        May be signed; the colour shows the magnitude.
-    name : str
-        Name of the points in the legend.
-    title : str
-        Title of the colour scale.
-    words : str
-        Text that appears when the pointer is over a point; %{customdata} stands for its value.
-    limits : tuple of float, or None
-        Ends of the colour scale, which are magnitudes; by default those of the values.
-    """
+    """Points of a field map, coloured by the magnitude of a value at each point."""
 
     positions: Floats
+    """Shape (n, 3), in m."""
     values: Floats
+    """May be signed; the colour shows the magnitude. Shape (n,)."""
     name: str
+    """Name of the points in the legend."""
     title: str
+    """Title of the colour scale."""
     words: str
+    """Text that appears when the pointer is over a point; %{customdata} stands for its value."""
     limits: tuple[float, float] | None = None
+    """Ends of the colour scale, which are magnitudes; by default those of the values."""
 
 
 def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:

@@ -50,23 +50,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Variations:
-    """The variations inside the blocks of a magnet, as polarizations of cells.
-
-    Attributes
-    ----------
-    interaction : Interaction
-    starts : ndarray of int, shape (blocks + 1,)
-        Number of the first cell of every block.
-    polarization : tuple of ndarray, shape (cells of a block, q, 3, modes), in T
-        For every block the polarization of the parts of its cells per amplitude.
-    names : tuple of str
-        Names of all amplitudes, block by block, such as ``r01s05.v03``.
-    """
+    """The variations inside the blocks of a magnet, as polarizations of cells."""
 
     interaction: Interaction
     starts: Ints
+    """Number of the first cell of every block. Shape (blocks + 1,)."""
     polarization: tuple[Floats, ...]
+    """For every block the polarization of the parts of its cells per amplitude.
+    Shape (cells of a block, q, 3, modes), in T."""
     names: tuple[str, ...]
+    """Names of all amplitudes, block by block, such as ``r01s05.v03``."""
 
     @classmethod
     def of(cls, magnet: Magnet) -> Variations | None:
@@ -393,13 +386,7 @@ Field = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class Deviations:
-    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    variations : Variations or None
-    """
+    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks."""
 
     magnet: Magnet
     variations: Variations | None

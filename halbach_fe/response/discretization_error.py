@@ -195,25 +195,17 @@ FLATTEST, STEEPEST = 0.5, 4.0
 
 @dataclass(frozen=True)
 class Difference:
-    """Largest differences between two solves, relative to the largest field.
-
-    Attributes
-    ----------
-    what : str
-        Description of the two solves that are compared.
-    pointwise : float
-        Largest |difference of B| at any point.
-    fourier : float or None
-        Largest difference of the Fourier coefficients of B_r; None if the study's positions are not
-        circles.
-    by_region : dict of str to float
-        Largest |difference of B| at any point of each noise region.
-    """
+    """Largest differences between two solves, relative to the largest field."""
 
     what: str
+    """Description of the two solves that are compared."""
     pointwise: float
+    """Largest |difference of B| at any point."""
     fourier: float | None
+    """Largest difference of the Fourier coefficients of B_r; None if the study's positions are not
+    circles."""
     by_region: dict[str, float]
+    """Largest |difference of B| at any point of each noise region."""
 
 
 @dataclass(frozen=True)

@@ -65,30 +65,20 @@ wrong sign or Gauss point makes a difference of 1e-4 T."""
 
 @dataclass(frozen=True)
 class NonlinearModel:
-    """The map from magnetizations p in A/m to readings in T; call an instance to evaluate it.
-
-    Attributes
-    ----------
-    condensed : Condensed
-        The problem condensed to the unknowns in the iron.
-    offset : ndarray, shape (readings,), in T
-        Readings of external fields.
-    parameters : tuple of str
-        Names of the parameters, as in `halbach_fe.response.matrix.Response`.
-    nominal : ndarray, shape (parameters,), in A/m
-        The study's nominal magnetization.
-    error : ndarray, shape (readings,), in T
-        Error bar of the finite elements, for the nominal array.
-    agreement_T : float
-        Largest difference from GetDP's Newton method in any reading of the verified samples.
-    """
+    """The map from magnetizations p in A/m to readings in T; call an instance to evaluate it."""
 
     condensed: Condensed
+    """The problem condensed to the unknowns in the iron."""
     offset: Floats
+    """Readings of external fields. Shape (readings,), in T."""
     parameters: tuple[str, ...]
+    """Names of the parameters, as in `halbach_fe.response.matrix.Response`."""
     nominal: Floats
+    """The study's nominal magnetization. Shape (parameters,), in A/m."""
     error: Floats
+    """Error bar of the finite elements, for the nominal array. Shape (readings,), in T."""
     agreement_T: float
+    """Largest difference from GetDP's Newton method in any reading of the verified samples."""
 
     def __call__(self, magnetizations: Floats, tolerance_T: float = 1e-9) -> Floats:
         """Return the readings (..., readings) in T of magnetizations (..., parameters) in A/m.
@@ -315,21 +305,14 @@ MAX_NEWTON_STEPS = 60
 
 @dataclass(frozen=True)
 class Statistics:
-    """Convergence of a solve.
-
-    Attributes
-    ----------
-    iterations : int
-        Accelerated iterations.
-    newton_steps : int
-        Newton steps after them, 0 if the accelerated iteration converged.
-    residuals : tuple of float
-        Residual of every iterate, relative to the sources.
-    """
+    """Convergence of a solve."""
 
     iterations: int
+    """Accelerated iterations."""
     newton_steps: int
+    """Newton steps after them, 0 if the accelerated iteration converged."""
     residuals: tuple[float, ...]
+    """Residual of every iterate, relative to the sources."""
 
 
 @dataclass(frozen=True)
@@ -338,38 +321,28 @@ class Condensed:
 
     The letters are those of the equations at the top of this module. The unknowns are nodal values
     of the potential in T m, or circulations along edges in T m^2.
-
-    Attributes
-    ----------
-    law : ConstitutiveLaw
-        The iron's law c(|F|^2).
-    gradient : sparse array, shape (d m, unknowns)
-        G. The field in T at m Gauss points in d dimensions, component after component.
-    weights : ndarray, shape (m,), in m^d
-        w.
-    stiffness : sparse array, shape (unknowns, unknowns)
-        S, with the iron replaced by vacuum.
-    potential : ndarray, shape (unknowns, parameters)
-        U, the potential without the iron per A/m.
-    linear : ndarray, shape (readings, parameters), in T m/A
-        Q0, the readings without the iron.
-    surface : ndarray, shape (s,)
-        The unknowns on which the readings depend.
-    readings : ndarray, shape (readings, s)
-        The columns of Q for ``surface``; all others are zero. Q d is in T.
-    reference : ndarray, shape (parameters,), in A/m
-        Magnetization about which the model is linearized, usually the nominal one.
     """
 
     law: ConstitutiveLaw
+    """The iron's law c(|F|^2)."""
     gradient: sparse.csr_array
+    """G. The field in T at m Gauss points in d dimensions, component after component.
+    Shape (d m, unknowns)."""
     weights: Floats
+    """w. Shape (m,), in m^d."""
     stiffness: sparse.csr_array
+    """S, with the iron replaced by vacuum. Shape (unknowns, unknowns)."""
     potential: Floats
+    """U, the potential without the iron per A/m. Shape (unknowns, parameters)."""
     linear: Floats
+    """Q0, the readings without the iron. Shape (readings, parameters), in T m/A."""
     surface: Ints
+    """The unknowns on which the readings depend. Shape (s,)."""
     readings: Floats
+    """The columns of Q for ``surface``; all others are zero. Q d is in T. Shape (readings, s)."""
     reference: Floats
+    """Magnetization about which the model is linearized, usually the nominal one.
+    Shape (parameters,), in A/m."""
     _state: _Reference = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -593,21 +566,14 @@ class Condensed:
 
 @dataclass(frozen=True)
 class _Reference:
-    """The solution at the reference magnetization.
-
-    Attributes
-    ----------
-    added : ndarray, shape (unknowns,)
-        d, the contribution of the iron.
-    tangent : SuperLU
-        The factorized tangent.
-    slope : ndarray, shape (unknowns, parameters)
-        dd/dp.
-    """
+    """The solution at the reference magnetization."""
 
     added: Floats
+    """d, the contribution of the iron. Shape (unknowns,)."""
     tangent: sparse_linalg.SuperLU
+    """The factorized tangent."""
     slope: Floats
+    """dd/dp. Shape (unknowns, parameters)."""
 
 
 def condense(

@@ -134,52 +134,35 @@ def mode_decay(magnet: Magnet, points: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Ring:
-    """Data of one ring for the template case_modes.pro.j2, which describes them.
-
-    Attributes
-    ----------
-    recoil_permeability : float
-    half_angle : float, in rad
-        Half the angle of a block.
-    rank : int
-        Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings,
-        and in runs for the nominal array.
-    along, across, axial : list of float, in T
-        Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
-        part in mode 0, then in mode 1, and so on (see `nominal_waves`); `NO_WAVES` in runs for
-        single blocks.
-    """
+    """Data of one ring for the template case_modes.pro.j2, which describes them."""
 
     recoil_permeability: float
     half_angle: float
+    """Half the angle of a block. In rad."""
     rank: int
+    """Number, from 1, among the rings whose blocks are sources of their own; 0 for other rings, and
+    in runs for the nominal array."""
     along: list[float]
     across: list[float]
     axial: list[float]
+    """Nominal remanence along the blocks' middles, across them and along z: its cosine and sine
+    part in mode 0, then in mode 1, and so on (see `nominal_waves`); `NO_WAVES` in runs for single
+    blocks. In T."""
 
 
 @dataclass(frozen=True)
 class ModesCase:
-    """The data that all runs for a magnet share.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    mesh : VerifiedMesh or CountedMesh
-        Mesh of the (r, z) half-plane.
-    weights : ndarray, shape (modes, 2, rings, 3), in T
-        Remanence of the nominal array, see `nominal_waves`.
-    solved : tuple of int
-        Numbers, from 0, of the rings that hold the blocks to solve for.
-    meridian : ndarray, shape (m, 3), in m
-        Points (r, z, 0) of the half-plane at which fields are evaluated.
-    """
+    """The data that all runs for a magnet share."""
 
     magnet: Magnet
     mesh: VerifiedMesh | CountedMesh
+    """Mesh of the (r, z) half-plane."""
     weights: Floats
+    """Remanence of the nominal array, see `nominal_waves`. Shape (modes, 2, rings, 3), in T."""
     solved: tuple[int, ...]
+    """Numbers, from 0, of the rings that hold the blocks to solve for."""
     meridian: Floats
+    """Points (r, z, 0) of the half-plane at which fields are evaluated. Shape (m, 3), in m."""
 
     @property
     def real_mesh(self) -> VerifiedMesh:

@@ -28,25 +28,19 @@ _IMAGINARY = "imaginary parts, which a static field has not"
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The unknowns of a system by mesh entity.
-
-    Attributes
-    ----------
-    count : int
-        Number of unknowns.
-    functions : tuple of ndarray of int
-        For each kind of basis function, in the order of the problem file: index of the unknown by
-        entity number, or -1 if the entity has no unknown (its value is fixed, or no entity has this
-        number). Nodes are numbered from 1 in the order of the mesh, edges and faces by GetDP.
-    edges, faces : ndarray of int, shape (elements, k)
-        Numbers of the k edges or faces of every element, in the mesh's order of elements; the sign
-        of an edge gives its direction. Without rows if the problem does not use edges or faces.
-    """
+    """The unknowns of a system by mesh entity."""
 
     count: int
+    """Number of unknowns."""
     functions: tuple[Ints, ...]
+    """For each kind of basis function, in the order of the problem file: index of the unknown by
+    entity number, or -1 if the entity has no unknown (its value is fixed, or no entity has this
+    number). Nodes are numbered from 1 in the order of the mesh, edges and faces by GetDP."""
     edges: Ints
     faces: Ints
+    """Numbers of the k edges or faces of every element, in the mesh's order of elements; the sign
+    of an edge gives its direction. Without rows if the problem does not use edges or faces.
+    Shape (elements, k)."""
 
 
 # Number of edges and of faces of an element, by meshio's name of its type.

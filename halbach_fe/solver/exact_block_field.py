@@ -210,22 +210,16 @@ def _upright(outline: Outline, angle_deg: float) -> tuple[object, ...]:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Blocks of the same shape, and what of their fields does not depend on the points.
-
-    Attributes
-    ----------
-    first : MagnetBlock
-    positions, axes : ndarray, shapes (blocks, 3) in m and (blocks, 3, 3)
-        Of frames, with the axes as columns, in which the outlines of all blocks are that of the
-        first one.
-    sums : ndarray, shape (blocks, 6, 3), in T
-        From the field matrices in such a frame to the field of the nominal remanence.
-    """
+    """Blocks of the same shape, and what of their fields does not depend on the points."""
 
     first: MagnetBlock
     positions: Floats
     axes: Floats
+    """Of frames, with the axes as columns, in which the outlines of all blocks are that of the
+    first one. Shapes (blocks, 3) in m and (blocks, 3, 3)."""
     sums: Floats
+    """From the field matrices in such a frame to the field of the nominal remanence.
+    Shape (blocks, 6, 3), in T."""
 
     @classmethod
     def of(cls, blocks: Sequence[MagnetBlock]) -> _Alike:

@@ -61,20 +61,14 @@ class Located:
     A point on a face belongs to both neighbouring elements. Derivatives of a solution jump there,
     and the mean over the elements that hold the point is taken. A point therefore has one or
     several instances (m >= n).
-
-    Attributes
-    ----------
-    cells : ndarray of int, shape (m,)
-        Index of the element that holds an instance, in the mesh's order.
-    reference : ndarray, shape (m, d)
-        Reference coordinates of an instance in its element.
-    mean : sparse array, shape (n, m)
-        Operator from values at the m instances to their means at the n points.
     """
 
     cells: Ints
+    """Index of the element that holds an instance, in the mesh's order. Shape (m,)."""
     reference: Floats
+    """Reference coordinates of an instance in its element. Shape (m, d)."""
     mean: sparse.csr_array
+    """Operator from values at the m instances to their means at the n points. Shape (n, m)."""
 
 
 def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Located:

@@ -79,33 +79,23 @@ numbering of the unknowns makes 0.5 or more."""
 
 @dataclass(frozen=True)
 class Problem:
-    """The discrete problem of the iron.
-
-    Attributes
-    ----------
-    bodies : tuple of IronSolid
-    stiffness_of_vacuum : sparse array, shape (n, n)
-    nodes : ndarray of int, shape (e, 10)
-        Unknowns of the iron's elements.
-    slopes : ndarray, shape (e, 15, 10, 3), in 1/m
-        Gradients of the functions of the nodes at the Gauss points.
-    weights : ndarray, shape (e, 15), in m^3
-    places : ndarray, shape (e, 10, 3), in m
-        Places of the nodes.
-    body : ndarray of int, shape (e,)
-        Body of each element.
-    coarse : sparse array, shape (n, corners)
-        Values at all nodes of those at the corners, linear in between.
-    """
+    """The discrete problem of the iron."""
 
     bodies: tuple[IronSolid, ...]
     stiffness_of_vacuum: sparse.csr_array
+    """Shape (n, n)."""
     nodes: Ints
+    """Unknowns of the iron's elements. Shape (e, 10)."""
     slopes: Floats
+    """Gradients of the functions of the nodes at the Gauss points. Shape (e, 15, 10, 3), in 1/m."""
     weights: Floats
+    """Shape (e, 15), in m^3."""
     places: Floats
+    """Places of the nodes. Shape (e, 10, 3), in m."""
     body: Ints
+    """Body of each element. Shape (e,)."""
     coarse: sparse.csr_array
+    """Values at all nodes of those at the corners, linear in between. Shape (n, corners)."""
 
     @cached_property
     def points(self) -> Floats:
@@ -256,26 +246,17 @@ class Tangent:
 
 @dataclass(frozen=True)
 class BodiesReaction(WithBar):
-    """The field that iron adds to that of its sources; `solve_bodies` returns it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the study.
-    problem : Problem
-    total : ndarray, shape (n, 1), in T m
-        The total potential in the iron.
-    residuals : tuple of float
-        Relative residual of Newton's method at the start and after every step.
-    coarse : BodiesReaction or None
-        The solution with larger elements, for the error bar.
-    """
+    """The field that iron adds to that of its sources; `solve_bodies` returns it."""
 
     name: str
+    """Name of the study."""
     problem: Problem
     total: Floats
+    """The total potential in the iron. Shape (n, 1), in T m."""
     residuals: tuple[float, ...]
+    """Relative residual of Newton's method at the start and after every step."""
     coarse: BodiesReaction | None
+    """The solution with larger elements, for the error bar."""
 
     @cached_property
     def polarization(self) -> Floats:

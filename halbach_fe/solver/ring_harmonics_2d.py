@@ -21,19 +21,13 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class SectorMagnetization:
-    """A uniformly magnetized sector.
-
-    Attributes
-    ----------
-    middle, half_width : float
-        Azimuth of the sector's middle, and half of its opening angle, in rad.
-    remanence : complex
-        ``B_rx + i B_ry`` in T.
-    """
+    """A uniformly magnetized sector."""
 
     middle: float
     half_width: float
+    """Azimuth of the sector's middle, and half of its opening angle, in rad."""
     remanence: complex
+    """``B_rx + i B_ry`` in T."""
 
 
 def ideal_sectors(

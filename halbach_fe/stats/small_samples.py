@@ -259,19 +259,12 @@ def uniformity(found: Ints, draws: int) -> tuple[Floats, float]:
 
 @dataclass(frozen=True)
 class Bin:
-    """Statements whose probabilities are similar.
-
-    Attributes
-    ----------
-    stated : float
-        Mean of the stated probabilities.
-    happened : float
-        Fraction of the statements that were true.
-    statements : int
-    """
+    """Statements whose probabilities are similar."""
 
     stated: float
+    """Mean of the stated probabilities."""
     happened: float
+    """Fraction of the statements that were true."""
     statements: int
 
 

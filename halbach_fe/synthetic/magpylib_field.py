@@ -132,24 +132,16 @@ def no_progress(done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class _Task:
-    """A field to compute, and the bodies that use it.
-
-    Attributes
-    ----------
-    piece : Piece
-    polarizations : ndarray, shape (k, 3), in T
-        Polarizations of the piece for which the field is computed.
-    points : ndarray, shape (n, 3), in m
-        Points in the piece's own axes.
-    users : tuple
-        For each body that uses the field: its number, the index of its points among ``points``,
-        and its weights (k,) of the polarizations; None stands for a weight of 1.
-    """
+    """A field to compute, and the bodies that use it."""
 
     piece: Piece
     polarizations: Floats
+    """Polarizations of the piece for which the field is computed. Shape (k, 3), in T."""
     points: Floats
+    """Points in the piece's own axes. Shape (n, 3), in m."""
     users: tuple[tuple[int, Any, Floats | None], ...]
+    """For each body that uses the field: its number, the index of its points among ``points``, and
+    its weights (k,) of the polarizations; None stands for a weight of 1."""
 
 
 def vacuum_field(

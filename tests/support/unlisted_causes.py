@@ -49,30 +49,20 @@ FieldAt = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class UnlistedCause:
-    """What was drawn, in words and numbers.
-
-    Attributes
-    ----------
-    acts_on : str
-        ``positions``, ``readings`` or ``source``.
-    varies_along : str
-        The coordinate of the random function, or which source it is.
-    texture : str
-        ``smooth`` or ``rough``; fields of sources are smooth.
-    axes : tuple of int
-        Components of the position, or sensors, that are off.
-    rms_T : float
-        Rms change of the readings without noise that it causes, over all components.
-    rms_over_noise : float
-        The same for the whitened readings.
-    """
+    """What was drawn, in words and numbers."""
 
     acts_on: str
+    """``positions``, ``readings`` or ``source``."""
     varies_along: str
+    """The coordinate of the random function, or which source it is."""
     texture: str
+    """``smooth`` or ``rough``; fields of sources are smooth."""
     axes: tuple[int, ...]
+    """Components of the position, or sensors, that are off."""
     rms_T: float
+    """Rms change of the readings without noise that it causes, over all components."""
     rms_over_noise: float
+    """The same for the whitened readings."""
 
     @property
     def family(self) -> str:

@@ -91,22 +91,15 @@ QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
 
 @dataclass(frozen=True)
 class DeclaredBlocks(DeclaredFormat):
-    """Statements of the user about a table of blocks.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
-        magnet) along which each component of the strength lies, as ``-y``.
-    along_block : bool
-        Whether components of the strength of free blocks lie along the block's own axes.
-    fixed : mapping of str to str
-        Value and unit of quantities for which the table has no column, such as ``12 cm^3``.
-    """
+    """Statements of the user about a table of blocks."""
 
     axes: tuple[str, str, str] = ("x", "y", "z")
+    """Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
+    magnet) along which each component of the strength lies, as ``-y``."""
     along_block: bool = False
+    """Whether components of the strength of free blocks lie along the block's own axes."""
     fixed: Mapping[str, str] = field(default_factory=dict)
+    """Value and unit of quantities for which the table has no column, such as ``12 cm^3``."""
     unused: ClassVar[tuple[str, ...]] = ("component", "at", "origin_m", "positions")
 
     def _wrong(self) -> dict[str, str]:
