@@ -41,7 +41,6 @@ def solid(name: str, body: Prism, openings: Sequence[Prism] = ()) -> tuple[str, 
     ----------
     name : str
         What it is, for error messages.
-    body : Prism
     openings : sequence of Prism
         They may reach beyond the body, and overlap.
 

@@ -252,8 +252,6 @@ def demagnetization_map(
 
     Parameters
     ----------
-    magnet : Magnet
-    session : Session
     across : int
         Number of cells across the radial thickness of a block. In the other directions the cells
         have about the same length, but are no fewer: through a thin block H varies most.

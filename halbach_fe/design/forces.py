@@ -571,7 +571,6 @@ def iron_loads(magnet: Magnet, charges: Sequence[tuple[Floats, Floats]],
 
     Parameters
     ----------
-    magnet : Magnet
     charges : sequence of two pairs
         Points (n, 3) in m on the faces of the blocks, and their magnetic charges (n,) in A m: of a
         good quadrature, and of a coarser one for the error bar.

@@ -42,7 +42,6 @@ def digits(
 
     Parameters
     ----------
-    text : str
     height : float, in m
     radius, angle : float, in m and rad
         Its middle.
@@ -151,7 +150,6 @@ def plates(
     ----------
     groups : sequence of sequence of HeldBlock
         From below.
-    holder : Holder
     iron : sequence of IronSolid
         Bodies that plates have to leave room for.
     asked : str or None

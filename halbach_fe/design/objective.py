@@ -133,7 +133,6 @@ def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> Dev
 
     Parameters
     ----------
-    model : HomogeneityModel
     about : ndarray, shape (parameters,), in A/m, optional
         Magnetizations of that magnet; by default the nominal ones.
     """
@@ -219,10 +218,8 @@ def objective_of(
 
     Parameters
     ----------
-    magnet : Magnet
     reference : MultipoleReference or None
         Radius, orders and z of multipoles, if the study asks for multipoles.
-    session : Session
     about : ndarray, shape (parameters,), in A/m, optional
         Magnetizations about which |B| is linearized; by default the nominal ones.
 

@@ -205,7 +205,6 @@ def remounted(
 
     Parameters
     ----------
-    magnet : Magnet
     moved : iterable of (int, int, ndarray)
         For each moved block, its new and its old slot (counted from 0, ring by ring), and the
         matrix (3, 3) that maps its magnetization in the old slot to that in the new slot, along

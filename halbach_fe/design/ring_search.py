@@ -220,8 +220,6 @@ def moved_radii(
 
     Parameters
     ----------
-    catalogue : Catalogue
-    rings : tuple of Option
     reaction : ndarray, shape (k,), in T
         Field of permeable blocks, which stays as it is.
     task : Task

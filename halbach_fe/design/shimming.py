@@ -426,8 +426,6 @@ def check_stock(
 
     Parameters
     ----------
-    magnet : Magnet
-    stock : BlockTable
     mounted : collection of str, optional
         Serial numbers of the blocks in the magnet, if they are known.
 

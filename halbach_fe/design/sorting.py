@@ -158,12 +158,10 @@ def sort_blocks(
 
     Parameters
     ----------
-    magnet : Magnet
     table : BlockTable
         The measured blocks.
     model : MultipoleModel or DeviationModel
         What to make small.
-    generator : numpy.random.Generator
     progress : callable, optional
         Is called with the number of starts done and their total number.
     turns : bool

@@ -148,7 +148,6 @@ def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
 
     Parameters
     ----------
-    magnet : Magnet
     nominal : ndarray, shape (parameters,), in A/m
         Nominal magnetizations, and 0 for variations inside blocks.
     """
@@ -174,7 +173,6 @@ def predict_tolerance(
         Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
         Number of samples.
-    generator : numpy.random.Generator
     limit : float, optional
         Limit of every |c_n|, in units of 1e-4.
     """
@@ -203,7 +201,6 @@ def predict_homogeneity(
         Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
         Number of samples.
-    generator : numpy.random.Generator
     limit : float, optional
         Limit of the rms deviation in ppm.
     """

@@ -34,7 +34,6 @@ def detection_limits(
     ----------
     update : InferenceResult
         The inference with the identified effects in the model.
-    campaign : Campaign
     columns : ndarray, shape (rows, k)
         Whitened signatures of the identified effects per prior standard deviation, whose amplitudes
         are free.
@@ -81,7 +80,6 @@ def smallest_amplitude(information: Floats, threshold: float) -> float:
     information : ndarray, shape (k, k)
         Of its signatures, per prior standard deviation of their amplitudes. The amplitudes are in
         the direction in which they are least visible.
-    threshold : float
 
     Returns
     -------

@@ -155,7 +155,6 @@ def diagnose(
 
     Parameters
     ----------
-    study : Study
     data : Dataset or dict of str to Dataset
         The map, as `halbach_fe.measurement.field_map.read_map` returns it; or all maps that the
         study lists, see `halbach_fe.measurement.campaign.read_maps`.
@@ -569,7 +568,6 @@ def with_first_rivals(
 
     Parameters
     ----------
-    found : sequence of IdentifiedEffect
     identified : sequence of IdentifiedEffect
         The effects in the model.
     rivals : dict

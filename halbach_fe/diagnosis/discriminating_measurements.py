@@ -157,10 +157,8 @@ def separations(
 
     Parameters
     ----------
-    diagnosis : Diagnosis
     data : Dataset or dict of str to Dataset
         The maps that were diagnosed.
-    session : Session
     effects : sequence of Effect, optional
         The effects among which the diagnosis chose; default the whole catalogue.
     """

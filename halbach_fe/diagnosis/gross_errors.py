@@ -149,7 +149,6 @@ def find_gross_errors(
 
     Parameters
     ----------
-    study : Study
     data : Dataset
         The map, as `halbach_fe.measurement.field_map.read_map` returns it.
     blocks : BlockTable, optional

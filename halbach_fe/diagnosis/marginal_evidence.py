@@ -318,7 +318,6 @@ def residual_groups(
 
     Parameters
     ----------
-    marginal : Marginal
     residual : ndarray, shape (n,)
         Whitened residual of the readings.
     memberships : dict

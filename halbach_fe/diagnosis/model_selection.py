@@ -259,8 +259,6 @@ def select_effects(
 
     Parameters
     ----------
-    evidence : Evidence
-    candidates : sequence of Candidate
     excluded : collection of int
         Numbers of candidates that cannot be selected, because their amplitudes are impossible.
     """
@@ -459,10 +457,8 @@ def most_likely(
 
     Parameters
     ----------
-    candidates : sequence of Candidate
     columns : sequence of ndarray, shape (rows, k)
         Whitened signatures of every candidate.
-    marginal : Marginal
     residual : ndarray, shape (rows,)
         Whitened residual to which the signatures are fitted.
     in_model : collection of int

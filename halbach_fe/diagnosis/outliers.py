@@ -129,7 +129,6 @@ def leave_one_out(
         H L, the covariance factor of the readings that the blocks cause.
     residual : ndarray, shape (n,), in T
         Readings less the prior prediction of the model.
-    noise : NoiseCovariance
     used : ndarray of bool, shape (n,)
         Readings from which the prediction is made.
     """

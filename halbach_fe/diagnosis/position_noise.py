@@ -56,8 +56,6 @@ def estimate_position_noise(
 
     Parameters
     ----------
-    update : InferenceResult
-    campaign : Campaign
     marginal : Marginal
         The training readings with the blocks integrated out.
     columns : ndarray, shape (n, k)
@@ -98,8 +96,6 @@ def _of_map(
 
     Parameters
     ----------
-    update : InferenceResult
-    scanned : ScannedMap
     points : ndarray, shape (n, 3), in m
         The map's points in the magnet.
     own : ndarray of int, shape (rows,)

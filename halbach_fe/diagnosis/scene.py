@@ -192,7 +192,6 @@ class Campaign:
 
         Parameters
         ----------
-        study : Study
         field : callable, optional
             Field of the nominal magnet of a study, see `FieldAt`, for effects that need it solved.
         iron : callable, optional

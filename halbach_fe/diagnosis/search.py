@@ -258,8 +258,6 @@ def score_hypotheses(
 
     Parameters
     ----------
-    point : Linearization
-    effects : sequence of Effect
     progress : callable, optional
         Called with the numbers of finished and of all hypotheses.
     is_over : callable, optional
@@ -281,15 +279,12 @@ def _improved_place(
 
     Parameters
     ----------
-    effect : Effect
-    places : sequence of Place
     columns : sequence of ndarray, shape (rows, k)
         Whitened signatures at these places per prior standard deviation.
     derivative : callable
         Takes a place and all amplitudes; returns whitened derivatives (rows, k + r).
     fixed : ndarray, shape (rows, f)
         Whitened signatures of effects in the model, whose amplitudes are free.
-    marginal : Marginal
     residual : ndarray, shape (rows,)
 
     Returns
@@ -345,7 +340,6 @@ def identify_effects(
     ----------
     corrected : Study
         The study corrected for gross errors and outliers.
-    search : Search
     """
     excluded = set(search.excluded)
     while True:

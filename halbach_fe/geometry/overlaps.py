@@ -74,7 +74,6 @@ def block_in_iron(
     ----------
     blocks, tolerance
         See `overlapping_blocks`.
-    iron : sequence of IronSolid
 
     Returns
     -------

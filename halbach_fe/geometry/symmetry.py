@@ -316,7 +316,6 @@ def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
 
     Parameters
     ----------
-    magnet : Magnet
     kind : str
         ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise than
         their places, also the blocks without their holder) or ``upside down``.

@@ -356,8 +356,6 @@ def as_mounted(
 
     Parameters
     ----------
-    magnet : Magnet
-    table : BlockTable
     places : ndarray of int, shape (rows,)
         New slot of each block, counted from 0, ring by ring.
     turned : ndarray, shape (rows, 3, 3), optional

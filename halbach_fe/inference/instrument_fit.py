@@ -208,8 +208,6 @@ def amplitude_columns(
         With the instruments as they are estimated.
     field : callable
         See `OpenTerms.columns`.
-    maps : sequence of Map
-    readings : Readings
     """
     # Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
     # laws are linear to 1e-6 over it.

@@ -59,7 +59,6 @@ def poses_along(
 
     Parameters
     ----------
-    magnet : Magnet
     points, readings : ndarray, shape (n, 3)
         In m and T; the middle of the points is at the origin.
     training : ndarray of bool, shape (n, 3)
@@ -68,7 +67,6 @@ def poses_along(
         Of the line, in the map's coordinates.
     across_m : float
         Prior standard deviation of the line's distance from the axis along x and y.
-    pace : Pace
     """
     most_starts = 12  # largest number of candidates that are improved
     rows = np.flatnonzero(training.any(axis=1))

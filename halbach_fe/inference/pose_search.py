@@ -71,7 +71,6 @@ def coarse_poses(
 
     Parameters
     ----------
-    magnet : Magnet
     points, readings : ndarray, shape (n, 3)
         In m and T; NaN for components that were not measured.
     training : ndarray of bool, shape (n, 3)

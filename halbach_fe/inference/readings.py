@@ -138,8 +138,6 @@ def read_campaign(
 
     Parameters
     ----------
-    magnet : Magnet
-    maps : sequence of Map
     known : dict, optional
         Noise of the same maps with little other poses, which is not computed again; what is
         computed is added.

@@ -34,7 +34,6 @@ def check_same_magnet(
 
     Parameters
     ----------
-    magnet : Magnet
     study : Study
         The study of the results.
     nominal : ndarray, shape (parameters,), in A/m

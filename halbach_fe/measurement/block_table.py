@@ -260,7 +260,6 @@ def read_order(path: str | Path, blocks: Sequence[str]) -> tuple[str, ...]:
 
     Parameters
     ----------
-    path : str or Path
     blocks : sequence of str
         Names of all blocks, each of which the table has to name once.
 

@@ -143,7 +143,6 @@ def maps_of(
 
     Parameters
     ----------
-    study : Study
     data : Dataset or dict of str to Dataset
         The only map of a study that lists none, or the maps that it lists, by name.
     validation_map : Dataset, optional

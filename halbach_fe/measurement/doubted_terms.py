@@ -231,7 +231,6 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
 
     Parameters
     ----------
-    magnet : Magnet
     mean, prior_mean, prior_sd : ndarray, shape (m,), in A/m
         Parameters of the magnet, of which the first are the magnetizations of its blocks.
 
@@ -264,10 +263,8 @@ def held_back(magnet: Magnet, mean: Floats, sd: Floats, prior: Gaussian) -> tupl
 
     Parameters
     ----------
-    magnet : Magnet
     mean, sd : ndarray, shape (m,), in A/m
         After the update, of all parameters, of which the first are the magnetizations of blocks.
-    prior : Gaussian
 
     Returns
     -------
@@ -296,7 +293,6 @@ def shared_doubts(magnet: Magnet, mean: Floats, prior: Gaussian, model_error: fl
 
     Parameters
     ----------
-    magnet : Magnet
     mean : ndarray, shape (m,), in A/m
         Parameters of the magnet, of which the first are the magnetizations of its blocks.
     prior : Gaussian

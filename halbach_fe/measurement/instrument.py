@@ -178,7 +178,6 @@ def nonlinear_part(instrument: Instrument, fields: Floats, time: Floats) -> Floa
 
     Parameters
     ----------
-    instrument : Instrument
     fields : ndarray, shape (n, 3), in T
         B in the sensors' own axes.
     time : ndarray, shape (n,)

@@ -201,7 +201,6 @@ def observe_total(
 
     Parameters
     ----------
-    study : Study
     points : ndarray, shape (n, 3), in m
         Positions as the map states them.
     measured : ndarray of bool, shape (n,)
@@ -245,7 +244,6 @@ def observe(
 
     Parameters
     ----------
-    study : Study
     points : ndarray, shape (n, 3), in m
         Positions as the map states them.
     measured : ndarray of bool, shape (n, 3)
@@ -365,7 +363,6 @@ def fourier_analysis(
     Parameters
     ----------
     points : ndarray, shape (n, 3), in m
-    settings : FourierCoefficients
 
     Returns
     -------

@@ -335,7 +335,6 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
 
     Parameters
     ----------
-    update : InferenceResult
     loo_residuals : ndarray, shape (n,)
         Standardized leave-one-out residuals of the training readings.
 

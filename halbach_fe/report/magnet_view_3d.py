@@ -467,7 +467,6 @@ def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
 
     Parameters
     ----------
-    block : MagnetBlock
     height : float
         Drawn height in m of a block of infinite length.
 

@@ -119,7 +119,6 @@ def discretization_changes(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     parts : ElementFields
         The finite-element part of the field at the points.

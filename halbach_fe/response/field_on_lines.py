@@ -271,11 +271,8 @@ def field_on_lines(
 
     Parameters
     ----------
-    magnet : Magnet
-    lines : Lines
     magnetizations : Gaussian
         Of all parameters of the response matrix.
-    session : Session
     inside : bool
         Whether points may lie inside blocks and iron; see `_through_blocks` for what magnets.
 
@@ -371,8 +368,6 @@ class _Beside:
 
         Parameters
         ----------
-        magnet : Magnet
-        lines : Lines
         flux : ndarray, shape (offsets * m, count, 3, 1 + q), in T
             Mean and root of B at `points`.
         error : ndarray, shape (lines, count, 3), in T

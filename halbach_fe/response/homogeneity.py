@@ -562,7 +562,6 @@ def extremes(
 
     Parameters
     ----------
-    region : Region
     points : ndarray, shape (n, 3), in m
     steps : ndarray, shape (n, 3)
         Distance of each point from those next to it, relative to the half axes.

@@ -160,9 +160,6 @@ def response_matrix(
 
     Parameters
     ----------
-    magnet : Magnet
-    observation : Observation
-    session : Session
     similar : Magnet, optional
         A magnet whose shapes or materials differ slightly, and which was solved for before with the
         session's cache. What its permeability and iron add to the field of single blocks, which

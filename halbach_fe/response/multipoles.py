@@ -462,7 +462,6 @@ def solved_circles(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
         The study's positions.
     flux_density : ndarray, shape (n, 3), in T
@@ -681,7 +680,6 @@ def _harmonics_of_shape(block: MagnetBlock, radius: float, highest: int, size: i
 
     Parameters
     ----------
-    block : MagnetBlock
     radius : float
         Reference radius in m.
     highest : int

@@ -103,8 +103,6 @@ def nonlinear_model(
 
     Parameters
     ----------
-    magnet : Magnet
-    observation : Observation
     session : Session
         Its folder receives the runs of GetDP.
     generator : numpy.random.Generator
@@ -209,9 +207,6 @@ def newton_readings(
 
     Parameters
     ----------
-    magnet : Magnet
-    observation : Observation
-    session : Session
     magnetizations : ndarray, shape (k, parameters), in A/m
     cold : bool
         Start Newton's method from zero for every sample, instead of from the sample before.

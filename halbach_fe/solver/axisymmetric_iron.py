@@ -220,7 +220,6 @@ def solve_iron(
         Its folder receives the mesh and the runs of GetDP.
     name : str
         Name of the study.
-    resolution : Resolution, optional
     estimate : bool
         Whether to solve once more with a coarser resolution, for the error bar.
     start : IronReaction, optional
@@ -420,7 +419,6 @@ def to_angles(by_mode: Complexes, numbers: Ints, angles: int) -> Floats:
     by_mode : ndarray, shape (modes, ...)
     numbers : ndarray of int, shape (modes,)
         The modes m, all below half of ``angles``.
-    angles : int
     """
     spectrum = np.zeros((angles // 2 + 1, *by_mode.shape[1:]), complex)
     spectrum[numbers] = by_mode * (angles / 2)

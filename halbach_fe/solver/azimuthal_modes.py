@@ -220,7 +220,6 @@ def solve_modes(
     blocks : sequence of int
         Numbers, from 0, of the blocks to solve for with a remanence of 1 T along x, y and z. Since
         the blocks of a ring share their solutions, more blocks of the same ring cost nothing more.
-    session : Session
     highest : int, optional
         The highest mode, by default `modes_needed`.
     single_blocks : callable, optional
@@ -383,7 +382,6 @@ def fill_run_folder(
 
     Parameters
     ----------
-    case : ModesCase
     folder : Path
         An existing folder.
     modes : list of int
@@ -394,7 +392,6 @@ def fill_run_folder(
         The source whose gradients GetDP prints, in the first mode.
     vacuum : bool
         Whether all materials are replaced by vacuum.
-    time_limit_s : float
     """
     problem = resources.files(pro).joinpath(PROBLEM).read_bytes()
     (folder / PROBLEM).write_bytes(problem)
@@ -425,7 +422,6 @@ def unknowns_of(inner: Entities, axis: Entities, mode: int) -> int:
         Off the outer boundary.
     axis : Entities
         Of these, those on the axis.
-    mode : int
     """
     everywhere, fixed = (part.nodes + part.edges + part.faces for part in (inner, axis))
     return everywhere - (fixed if mode > 0 else 0)
@@ -488,14 +484,12 @@ def _superpose(
 
     Parameters
     ----------
-    case : ModesCase
     nominal, single : dict of int to ndarray, shape (sources, m, 3), in T
         d psi/dr, psi/r and d psi/dz at the points of the half-plane, by mode, of the nominal
         array and of single blocks.
     points : ndarray, shape (n, 3), in m
     where : ndarray of int, shape (n,)
         Number of each point's (r, z) among the points of the half-plane.
-    blocks : sequence of int
 
     Returns
     -------

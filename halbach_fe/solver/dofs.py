@@ -52,7 +52,6 @@ def read_unknowns(path: Path, cell_type: str) -> Unknowns:
 
     Parameters
     ----------
-    path : Path
     cell_type : str
         meshio's name of the element type: ``triangle6``, ``quad`` or ``tetra10``.
 
@@ -126,8 +125,6 @@ def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> N
 
     Parameters
     ----------
-    path : Path
-    unknowns, solves : int
     before : int
         Number of other solutions that come first in the file, such as the steps of Newton's method.
 

@@ -439,8 +439,6 @@ def neighbour_field(magnet: Magnet, neighbour: Neighbour, points: Floats) -> Flo
 
     Parameters
     ----------
-    magnet : Magnet
-    neighbour : Neighbour
     points : ndarray, shape (n, 3), in m
 
     Returns

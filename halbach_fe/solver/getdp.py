@@ -269,8 +269,6 @@ def run(
 
     Parameters
     ----------
-    getdp : GetDP
-    job : Job
     folder : Path
         The run folder with all input files. Output files and the log, ``getdp.log``, are written
         there.

@@ -76,7 +76,6 @@ def locate(mesh: VerifiedMesh, points: Floats, anywhere: bool = False) -> Locate
 
     Parameters
     ----------
-    mesh : VerifiedMesh
     points : ndarray, shape (n, 3), in m
         On a 2D mesh the third coordinate is ignored.
     anywhere : bool
@@ -170,7 +169,6 @@ def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
 
     Parameters
     ----------
-    mesh : VerifiedMesh
     cells : ndarray of int
         Indices of the elements.
 
@@ -471,7 +469,6 @@ def grid_operators(
         A grid of rectangles of the (r, z) half-plane.
     located : Located
         n points in air.
-    unknowns : Unknowns
 
     Returns
     -------

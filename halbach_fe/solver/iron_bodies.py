@@ -379,10 +379,8 @@ def solve_bodies(
 
     Parameters
     ----------
-    magnet : Magnet
     source : callable
         mu_0 H of the sources in T at points (n, 3) in m in the iron.
-    session : Session
     estimate : bool
         Whether to solve once more with larger elements, for the error bar.
     start : BodiesReaction, optional

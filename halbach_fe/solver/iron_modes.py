@@ -338,9 +338,6 @@ def assemble_modes(
     ----------
     name : str
         Name of the study.
-    bodies : sequence of IronSolid
-    resolution : Resolution
-    session : Session
 
     Raises
     ------

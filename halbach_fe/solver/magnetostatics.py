@@ -167,13 +167,10 @@ def solve_sources(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     blocks : sequence of int
         Numbers, from 0, of the blocks to solve for with a remanence of 1 T along each of the D
         axes, while all other blocks have none.
-    session : Session
-    formulation : Formulation
     anywhere : bool
         Whether points may lie in magnet and iron.
 
@@ -198,12 +195,9 @@ def solve_tangent(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     blocks : sequence of int
         Numbers, from 0, of the blocks whose derivatives are wanted.
-    session : Session
-    formulation : Formulation
     anywhere : bool
         Whether points may lie in magnet and iron.
 
@@ -237,13 +231,10 @@ def solve_samples(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
         In air.
     samples : ndarray, shape (k, blocks, 3), in A/m
         Magnetizations of all blocks.
-    session : Session
-    formulation : Formulation
     cold : bool
         Whether Newton's method starts from zero for every sample, instead of from the solution of
         the sample before.
@@ -538,13 +529,10 @@ def fill_run_folder(
 
     Parameters
     ----------
-    magnet : Magnet
-    mesh : VerifiedMesh
     places : ndarray, shape (n, 3), in m
         Points at which GetDP prints the field of the first source.
     folder : Path
         An existing folder.
-    formulation : Formulation
     request : RunRequest, optional
         By default the nominal array is solved for, with real materials.
     """

@@ -68,7 +68,6 @@ def bore_field(
 
     Parameters
     ----------
-    sectors : list of SectorMagnetization
     inner_radius, outer_radius : float
         Radii of the sectors in m.
     points : ndarray, shape (n, 2), in m

@@ -265,10 +265,8 @@ def finite_element_part(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
         In air, or ``anywhere`` in a cross-section.
-    session : Session
     columns : bool
         Whether to solve for single blocks too, the columns of the response matrix.
     estimate : bool
@@ -507,7 +505,6 @@ def check_points(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     key : str
         Key of the study that the points come from, for the error message.
@@ -581,12 +578,10 @@ def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Sess
 
     Parameters
     ----------
-    magnet : Magnet
     block : int
         Number of the block, from 0.
     points : ndarray, shape (n, 3), in m
         Anywhere inside the outer boundary, also in magnet and iron.
-    session : Session
 
     Returns
     -------

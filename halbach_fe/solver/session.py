@@ -385,7 +385,6 @@ def run_folder(parent: Path, name: str, cancel: threading.Event) -> Iterator[Pat
 
     Parameters
     ----------
-    parent : Path
     name : str
         The folder is kept as ``name`` if the run succeeds, and as ``name-failed`` (with the log) if
         it raises a GetDPError. In all other cases, and if the run was cancelled, it is removed.

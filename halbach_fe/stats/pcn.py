@@ -97,7 +97,6 @@ def laplace(
 
     Parameters
     ----------
-    posterior : Posterior
     jacobian : callable
         Maps parameters (m,) to the derivatives dq/dp (n, m) of the readings.
 
@@ -178,10 +177,8 @@ def sample(
     ----------
     posterior : Posterior
         Distribution to sample.
-    proposals : sequence of Proposal
     count : int
         Number of steps; each gives a sample.
-    generator : numpy.random.Generator
     start : ndarray, shape (k,)
         Whitened coordinates z at which the chain starts.
     surrogate : Posterior, optional
@@ -268,7 +265,6 @@ def require_convergence(
 
     Parameters
     ----------
-    found : ConvergenceDiagnostics
     names : sequence of str
         Names of the parameters, for the error message.
     effective : float

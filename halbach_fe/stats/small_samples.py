@@ -209,7 +209,6 @@ def ranks(
         The inference under test, see `Sampler`.
     repeats : int
         Number of simulated inferences.
-    generator : numpy.random.Generator
     progress : callable
         Called with the number of completed inferences and with ``repeats``.
 

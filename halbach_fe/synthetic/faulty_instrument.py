@@ -189,7 +189,6 @@ def stated_readings(instrument: Instrument, fields: Floats, time: Floats) -> Flo
 
     Parameters
     ----------
-    instrument : Instrument
     fields : ndarray, shape (3, n, 3), in T
         B at the place of each sensor, along the axes of the magnet.
     time : ndarray, shape (n,)

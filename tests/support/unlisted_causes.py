@@ -85,8 +85,6 @@ def simulate_unlisted(
 
     Parameters
     ----------
-    study : Study
-    seed : int
     family : tuple, optional
         One of `families`; drawn if left out.
     """

@@ -72,7 +72,6 @@ def import_map(path: Path, declared: DeclaredFormat, name: str = "") -> Imported
 
     Parameters
     ----------
-    path : Path
     declared : DeclaredFormat
         Statements of the user about the file.
     name : str

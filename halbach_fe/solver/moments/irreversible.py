@@ -103,7 +103,6 @@ def solve_irreversible(
     ----------
     system : System
         The cells with the remanence that they had when they were saturated.
-    law : KneeLaw
     applied : callable, optional
         mu_0 H of other sources, such as iron.
     by_mean : bool
