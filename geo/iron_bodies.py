@@ -123,10 +123,7 @@ def _generate(name: str) -> None:
     A tetrahedron with two faces on a sphere is flat where they meet. Gmsh's optimizer mends such,
     but leaves them inside out in one mesh in some thirty; then elements are a little smaller.
 
-    Raises
-    ------
-    MeshError
-        If curved sides turn an element inside out in every mesh.
+    MeshError if curved sides turn an element inside out in every mesh.
     """
     mesh, raising = gmsh.model.mesh, gmsh.option.getNumber("General.AbortOnError")
     for factor in (1.0, 0.97, 0.94):

@@ -89,10 +89,7 @@ def _prism(prism: Prism) -> int:
 def _step_text() -> str:
     """Return the model as the text of a STEP file.
 
-    Raises
-    ------
-    OutputError
-        If the temporary file cannot be written. Gmsh itself does not notice a full disk.
+    OutputError if the temporary file cannot be written. Gmsh itself does not notice a full disk.
     """
     gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
     with TemporaryDirectory(prefix="halbach-fe-") as folder:

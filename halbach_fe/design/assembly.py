@@ -348,10 +348,7 @@ def _of_table(
 
     The table names the place that a block was made for.
 
-    Raises
-    ------
-    MeasurementError
-        If the table does not fit the study, or says nothing about places.
+    MeasurementError if the table does not fit the study, or says nothing about places.
     """
     if table is None:
         return {}, {}

@@ -337,12 +337,7 @@ Cut = tuple[Floats, Ints, Floats, Floats]
 
 
 def _check_memory(count: int, across: int) -> None:
-    """Refuse more cells than fit into memory.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse more cells than fit into memory."""
     bytes_each = 800  # of 0.44 million cells 765 were measured
     needed, left = count * bytes_each / 2**30, available_memory()
     if left is not None and needed > left:
@@ -502,12 +497,7 @@ def _by_moments(magnet: Magnet) -> bool:
 
 
 def _check_equal_rings(magnet: Magnet) -> None:
-    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D."""
     if magnet.dimension == 3 and not magnet.array.is_uniform:
         raise StudyError(
             f"Input `array` of study {magnet.name} must consist of equal rings for a map of the "

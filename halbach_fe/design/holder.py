@@ -221,10 +221,7 @@ def _frame(
 ) -> _Frame:
     """Return what plates of a magnet have in common.
 
-    Raises
-    ------
-    CannotBeMadeError
-        If there is no room for plates.
+    CannotBeMadeError if there is no room for plates.
     """
     limits = [(min(block.prism.z_min for block in group), max(block.prism.z_max for block in group))
               for group in groups]
@@ -298,12 +295,7 @@ def _plate(
     group: Sequence[HeldBlock], pockets: Mapping[int, Prism], holder: Holder, frame: _Frame,
     iron: Sequence[IronSolid],
 ) -> Plate:
-    """Return the plate of a group, without its number.
-
-    Raises
-    ------
-    CannotBeMadeError
-    """
+    """Return the plate of a group, without its number."""
     low = min(block.prism.z_min for block in group) - frame.floor
     top = max(block.prism.z_max for block in group) - low
     thickness = holder.thickness_m or top

@@ -131,11 +131,8 @@ class MeasurementPlan(ShownInNotebook):
 def plan_measurement(magnet: Magnet, session: Session, count: int | None = None) -> MeasurementPlan:
     """Choose positions for a study's next measurement.
 
-    Parameters
-    ----------
-    count : int, optional
-        Number of positions to choose. Default: the study's ``plan.points``, else the number of
-        positions that the study measures.
+    ``count``: number of positions to choose. Default: the study's ``plan.points``, else the number
+    of positions that the study measures.
 
     Raises
     ------
@@ -190,10 +187,7 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
 def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:
     """Return the candidate positions (n, 3) in m and the number of positions to choose.
 
-    Raises
-    ------
-    StudyError
-        See `plan_measurement`.
+    StudyError: See `plan_measurement`.
     """
     if magnet.study.observation.quantity != "flux_density":
         raise StudyError(

@@ -131,10 +131,7 @@ class DeviationModel:
 def deviation_model(model: HomogeneityModel, about: Floats | None = None) -> DeviationModel:
     """Return the linear model of the deviations of |B| about the field of a magnet.
 
-    Parameters
-    ----------
-    about : ndarray, shape (parameters,), in A/m, optional
-        Magnetizations of that magnet; by default the nominal ones.
+    ``about`` (parameters,) in A/m: magnetizations of that magnet; by default the nominal ones.
     """
     response = model.response
     inner = np.flatnonzero(model.weights > 0)

@@ -109,10 +109,8 @@ def mounts_of(magnet: Magnet) -> Mounts:
 def shape_turns(sides: tuple[float, float, float] | None) -> Floats:
     """Return the rotations (n, 3, 3) that leave a shape unchanged; the first is the identity.
 
-    Parameters
-    ----------
-    sides : tuple of float, or None
-        Sides of a cuboid; None for a shape whose inner and outer face differ, such as a sector.
+    ``sides``: sides of a cuboid; None for a shape whose inner and outer face differ, such as a
+    sector.
     """
     turns = Rotation.create_group("O").as_matrix().round()
     if sides is None:

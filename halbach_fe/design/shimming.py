@@ -424,10 +424,7 @@ def check_stock(
 ) -> None:
     """Refuse a stock whose blocks do not fit the magnet, or stand in it already.
 
-    Parameters
-    ----------
-    mounted : collection of str, optional
-        Serial numbers of the blocks in the magnet, if they are known.
+    ``mounted``: serial numbers of the blocks in the magnet, if they are known.
 
     Raises
     ------
@@ -572,10 +569,7 @@ def _measured_spares(magnet: Magnet, mounts: Mounts, table: BlockTable) -> Spare
 def _possible_moves(move_model: _MoveModel) -> dict[Kind, int]:
     """Return the number of possible moves of each kind; of cycles without their turns.
 
-    Raises
-    ------
-    StudyError
-        If there are more than `MOST_NUMBERS` allows.
+    StudyError if there are more than `MOST_NUMBERS` allows.
     """
     slots = len(move_model.mean)
     ways = move_model.fits.sum(axis=0, dtype=float)

@@ -146,10 +146,7 @@ def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
     It has the tolerances of the blocks, the error that they share, and the random angles by which
     blocks are turned when they are mounted.
 
-    Parameters
-    ----------
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetizations, and 0 for variations inside blocks.
+    ``nominal`` (parameters,) in A/m: nominal magnetizations, and 0 for variations inside blocks.
     """
     settings, size = magnet.study.prior, magnet.dimension
     uniform = nominal[:size * len(magnet.blocks)]

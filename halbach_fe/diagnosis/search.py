@@ -336,10 +336,7 @@ def identify_effects(
     candidate is excluded and the selection repeated. Those with rough signatures are excluded: they
     explain too little, also in place of one that is impossible.
 
-    Parameters
-    ----------
-    corrected : Study
-        The study corrected for gross errors and outliers.
+    ``corrected``: the study corrected for gross errors and outliers.
     """
     excluded = set(search.excluded)
     while True:

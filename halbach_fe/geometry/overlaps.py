@@ -70,10 +70,7 @@ def block_in_iron(
 ) -> tuple[int, int, float] | None:
     """Return the first block, by number, that overlaps a body of iron.
 
-    Parameters
-    ----------
-    blocks, tolerance
-        See `overlapping_blocks`.
+    ``blocks`` and ``tolerance``: see `overlapping_blocks`.
 
     Returns
     -------

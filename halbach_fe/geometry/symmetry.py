@@ -53,10 +53,8 @@ class SymmetryImage:
     def from_source(self, field: Floats) -> Floats:
         """Return the field of the copy from the field of the source at the `to_source` points.
 
-        Parameters
-        ----------
-        field : ndarray, shape (..., 3, k)
-            B per unit of magnetization along the first k axes (x, y in a cross-section).
+        ``field`` (..., 3, k): B per unit of magnetization along the first k axes (x, y in a
+        cross-section).
         """
         size = field.shape[-1]
         turn = rotation_about_z(self.turn)
@@ -314,11 +312,8 @@ def turns_in_slot(block: MagnetBlock) -> tuple[Turn, ...]:
 def moves_of_rings(magnet: Magnet, kind: str) -> dict[str, Move]:
     """Return the moves of rings, and of half of them, after which every block fits its slot.
 
-    Parameters
-    ----------
-    kind : str
-        ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise than
-        their places, also the blocks without their holder) or ``upside down``.
+    ``kind``: ``exchanged``, ``turned`` (from slot to slot about z; where slots are turned otherwise
+    than their places, also the blocks without their holder) or ``upside down``.
     """
     return _moves(_drop_exceptions(magnet.array), magnet.dimension, kind)
 

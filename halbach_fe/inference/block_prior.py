@@ -350,7 +350,7 @@ def loose_blocks(magnet: Magnet, table: BlockTable) -> tuple[Floats, Floats]:
 def as_mounted(
     magnet: Magnet, table: BlockTable, places: Ints, turned: Floats | None = None
 ) -> Floats:
-    """Return the moments of blocks in the axes of new slots.
+    """Return the moments (rows, 3) in A m^2 of blocks in the axes of new slots.
 
     A block keeps the orientation of its faces relative to those of the slot, unless it is turned.
 
@@ -360,10 +360,6 @@ def as_mounted(
         New slot of each block, counted from 0, ring by ring.
     turned : ndarray, shape (rows, 3, 3), optional
         Rotation of each block in its own axes.
-
-    Returns
-    -------
-    ndarray, shape (rows, 3), in A m^2
     """
     index = _block_of_rows(as_meant(magnet), table)
     own = np.array([rotation_about_z(-np.radians(block.angle_deg)) @ block.shape_axes
@@ -490,10 +486,8 @@ def _at_reference_temperature(magnet: Magnet, table: BlockTable) -> Floats:
 
     They are not changed if the study has no temperature coefficient.
 
-    Raises
-    ------
-    MeasurementError
-        If a temperature is missing, or if temperatures differ and the study has no coefficient.
+    MeasurementError if a temperature is missing, or if temperatures differ and the study has no
+    coefficient.
     """
     # Largest difference of temperatures at which moments count as measured at the same one. It
     # changes the moment of NdFeB, of -0.0012/K, by 0.24 %, no more than usual coils determine it.

@@ -116,10 +116,6 @@ def sample_posterior(
         Calls a function for every chain, like `map`. The method ``map`` of an executor runs the
         chains in parallel, with the same result.
 
-    Returns
-    -------
-    SampledPosterior
-
     Raises
     ------
     StudyError
@@ -215,10 +211,7 @@ def _assessed(
 
     Parameters that are not ``free`` (m,), those of missing blocks, are known exactly.
 
-    Raises
-    ------
-    SamplingError
-        If the free parameters have not converged.
+    SamplingError if the free parameters have not converged.
     """
     found = assess_convergence(samples[:, :, free])
     require_convergence(found, [name for name, one in zip(names, free, strict=True) if one],

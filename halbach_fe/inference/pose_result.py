@@ -198,7 +198,7 @@ class Registration:
     instrument : Instrument
         The pose, axes, gains, offsets and sensors that were found.
     middle_m : ndarray, shape (3,)
-        Where the middle of the map lies in the magnet, see `middle_of`.
+        Where the middle of the box around the map's points lies in the magnet.
     translation_sd_m, rotation_sd_rad : ndarray, shape (3,)
         Standard deviations of that place, and of the turns about the magnet's axes.
     prior_sd : ndarray, shape (6,)

@@ -219,10 +219,7 @@ def _read_root(
 ) -> Floats | CovarianceFactor:
     """Return the stored root with ``size`` rows.
 
-    Raises
-    ------
-    KeyError, ValueError or TypeError
-        If the variables are missing or do not describe a root.
+    KeyError, ValueError or TypeError if the variables are missing or do not describe a root.
     """
     if f"{name}_left" in data and prior is not None:
         left = data[f"{name}_left"]

@@ -229,10 +229,8 @@ def block_doubts(magnet: Magnet, mean: Floats, prior_mean: Floats, prior_sd: Flo
                  ) -> tuple[Term, ...]:
     """Return the doubts about what an update has done to the blocks.
 
-    Parameters
-    ----------
-    mean, prior_mean, prior_sd : ndarray, shape (m,), in A/m
-        Parameters of the magnet, of which the first are the magnetizations of its blocks.
+    ``mean``, ``prior_mean`` and ``prior_sd`` (m,) in A/m: parameters of the magnet, of which the
+    first are the magnetizations of its blocks.
 
     Returns
     -------
@@ -261,10 +259,8 @@ def held_back(magnet: Magnet, mean: Floats, sd: Floats, prior: Gaussian) -> tupl
     after the update would be at ``m / (1 - (s / p)**2)``. Where the readings alone determine a
     block, that is m, however far m is. Where they do not, its error bar is not to be believed.
 
-    Parameters
-    ----------
-    mean, sd : ndarray, shape (m,), in A/m
-        After the update, of all parameters, of which the first are the magnetizations of blocks.
+    ``mean`` and ``sd`` (m,) in A/m: after the update, of all parameters, of which the first are the
+    magnetizations of blocks.
 
     Returns
     -------

@@ -113,10 +113,7 @@ class Observation:
     def part(self, rows: slice) -> tuple[Ints, sparse.csr_array]:
         """Restrict the operator to some readings and the points that they depend on.
 
-        Parameters
-        ----------
-        rows : slice
-            The r readings.
+        ``rows``: the r readings.
 
         Returns
         -------

@@ -333,10 +333,7 @@ def _line(update: InferenceResult, loo_residuals: Floats) -> tuple[str, Ints, Fl
     These are the readings with the largest residuals of all lines along z, circles, or coefficients
     of one kind. If no line has as many as `FEWEST_ON_A_LINE`, they are all of one component.
 
-    Parameters
-    ----------
-    loo_residuals : ndarray, shape (n,)
-        Standardized leave-one-out residuals of the training readings.
+    ``loo_residuals`` (n,): standardized leave-one-out residuals of the training readings.
 
     Returns
     -------

@@ -107,7 +107,7 @@ def error_bars(observation: Observation, parts: ElementFields, changes: Floats) 
 def discretization_changes(
     magnet: Magnet, points: Floats, parts: ElementFields, session: Session
 ) -> Floats:
-    """Return the changes of the field that other discretizations make, with their signs.
+    """Return the signed changes (k, n, 3) in T of the field that other discretizations make.
 
     Each is as large as the error that it stands for, at all points together. On a 3D mesh the other
     discretization is the dual formulation on the same mesh: the energies of the two formulations
@@ -124,10 +124,6 @@ def discretization_changes(
         The finite-element part of the field at the points.
     session : Session
         The additional solves have a subfolder of its folder.
-
-    Returns
-    -------
-    ndarray, shape (k, n, 3), in T
     """
     nominal, known = parts.nominal, parts.error
     if known is not None:

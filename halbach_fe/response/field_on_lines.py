@@ -484,10 +484,7 @@ def _through_blocks(
     the deviations of the blocks too; what their permeability adds is an error bar, chi times that
     field.
 
-    Raises
-    ------
-    StudyError
-        If blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
+    StudyError if blocks are not uniformly magnetized, or a 3D magnet is not solved by moments.
     """
     blocks = magnet.blocks
     in_iron = number >= len(blocks)

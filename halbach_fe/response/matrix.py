@@ -158,13 +158,10 @@ def response_matrix(
 ) -> Response:
     """Build H, or read it from the session's folder if it was built for the same inputs.
 
-    Parameters
-    ----------
-    similar : Magnet, optional
-        A magnet whose shapes or materials differ slightly, and which was solved for before with the
-        session's cache. What its permeability and iron add to the field of single blocks, which
-        takes most of the time, serves this magnet too if it adds up to the nominal array to
-        5e-4. The nominal array and the field in vacuum are computed in any case.
+    ``similar``: a magnet whose shapes or materials differ slightly, and which was solved for before
+    with the session's cache. What its permeability and iron add to the field of single blocks,
+    which takes most of the time, serves this magnet too if it adds up to the nominal array to 5e-4.
+    The nominal array and the field in vacuum are computed in any case.
 
     Raises
     ------

@@ -334,12 +334,7 @@ def multipole_models(
 
 
 def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
-    """Refuse a reference circle of which points (n, 3) in m are not in air.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse a reference circle of which points (n, 3) in m are not in air."""
     if magnet.contains(points).any():
         bore = "" if magnet.has_bore else ", which has no bore there"
         raise StudyError(must_be(
@@ -350,12 +345,7 @@ def _check_air(magnet: Magnet, radius: float, points: Floats) -> None:
 
 
 def _check_no_source(magnet: Magnet, radius: float, z: float) -> None:
-    """Refuse a reference circle within which a coil or a dipole is: B_r has no multipoles there.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse a reference circle within which a coil or a dipole is: B_r has no multipoles there."""
     if source := _source_within(magnet, radius, z):
         raise StudyError(must_be(
             "the reference circle of multipoles", f"study {magnet.name}",
@@ -543,11 +533,8 @@ def _turn(
     ``row`` (parameters,) is the row of the main multipole in the matrix from magnetizations to C,
     and ``external`` what external fields add to it.
 
-    Raises
-    ------
-    StudyError
-        If the main multipole of the nominal magnet, with external fields or without, vanishes, or
-        is no larger than ``least_T``.
+    StudyError if the main multipole of the nominal magnet, with external fields or without,
+    vanishes, or is no larger than ``least_T``.
     """
     own = row @ model.nominal
     scale = np.abs(row).sum() * np.abs(model.nominal).max()
@@ -726,10 +713,7 @@ def _integrals_of_coils(
 
     The error bar in T m of all comes second. The ``radius`` of the circle is in m.
 
-    Raises
-    ------
-    StudyError
-        If one of them is within the circle, at any z: then the integral has sources there.
+    StudyError if one of them is within the circle, at any z: then the integral has sources there.
     """
     external = External(coils=magnet.external.coils, dipoles=magnet.external.dipoles)
     if external == External():

@@ -152,7 +152,7 @@ class IronReaction(WithBar):
         self, sources: Sequence[Source] | Floats, points: Floats, inside: Floats | None = None,
         modes: int = TANGENT_MODES
     ) -> Floats:
-        """Return the derivative of the reaction with respect to additional sources.
+        """Return the derivative (c, n + i, 3) in T of the reaction by additional sources.
 
         For linear iron this is the reaction to the sources.
 
@@ -165,10 +165,6 @@ class IronReaction(WithBar):
             Points in iron, for which the derivative of mu_0 H follows that at the points.
         modes : int
             Highest azimuthal mode.
-
-        Returns
-        -------
-        ndarray, shape (c, n + i, 3), in T
         """
         state, numbers = self.problem, np.arange(modes + 1)
         spaces = [state.modes.exterior(number) for number in numbers.tolist()]

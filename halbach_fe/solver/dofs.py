@@ -50,10 +50,7 @@ _PARTS = {"triangle6": (3, 1), "quad": (4, 1), "tetra10": (6, 4)}
 def read_unknowns(path: Path, cell_type: str) -> Unknowns:
     """Read the ``.pre`` file of a run on a mesh of one type of elements.
 
-    Parameters
-    ----------
-    cell_type : str
-        meshio's name of the element type: ``triangle6``, ``quad`` or ``tetra10``.
+    ``cell_type``: meshio's name of the element type: ``triangle6``, ``quad`` or ``tetra10``.
 
     Raises
     ------
@@ -123,10 +120,8 @@ def _entities(text: str, name: str, count: int) -> Ints:
 def read_solutions(path: Path, unknowns: int, solves: int, before: int = 0) -> NDArray[np.floating]:
     """Return the last ``solves`` solutions in a file of PETSc vectors.
 
-    Parameters
-    ----------
-    before : int
-        Number of other solutions that come first in the file, such as the steps of Newton's method.
+    ``before``: number of other solutions that come first in the file, such as the steps of Newton's
+    method.
 
     Returns
     -------

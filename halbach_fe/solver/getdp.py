@@ -207,10 +207,7 @@ def _advice() -> str:
 def find_getdp(named: str | Path | None = None) -> GetDP:
     """Find the GetDP executable and read its version and build from ``getdp -info``.
 
-    Parameters
-    ----------
-    named : str or Path, optional
-        The executable; by default that of $HALBACH_FE_GETDP, then of PATH, then of pyonelab.
+    ``named``: the executable; by default that of $HALBACH_FE_GETDP, then of PATH, then of pyonelab.
 
     Raises
     ------
@@ -315,7 +312,7 @@ def run(
 
 
 def read_vectors(path: Path, points: Floats) -> Floats:
-    """Read a table of vectors at points that GetDP printed as SimpleTable, and verify it.
+    """Read a table of vectors (n, 3) at points that GetDP printed as SimpleTable, and verify it.
 
     Parameters
     ----------
@@ -323,10 +320,6 @@ def read_vectors(path: Path, points: Floats) -> Floats:
         The file; its columns are x, y, z and three components.
     points : ndarray, shape (n, 3), in m
         The points at which GetDP was asked to print the vectors.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
 
     Raises
     ------

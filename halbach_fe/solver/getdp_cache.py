@@ -245,11 +245,8 @@ class Entry:
 def default_cache(folder: Path | None = None) -> Cache | None:
     """Return the user's cache, or None if the limit in the environment is 0.
 
-    Parameters
-    ----------
-    folder : Path, optional
-        Folder of the cache; by default that of $HALBACH_FE_CACHE, else ``halbach-fe`` in
-        $XDG_CACHE_HOME or ``~/.cache``. None is also returned if the user has no home folder.
+    ``folder``: folder of the cache; by default that of $HALBACH_FE_CACHE, else ``halbach-fe`` in
+    $XDG_CACHE_HOME or ``~/.cache``. None is also returned if the user has no home folder.
 
     Raises
     ------

@@ -334,10 +334,7 @@ def assemble_modes(
 ) -> IronModes:
     """Have GetDP assemble the stiffness of the half-plane around iron, and verify it.
 
-    Parameters
-    ----------
-    name : str
-        Name of the study.
+    ``name``: name of the study.
 
     Raises
     ------

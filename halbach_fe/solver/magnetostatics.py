@@ -227,7 +227,7 @@ def solve_samples(
     magnet: Magnet, points: Floats, samples: Floats, session: Session, formulation: Formulation,
     cold: bool = False, tolerance: float = NEWTON_TOLERANCE,
 ) -> Floats:
-    """Return the finite-element part of B for samples of magnetization, by Newton's method.
+    """Return the finite-element part (k, n, 3) in T of B by Newton's method for magnetizations.
 
     Parameters
     ----------
@@ -240,10 +240,6 @@ def solve_samples(
         the sample before.
     tolerance : float
         Largest residual of a solution, relative to the right-hand side.
-
-    Returns
-    -------
-    ndarray, shape (k, n, 3), in T
 
     Raises
     ------

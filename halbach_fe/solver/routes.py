@@ -572,7 +572,7 @@ def _external_past_iron(magnet: Magnet, points: Floats, route: Route) -> str | N
 
 
 def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
-    """Return the derivative of B along the nominal direction of magnetization of a block.
+    """Return the derivative (n, 3) in T m/A of B along a block's nominal magnetization.
 
     The iron is at its operating point in the nominal array.
 
@@ -582,10 +582,6 @@ def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Sess
         Number of the block, from 0.
     points : ndarray, shape (n, 3), in m
         Anywhere inside the outer boundary, also in magnet and iron.
-
-    Returns
-    -------
-    ndarray, shape (n, 3), in T m/A
 
     Raises
     ------

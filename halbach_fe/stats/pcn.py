@@ -95,10 +95,7 @@ def laplace(
     The mode is found by Gauss-Newton steps, which are halved until the posterior density increases;
     the covariance is the inverse of the Gauss-Newton Hessian at the mode.
 
-    Parameters
-    ----------
-    jacobian : callable
-        Maps parameters (m,) to the derivatives dq/dp (n, m) of the readings.
+    ``jacobian``: maps parameters (m,) to the derivatives dq/dp (n, m) of the readings.
 
     Returns
     -------

@@ -81,10 +81,7 @@ def predictive_covariance(samples: Floats) -> tuple[Floats, float]:
     between 0.4 and 1.5 for single components whose true standard deviations differed by a factor of
     five.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (n, d)
-        At least three samples.
+    ``samples`` (n, d): at least three samples.
 
     Returns
     -------

@@ -83,10 +83,7 @@ def simulate_unlisted(
     The field is magpylib's, as in `halbach_fe.synthetic.simulate`. The order in which the points
     were measured is drawn, too: circle by circle along z, or line by line.
 
-    Parameters
-    ----------
-    family : tuple, optional
-        One of `families`; drawn if left out.
+    ``family``: one of `families`; drawn if left out.
     """
     # Displacement by which the change of the readings per displacement is found.
     trial_displacement_m = 1e-4

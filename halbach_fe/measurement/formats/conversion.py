@@ -781,10 +781,7 @@ def _cylindrical(si: dict[str, Floats], where: str) -> dict[str, Floats]:
 def _checked(points: Floats, flux_density: Floats, total: Floats, where: str) -> xr.Dataset:
     """Return the map without |B| ``total`` (n,) in T.
 
-    Raises
-    ------
-    MeasurementError
-        If values are too large for a permanent magnet.
+    MeasurementError if values are too large for a permanent magnet.
     """
     largest = float(np.nanmax(np.abs(np.column_stack([flux_density, total]))))
     farthest = float(np.abs(points).max())
