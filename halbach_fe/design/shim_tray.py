@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, unit_circle
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, slices, unit_circle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.blocks import MagnetBlock, present_blocks, vector
@@ -401,8 +401,8 @@ def _best(
     points = model.points[:len(inner)][inner]
     at_once = 1000  # points whose fields are in memory with all components
     effect = whitened(np.concatenate([
-        choices.all_fields(points[first:first + at_once]) @ before.direction
-        for first in range(0, len(points), at_once)], axis=-1))
+        choices.all_fields(points[part]) @ before.direction
+        for part in slices(len(points), at_once)], axis=-1))
     flat = effect.reshape(-1, effect.shape[-1])
     # an error that all shims share adds the square of their whole field
     search = _Search((1 + tray.common_sd**2) * (flat @ flat.T), flat @ target,

@@ -27,7 +27,7 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 
-from halbach_fe.core.arrays import Bools, Floats, radii_of
+from halbach_fe.core.arrays import Bools, Floats, radii_of, spread
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
@@ -240,8 +240,7 @@ def candidate_measurements(
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
-    heights = np.unique(np.round(places[:, 2], 9))
-    heights = heights[np.linspace(0, len(heights) - 1, min(len(heights), 40)).astype(int)]
+    heights = spread(np.unique(np.round(places[:, 2], 9)), 40)
     others = [("second_radius", f"circles of radius {1e3 * radius:.0f} mm",
                np.vstack([_circle(radius, z) for z in heights]))]
     if study.dimension == 3:

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.linalg as linalg
 from scipy import special
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.stats.small_samples import false_discovery_rates
 
 
@@ -244,7 +244,7 @@ def _rows(count: int) -> list[slice]:
     """Return slices of rows, so few that the memory of a product over them is bounded."""
     # Number of rows that products over all readings take at a time, to bound their memory.
     rows_at_once = 8192
-    return [slice(first, first + rows_at_once) for first in range(0, count, rows_at_once)]
+    return slices(count, rows_at_once)
 
 
 DISCOVERIES = 0.01

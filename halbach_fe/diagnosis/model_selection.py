@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from halbach_fe.core.arrays import Bools, Floats
+from halbach_fe.core.arrays import Bools, Floats, slices
 from halbach_fe.diagnosis.marginal_evidence import Evidence, Marginal
 
 DETECTION_LOG_ODDS = 5.0
@@ -257,10 +257,8 @@ def select_effects(
 ) -> list[SelectedEffect]:
     """Select missing effects one at a time, and drop those that later ones make needless.
 
-    Parameters
-    ----------
-    excluded : collection of int
-        Numbers of candidates that cannot be selected, because their amplitudes are impossible.
+    ``excluded``: numbers of candidates that cannot be selected, because their amplitudes are
+    impossible.
     """
     prior = prior_log_odds(candidates)
     chosen: list[int] = []
@@ -481,8 +479,7 @@ def most_likely(
         return compared(range(len(candidates)))
     factors = np.empty(len(candidates))
     model = sorted(in_model)
-    for first in range(0, len(candidates), AT_ONCE):
-        some = list(range(first, min(first + AT_ONCE, len(candidates))))
+    for some in (list(range(part.start, part.stop)) for part in slices(len(candidates), AT_ONCE)):
         numbered = renumbered([candidates[number] for number in (*model, *some)])
         beside = with_candidates(compared([*model, *some]).evidence, numbered[:len(model)])
         factors[some] = log_bayes_factors(beside, numbered[len(model):])

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle, spread
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.core.pace import Pace
 from halbach_fe.geometry.magnet import Magnet
@@ -36,7 +36,6 @@ from halbach_fe.inference.pose_space import (
     share_of,
 )
 from halbach_fe.inference.readings import unit_vectors
-from halbach_fe.measurement.campaign import middle_of
 from halbach_fe.measurement.doubted_terms import (
     UNITS,
     Term,
@@ -266,7 +265,7 @@ class PoseFit:
 
     def _origin(self, base: Instrument) -> Floats:
         """Return the middle (3,) in m of the map, in the scale of an instrument without pose."""
-        return middle_of(sensor_positions(base.with_(
+        return box_middle(sensor_positions(base.with_(
             sensor_position_m=((0.0, 0.0, 0.0),) * 3), self.points)[:, 0])
 
     def _base(self, values: Floats) -> Instrument:
@@ -345,8 +344,7 @@ class PoseFit:
         few_points = 400
         if len(self.points) < 2 * few_points or self.on_a_line:
             return None
-        rows = np.flatnonzero(self.training.any(axis=1))
-        some = rows[np.linspace(0, len(rows) - 1, min(few_points, len(rows))).astype(int)]
+        some = spread(np.flatnonzero(self.training.any(axis=1)), few_points)
         some = np.unique(np.concatenate([some, self.points.argmin(axis=0),
                                          self.points.argmax(axis=0)]))
         chosen: dict[str, Any] = {name: getattr(self, name)[some] for name in (

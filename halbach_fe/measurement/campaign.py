@@ -16,7 +16,7 @@ from scipy import special
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
@@ -89,11 +89,6 @@ class Map:
     """Prior standard deviations of an own shift along the axes of the stage."""
     is_validation: bool = False
     """Whether it is predicted but does not update the model."""
-
-
-def middle_of(points: Floats) -> Floats:
-    """Return the middle (3,) in m of the box about points (n, 3)."""
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
 @typed
@@ -394,4 +389,4 @@ def _seen_from(study: Study, first: Map) -> Floats:
 
 
 def _middle(study: Study, data: xr.Dataset) -> Floats:
-    return middle_of(points_of(in_si_and_magnet_axes(study.instrument, data)))
+    return box_middle(points_of(in_si_and_magnet_axes(study.instrument, data)))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.threads import in_threads, share_out
 
 CLOSENESS = 0.45
@@ -136,8 +136,7 @@ class FewCharges(Charges):
         """Return B . u (n, r) per amplitude, for u (n, 3)."""
         result = np.empty((len(points), len(self)))
         of_all = Charges(self.places, self.scale)
-        for first in range(0, len(points), AT_ONCE):
-            some = slice(first, first + AT_ONCE)
+        for some in slices(len(points), AT_ONCE):
             np.matmul(of_all.fields_along(points[some], directions[some]), self.vectors,
                       out=result[some])
         return result
@@ -369,10 +368,9 @@ class FreeField:
 
     def _halves(self) -> Iterator[Floats]:
         """Yield half of the way to the solutions for some columns (k, m) of A^T at a time."""
-        for first in range(0, len(self.by_amplitude), AT_ONCE):
+        for part in slices(len(self.by_amplitude), AT_ONCE):
             yield np.asarray(linalg.solve_triangular(
-                self.lower, self.by_amplitude[first:first + AT_ONCE].T, lower=True,
-                check_finite=False))
+                self.lower, self.by_amplitude[part].T, lower=True, check_finite=False))
 
     def most_probable(self, readings: Floats) -> HarmonicFit:
         """Return the fit of readings (m,) by that one of `PENALTIES` which has most evidence.

@@ -12,6 +12,7 @@ applied in three ways:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,7 @@ from halbach_fe.measurement.field_map import (
 from halbach_fe.measurement.scan_lines import motion
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
-from halbach_fe.study.types import COMPONENTS, Axes
+from halbach_fe.study.types import COMPONENTS
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,13 @@ def by_stated_units(instrument: Instrument, data: xr.Dataset) -> xr.Dataset:
     return read.assign({name: data[name] * unit for name in TOTAL_COLUMNS if name in data})
 
 
-def to_magnet_axes(axes: Axes, columns: Floats) -> Floats:
-    """Convert vectors (n, 3) to the magnet's axes.
+def to_magnet_axes(axes: Sequence[str], columns: Floats) -> Floats:
+    """Convert vectors (n, 3) to the axes of the magnet, or of whatever else names the axes.
 
     Parameters
     ----------
-    axes : Axes
-        For each column of the vectors, the axis of the magnet along which it points, such as
+    axes : sequence of str
+        For each column of the vectors, the axis along which it points, such as
         ``("x", "-z", "y")``.
     columns : ndarray, shape (n, 3)
     """

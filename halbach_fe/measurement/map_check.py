@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, spread
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.core.numbers import MAD_TO_SD, in_a_row
 from halbach_fe.core.pace import Pace, Progress
@@ -836,8 +836,7 @@ def _thinned(scan: Scan) -> ProbeModel:
     Its charges are neither near nor far: those of a map near edges of magnets, fitted by far ones,
     gave sensors 10 mm off.
     """
-    some = scan.of(np.linspace(0, len(scan.points) - 1, min(
-        len(scan.points), SOME_POINTS)).astype(int))
+    some = scan.of(spread(np.arange(len(scan.points)), SOME_POINTS))
     return some.model(Charges.around(some.points, MIDDLING * point_spacing(scan.points)))
 
 

@@ -24,7 +24,7 @@ from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, spread
 from halbach_fe.core.errors import MeasurementError, StudyError, must_be
 from halbach_fe.core.files import file_bytes
 from halbach_fe.core.numbers import MAD_TO_SD, check_number, decimals
@@ -318,7 +318,7 @@ class Checked:
             floor = check.reach.inside_T
         kept = oriented(data, check) if within is None else within
         points, ideal = points_of(kept), check.corrected_T[rows]
-        some = np.linspace(0, len(points) - 1, min(len(points), SOME_POINTS)).astype(int)
+        some = spread(np.arange(len(points)), SOME_POINTS)
         charges = Charges.around(points, check.gap_m)
         (fit,) = fit_fields(charges, points[some], [ideal[some]])
         return cls(name, kept, check, ideal, floor, charges, fit.amplitudes)
@@ -661,7 +661,7 @@ def _refined(one: Checked, other: Checked, pose: Pose, sign: int) -> _Match:
         rows = np.flatnonzero(one.holds(pose.places(other.points)))
         if len(rows) < _fewest_shared(pose.turn, sign):
             return _Match(pose, sign, np.inf, np.nan, -np.inf)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), compared)).astype(int)]
+        rows = spread(rows, compared)
         points, read = other.points[rows], sign * other.ideal_T[rows]
 
         def left(values: Floats, start: Pose = pose, at: Floats = points,

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from markupsafe import Markup
 
-from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area
+from halbach_fe.core.arrays import Floats, box_middle, face_vectors, polygon_area, slices
 from halbach_fe.core.files import atomic, write_text
 from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.assembly import AssembledBlock, Assembly
@@ -280,7 +280,7 @@ def _tables(sheet: Sheet, ordered_as: Mapping[int, int]) -> list[Rows]:
                            .replace("clockwise", "cw").replace("from outwards, ", "")})
     tables = min(most_tables, -(-len(rows) // shortest))
     length = -(-len(rows) // tables)
-    return [rows[start:start + length] for start in range(0, len(rows), length)]
+    return [rows[part] for part in slices(len(rows), length)]
 
 
 def _outline_mm(one: AssembledBlock) -> Floats:

@@ -13,7 +13,7 @@ import scipy.sparse as sparse
 from markupsafe import Markup
 from scipy.spatial import Delaunay
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, spread
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.iron import IronSolid
 from halbach_fe.geometry.magnet import Magnet
@@ -188,8 +188,7 @@ def field_points(positions: Floats, flux_density: Floats) -> ViewPoints:
 
 def view_of_nominal_magnet(magnet: Magnet, points: ViewPoints) -> Markup:
     """Return the view of a nominal magnet and the points of a map, `MOST_POINTS` at most."""
-    count = len(points.positions)
-    drawn = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
+    drawn = spread(np.arange(len(points.positions)), MOST_POINTS)
     return magnet_view(
         magnet, BlockValues(magnet.nominal_magnetization.reshape(len(magnet.blocks), -1)), replace(
             points, positions=points.positions[drawn], values=points.values[drawn],
@@ -261,8 +260,7 @@ def residual_points(positions: Floats, scores: Floats) -> ViewPoints:
     worst[inverse.ravel()[order]] = scores[order]
     if len(points) > MOST_POINTS:
         kept = np.sort(np.argsort(-np.abs(worst))[:MOST_POINTS // 2])
-        evenly = np.linspace(0, len(points) - 1, MOST_POINTS // 2).astype(int)
-        chosen = np.union1d(kept, evenly)
+        chosen = np.union1d(kept, spread(np.arange(len(points)), MOST_POINTS // 2))
         points, worst = points[chosen], worst[chosen]
     return ViewPoints(points, worst, "measured points", "largest standardized<br>residual in sd",
                       "largest residual %{customdata:+.2f} sd", (0.0, LARGE))
@@ -465,10 +463,7 @@ def _hover_text(block: MagnetBlock, more: int, values: BlockValues, number: int)
 def prism(block: MagnetBlock, height: float) -> tuple[Floats, Ints]:
     """Triangulate the surface of a block.
 
-    Parameters
-    ----------
-    height : float
-        Drawn height in m of a block of infinite length.
+    ``height``: drawn height in m of a block of infinite length.
 
     Returns
     -------

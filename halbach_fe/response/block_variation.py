@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sparse
 
-from halbach_fe.core.arrays import Floats, Ints, radii_of
+from halbach_fe.core.arrays import Floats, Ints, radii_of, slices
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -144,7 +144,7 @@ class Variations:
         # number of field components of parts at points that are in memory at a time, 240 MB
         numbers_at_once = 30_000_000
         step = max(1, numbers_at_once // (9 * self.interaction.cells.weights.size))
-        return (every[first:first + step] for first in range(0, len(every), step))
+        return (every[part] for part in slices(len(every), step))
 
     def _of_amplitudes(self, by_part: Floats) -> Floats:
         """Return values (r, amplitudes) per amplitude of those (r, parts 3) per polarization."""

@@ -34,7 +34,7 @@ import numpy as np
 import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, NotConvergedError, StudyError, must_be
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.measurement.observation import Observation
@@ -203,17 +203,13 @@ def newton_readings(
     magnet: Magnet, observation: Observation, session: Session, magnetizations: Floats,
     cold: bool = False,
 ) -> Floats:
-    """Return the readings of magnetizations by GetDP's own Newton method.
+    """Return the readings (k, readings) in T of magnetizations by GetDP's own Newton method.
 
     Parameters
     ----------
     magnetizations : ndarray, shape (k, parameters), in A/m
     cold : bool
         Start Newton's method from zero for every sample, instead of from the sample before.
-
-    Returns
-    -------
-    ndarray, shape (k, readings), in T
     """
     size = magnet.dimension
     samples = np.zeros((len(magnetizations), len(magnet.blocks), 3))
@@ -281,10 +277,7 @@ def _check_iron(
 ) -> None:
     """Check that GetDP's matrix inside the iron equals that assembled from our Gauss points.
 
-    Raises
-    ------
-    GetDPError
-        If the two matrices differ.
+    GetDPError if the two matrices differ.
     """
     size = gradient.shape[0] // len(weights)
     ours = vacuum * (gradient.T @ (sparse.diags_array(np.tile(weights, size)) @ gradient))
@@ -605,8 +598,7 @@ def condense(
     condensed = np.empty((outputs.shape[0], len(surface)))
     coupling, other_outputs = coupling[:, surface], outputs[:, rest]
     step = 256  # number of columns that `condense` solves for at a time, which limits its memory
-    for first in range(0, len(surface), step):
-        part = slice(first, first + step)
+    for part in slices(len(surface), step):
         solved = inner.solve(coupling[:, part].toarray())
         schur[:, part] = coupling.T @ solved
         condensed[:, part] = own[:, surface[part]].toarray() - other_outputs @ solved

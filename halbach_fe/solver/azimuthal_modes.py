@@ -32,7 +32,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from halbach_fe import pro
-from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of
+from halbach_fe.core.arrays import Bools, Floats, Ints, azimuths_of, radii_of, slices
 from halbach_fe.geometry.blocks import MagnetBlock
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import unique_points
@@ -292,8 +292,7 @@ def _shared_out(modes: list[int], most: int) -> list[list[int]]:
     Mode 0 has no boundary condition on the axis, unlike all others.
     """
     others, most = [m for m in modes if m > 0], max(1, most)
-    return [others[first:first + most] for first in range(0, len(others), most)
-            ] + [[m] for m in modes if m == 0]
+    return [others[part] for part in slices(len(others), most)] + [[m] for m in modes if m == 0]
 
 
 def nominal_waves(magnet: Magnet, highest: int) -> Floats:

@@ -29,7 +29,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Bools, Floats, Ints
+from halbach_fe.core.arrays import Bools, Floats, Ints, slices
 from halbach_fe.core.errors import GetDPError, PointsOutsideError
 from halbach_fe.solver import getdp as runner
 from halbach_fe.solver.dofs import Unknowns
@@ -167,10 +167,7 @@ def quadrature(mesh: VerifiedMesh, cells: Ints) -> tuple[Located, Floats]:
     Methods Appl. Mech. Engrg. 55 (1986) 339. The same points as in GetDP give the same discrete
     problem.
 
-    Parameters
-    ----------
-    cells : ndarray of int
-        Indices of the elements.
+    ``cells``: indices of the elements.
 
     Returns
     -------
@@ -410,8 +407,7 @@ def apply_operator(operator: sparse.csr_array, solutions: NDArray[np.floating]) 
     """Apply an operator (n, unknowns) to solutions (k, unknowns); the result has shape (k, n)."""
     result = np.empty((len(solutions), operator.shape[0]))
     step = 32  # number of solutions that are read from the disk at a time, which limits the memory
-    for first in range(0, len(solutions), step):
-        part = slice(first, first + step)
+    for part in slices(len(solutions), step):
         result[part] = (operator @ solutions[part].astype(float).T).T
     return result
 

@@ -31,7 +31,7 @@ import scipy.sparse.linalg as sparse_linalg
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import PointsOutsideError, StudyError, must_be
 from halbach_fe.core.threads import available_memory, in_threads, share_out
 from halbach_fe.geometry import domain as tags
@@ -174,8 +174,7 @@ class Problem:
         size = self.stiffness_of_vacuum.shape[0]
         parts = np.empty((len(self.nodes), 10, 10))
         step = 4096  # elements at a time, which limits the memory
-        for first in range(0, len(parts), step):
-            some = slice(first, first + step)
+        for some in slices(len(parts), step):
             weighted = differential[some] * self.weights[some, :, None, None]
             parts[some] = np.einsum("eqai,eqij,eqbj->eab", self.slopes[some], weighted,
                                     self.slopes[some], optimize=True)
@@ -502,10 +501,6 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
     """Refuse iron whose mesh would not fit into memory, with a size of elements that would.
 
     ``known`` is the number of unknowns once it is meshed. Before, the estimate may be a third low.
-
-    Raises
-    ------
-    StudyError
     """
     from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 

@@ -28,7 +28,7 @@ import numpy as np
 import scipy.linalg as linalg
 import scipy.sparse as sparse
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.stats.gaussian import CovarianceFactor, Gaussian, root_matrix, stacked_root
 from halbach_fe.stats.noise import NoiseCovariance
 
@@ -192,14 +192,14 @@ def _selected(matrix: Rows, indices: Ints) -> Floats:
     return matrix[indices]
 
 
-def row_slices(count: int, columns: int, most: int | None = None) -> Iterator[slice]:
+def row_slices(count: int, columns: int, most: int | None = None) -> list[slice]:
     """Return slices that divide the rows of a matrix (count, columns) into blocks.
 
     A block has at most ``most`` rows (default: `READINGS_AT_ONCE`) and, unless it is a single row,
     at most `NUMBERS_AT_ONCE` entries.
     """
     step = min(most or READINGS_AT_ONCE, max(1, NUMBERS_AT_ONCE // max(1, columns)))
-    return (slice(first, min(first + step, count)) for first in range(0, count, step))
+    return slices(count, step)
 
 
 def information_of(

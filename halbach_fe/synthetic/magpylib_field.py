@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, slices
 from halbach_fe.core.errors import CheckFailedError
 from halbach_fe.core.optional_packages import import_extra
 from halbach_fe.core.pace import Progress
@@ -185,8 +185,8 @@ def tasks_of(bodies: Sequence[Body], points: Floats) -> Iterator[_Task]:
                 (number, (part.factor - 1) * remanence))
     at_once = max(1, searched // len(points))
     for piece, members in groups.items():
-        for first in range(0, len(members), at_once):
-            yield from _tasks(piece, members[first:first + at_once], bodies, points)
+        for some in slices(len(members), at_once):
+            yield from _tasks(piece, members[some], bodies, points)
 
 
 def _tasks(

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csc_array
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints, of_length
+from halbach_fe.core.arrays import Floats, Ints, of_length, slices
 from halbach_fe.core.errors import HalbachError
 from halbach_fe.core.pace import Progress
 from halbach_fe.geometry.blocks import MagnetBlock
@@ -216,10 +216,6 @@ def solve_moments(
         Nodes per direction in every cell.
     applied : callable, optional
         mu_0 H of other sources, such as iron.
-
-    Returns
-    -------
-    Moments
     """
     return System.of(blocks, cells_per_side, divisions).solve(applied)
 
@@ -363,11 +359,10 @@ def reaction_columns(
         deviations, extra = _deviations(system)
         panels = _Panels(system, extra, {})
         step = max(1, ENTRIES_AT_ONCE // (9 * len(system.remanence)))
-        for first in range(0, len(points), step):
-            part = slice(first, first + step)
+        for part in slices(len(points), step):
             found[:, part] = _columns_at(
                 system, np.array(points[part], float), deviations, panels,
-                partial(_report_progress, progress, first, len(points)))
+                partial(_report_progress, progress, part.start, len(points)))
     return lambda number, some: found[number, some]
 
 

@@ -189,7 +189,9 @@ def near_points(generator: np.random.Generator, blocks: list[MagnetBlock], dista
     return np.array(found)
 
 
-def errors_in_bars(generator, susceptibilities, far):
+def errors_in_bars(
+    generator: np.random.Generator, susceptibilities: Floats, far: int
+) -> Floats:
     """Errors of random magnets, near and at ``far`` points, in bars, against four cells a side."""
     ratios = []
     for chi in susceptibilities:
