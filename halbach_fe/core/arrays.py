@@ -6,12 +6,13 @@ import re
 from collections.abc import Sequence
 from itertools import chain
 from numbers import Number
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+T = TypeVar("T", bound=np.generic)
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -53,6 +54,16 @@ def face_vectors(triangles: Floats) -> Floats:
 def unit_circle(angles: ArrayLike) -> Floats:
     """Return the points (..., 3) at angles (...) in rad on the unit circle about the z axis."""
     return np.stack([np.cos(angles), np.sin(angles), np.zeros(np.shape(angles))], axis=-1)
+
+
+def slices(count: int, most: int) -> list[slice]:
+    """Return slices that divide ``count`` rows into parts of at most ``most``, in order."""
+    return [slice(first, min(first + most, count)) for first in range(0, count, most)]
+
+
+def spread(rows: NDArray[T], most: int) -> NDArray[T]:
+    """Return at most so many of some rows (n, ...), from the first to the last, evenly spread."""
+    return rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
 
 
 AXIS = re.compile(r"[bB]?_?([xyzXYZ])(?![A-Za-z])")

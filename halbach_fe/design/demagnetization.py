@@ -63,44 +63,31 @@ LINEAR = 0.25, 2.0
 
 @dataclass(frozen=True)
 class Cells:
-    """Blocks cut into small cells, layer by layer.
-
-    Attributes
-    ----------
-    vertices : ndarray, shape (v, 3), in m
-    corners : ndarray, shape (cells, 8), or in 2D (cells, 4)
-        Numbers of the vertices of each cell, in VTK's order.
-    block : ndarray, shape (cells,)
-        Number of the block that each cell belongs to, counted from 0.
-    middles : ndarray, shape (cells, 3), in m
-        Centres of the cells, where H is computed.
-    volumes : ndarray, shape (cells,), in m^3 (in 2D areas in m^2)
-    """
+    """Blocks cut into small cells, layer by layer."""
 
     vertices: Floats
+    """Shape (v, 3), in m."""
     corners: Ints
+    """Numbers of the vertices of each cell, in VTK's order.
+    Shape (cells, 8), or in 2D (cells, 4)."""
     block: Ints
+    """Number of the block that each cell belongs to, counted from 0. Shape (cells,)."""
     middles: Floats
+    """Centres of the cells, where H is computed. Shape (cells, 3), in m."""
     volumes: Floats
+    """Shape (cells,), in m^3 (in 2D areas in m^2)."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places anywhere in cells that are in an opposed field, and the middles of other ones.
-
-    Attributes
-    ----------
-    cell : ndarray, shape (n,)
-        Number of the cell of each place.
-    volumes : ndarray, shape (n,), in m^3 (in 2D areas in m^2)
-        What of the volume of its cell each stands for.
-    along : ndarray, shape (n,), in A/m
-        H along the magnetization.
-    """
+    """Places anywhere in cells that are in an opposed field, and the middles of other ones."""
 
     cell: Ints
+    """Number of the cell of each place. Shape (n,)."""
     volumes: Floats
+    """What of the volume of its cell each stands for. Shape (n,), in m^3 (in 2D areas in m^2)."""
     along: Floats
+    """H along the magnetization. Shape (n,), in A/m."""
 
 
 @dataclass(frozen=True)
@@ -265,8 +252,6 @@ def demagnetization_map(
 
     Parameters
     ----------
-    magnet : Magnet
-    session : Session
     across : int
         Number of cells across the radial thickness of a block. In the other directions the cells
         have about the same length, but are no fewer: through a thin block H varies most.
@@ -352,12 +337,7 @@ Cut = tuple[Floats, Ints, Floats, Floats]
 
 
 def _check_memory(count: int, across: int) -> None:
-    """Refuse more cells than fit into memory.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse more cells than fit into memory."""
     bytes_each = 800  # of 0.44 million cells 765 were measured
     needed, left = count * bytes_each / 2**30, available_memory()
     if left is not None and needed > left:
@@ -517,12 +497,7 @@ def _by_moments(magnet: Magnet) -> bool:
 
 
 def _check_equal_rings(magnet: Magnet) -> None:
-    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse rings of their own and free blocks where a mesh of all space is needed in 3D."""
     if magnet.dimension == 3 and not magnet.array.is_uniform:
         raise StudyError(
             f"Input `array` of study {magnet.name} must consist of equal rings for a map of the "

@@ -42,23 +42,15 @@ from halbach_fe.stats.linear_gaussian import posterior
 
 @dataclass(frozen=True)
 class UnknownDeviation:
-    """The rms uncertainty of the deviation of |B| in the study's region, in ppm.
-
-    Attributes
-    ----------
-    region : Region
-    prior : float
-        Without any readings.
-    planned : ndarray, shape (count,)
-        After the first 1, 2, ... chosen positions.
-    baseline : ndarray
-        After the evenly spread subsets of the study's positions.
-    """
+    """The rms uncertainty of the deviation of |B| in the study's region, in ppm."""
 
     region: Region
     prior: float
+    """Without any readings."""
     planned: Floats
+    """After the first 1, 2, ... chosen positions. Shape (count,)."""
     baseline: Floats
+    """After the evenly spread subsets of the study's positions."""
 
 
 @dataclass(frozen=True)
@@ -139,11 +131,8 @@ class MeasurementPlan(ShownInNotebook):
 def plan_measurement(magnet: Magnet, session: Session, count: int | None = None) -> MeasurementPlan:
     """Choose positions for a study's next measurement.
 
-    Parameters
-    ----------
-    count : int, optional
-        Number of positions to choose. Default: the study's ``plan.points``, else the number of
-        positions that the study measures.
+    ``count``: number of positions to choose. Default: the study's ``plan.points``, else the number
+    of positions that the study measures.
 
     Raises
     ------
@@ -198,10 +187,7 @@ def plan_measurement(magnet: Magnet, session: Session, count: int | None = None)
 def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Floats, int]:
     """Return the candidate positions (n, 3) in m and the number of positions to choose.
 
-    Raises
-    ------
-    StudyError
-        See `plan_measurement`.
+    StudyError: See `plan_measurement`.
     """
     if magnet.study.observation.quantity != "flux_density":
         raise StudyError(
@@ -264,21 +250,15 @@ def variance_left(design: Floats, values: Floats) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """Positions in the order of their choice, and what they tell.
-
-    Attributes
-    ----------
-    chosen : ndarray of int, shape (count,)
-        Indices of the positions.
-    gain : ndarray, shape (count,)
-        Information gain in nats of the positions chosen up to and including each.
-    fall : ndarray, shape (count,)
-        What they take off the sum of the variances of the values of interest; 0 without such.
-    """
+    """Positions in the order of their choice, and what they tell."""
 
     chosen: Ints
+    """Indices of the positions. Shape (count,)."""
     gain: Floats
+    """Information gain in nats of the positions chosen up to and including each. Shape (count,)."""
     fall: Floats
+    """What they take off the sum of the variances of the values of interest; 0 without such.
+    Shape (count,)."""
 
 
 def greedy(design: Floats, count: int, values: Floats | None = None) -> Choice:

@@ -138,21 +138,15 @@ class SortedBlocks(ShownInNotebook):
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The measured blocks, and what each of them does in each slot.
-
-    Attributes
-    ----------
-    slots : Slots
-    offset : ndarray, shape (q,)
-        The values without blocks.
-    types, slot_types : ndarray of int, shape (blocks,) and (slots,)
-        Number of the type of each block, and of the blocks that each slot takes.
-    """
+    """The measured blocks, and what each of them does in each slot."""
 
     slots: Slots
     offset: Floats
+    """The values without blocks. Shape (q,)."""
     types: Ints
     slot_types: Ints
+    """Number of the type of each block, and of the blocks that each slot takes.
+    Shape (blocks,) and (slots,)."""
 
 
 def sort_blocks(
@@ -164,12 +158,10 @@ def sort_blocks(
 
     Parameters
     ----------
-    magnet : Magnet
     table : BlockTable
         The measured blocks.
     model : MultipoleModel or DeviationModel
         What to make small.
-    generator : numpy.random.Generator
     progress : callable, optional
         Is called with the number of starts done and their total number.
     turns : bool
@@ -383,30 +375,22 @@ Change = tuple[float, tuple[tuple[int, int, int], ...]]
 
 @dataclass(frozen=True)
 class Slots:
-    """Slots, and the blocks that may stand in them; S slots, B blocks, q values, dimension D.
-
-    Attributes
-    ----------
-    effect : ndarray, shape (q, S, D)
-        Change of the values by magnetizations in A/m in the own axes of each slot.
-    blocks : ndarray, shape (B, D), in A/m
-        Mean magnetizations of the blocks in own axes.
-    spread : ndarray, shape (B, D, D), in A^2/m^2
-        Covariances that mounting adds, in own axes.
-    turns : ndarray, shape (n, D, D)
-        Rotations of a block in its own axes; the first is the identity.
-    fits : ndarray of bool, shape (n, A, C)
-        Turns by which blocks of a class C fit into slots of a class A.
-    slot_class, block_class : ndarray of int, shape (S,) and (B,)
-    """
+    """Slots, and the blocks that may stand in them; S slots, B blocks, q values, dimension D."""
 
     effect: Floats
+    """Change of the values by magnetizations in A/m in the own axes of each slot.
+    Shape (q, S, D)."""
     blocks: Floats
+    """Mean magnetizations of the blocks in own axes. Shape (B, D), in A/m."""
     spread: Floats
+    """Covariances that mounting adds, in own axes. Shape (B, D, D), in A^2/m^2."""
     turns: Floats
+    """Rotations of a block in its own axes; the first is the identity. Shape (n, D, D)."""
     fits: Bools
+    """Turns by which blocks of a class C fit into slots of a class A. Shape (n, A, C)."""
     slot_class: Ints
     block_class: Ints
+    """Shape (S,) and (B,)."""
 
     @cached_property
     def products(self) -> Floats:
@@ -505,22 +489,16 @@ class Slots:
 
 @dataclass
 class Assignment:
-    """Which block stands in which slot by which turn, and the values that result.
-
-    Attributes
-    ----------
-    slots : Slots
-    order, turn : ndarray of int, shape (S,)
-    present : ndarray, shape (S, D), in A/m
-        Magnetizations in the slots, in own axes.
-    values : ndarray, shape (q,)
-    """
+    """Which block stands in which slot by which turn, and the values that result."""
 
     slots: Slots
     order: Ints
     turn: Ints
+    """Shape (S,)."""
     present: Floats
+    """Magnetizations in the slots, in own axes. Shape (S, D), in A/m."""
     values: Floats
+    """Shape (q,)."""
 
     @classmethod
     def of(cls, slots: Slots, order: Ints, start: Floats) -> Assignment:

@@ -146,11 +146,7 @@ def assembled_prior(magnet: Magnet, nominal: Floats) -> Gaussian:
     It has the tolerances of the blocks, the error that they share, and the random angles by which
     blocks are turned when they are mounted.
 
-    Parameters
-    ----------
-    magnet : Magnet
-    nominal : ndarray, shape (parameters,), in A/m
-        Nominal magnetizations, and 0 for variations inside blocks.
+    ``nominal`` (parameters,) in A/m: nominal magnetizations, and 0 for variations inside blocks.
     """
     settings, size = magnet.study.prior, magnet.dimension
     uniform = nominal[:size * len(magnet.blocks)]
@@ -174,7 +170,6 @@ def predict_tolerance(
         Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
         Number of samples.
-    generator : numpy.random.Generator
     limit : float, optional
         Limit of every |c_n|, in units of 1e-4.
     """
@@ -203,7 +198,6 @@ def predict_homogeneity(
         Distribution of the magnetizations in A/m, including the errors of mounting.
     draws : int
         Number of samples.
-    generator : numpy.random.Generator
     limit : float, optional
         Limit of the rms deviation in ppm.
     """

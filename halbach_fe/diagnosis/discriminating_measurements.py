@@ -27,7 +27,7 @@ import numpy as np
 import scipy.sparse as sparse
 import xarray as xr
 
-from halbach_fe.core.arrays import Bools, Floats, radii_of
+from halbach_fe.core.arrays import Bools, Floats, radii_of, spread
 from halbach_fe.diagnosis.effects import catalogue
 from halbach_fe.diagnosis.effects.base import Effect, Hypothesis, Place
 from halbach_fe.diagnosis.marginal_evidence import Marginal
@@ -67,81 +67,54 @@ TEMPERATURE_EFFECTS = {"temperature", "temperature_gradient"}
 
 @dataclass(frozen=True)
 class ProposedScan:
-    """Readings of a map, present or proposed.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), in m
-        Points in the mapper's axes.
-    time : ndarray, shape (n,)
-        Time of each point, from 0 to 1.
-    analysis : sparse array, shape (readings, 3 n)
-        Matrix from B at the points to the readings.
-    noise : NoiseCovariance
-        Noise of the readings.
-    probe_rotation, magnet_rotation : ndarray, shape (3, 3)
-        Rotations of the probe and of the magnet in the mapper's axes, relative to their orientation
-        in the study.
-    temperature_known : bool
-        Whether the magnet's temperature is uniform and measured.
-    mapped : bool
-        Whether the mapper and its probe take the readings; False for an NMR teslameter.
-    map : str or None
-        Name of the map, of those that the study lists, whose mapper and probe take them.
-    way : ndarray, shape (n, 3), or None
-        See `NominalFields.way`; None if all lines go one way, so that a lag does not show.
-    """
+    """Readings of a map, present or proposed."""
 
     points: Floats
+    """Points in the mapper's axes. Shape (n, 3), in m."""
     time: Floats
+    """Time of each point, from 0 to 1. Shape (n,)."""
     analysis: sparse.csr_array
+    """Matrix from B at the points to the readings. Shape (readings, 3 n)."""
     noise: NoiseCovariance
+    """Noise of the readings."""
     probe_rotation: Floats
     magnet_rotation: Floats
+    """Rotations of the probe and of the magnet in the mapper's axes, relative to their orientation
+    in the study. Shape (3, 3)."""
     temperature_known: bool = False
+    """Whether the magnet's temperature is uniform and measured."""
     mapped: bool = True
+    """Whether the mapper and its probe take the readings; False for an NMR teslameter."""
     map: str | None = None
+    """Name of the map, of those that the study lists, whose mapper and probe take them."""
     way: Floats | None = None
+    """See `NominalFields.way`; None if all lines go one way, so that a lag does not show.
+    Shape (n, 3)."""
 
 
 @dataclass(frozen=True)
 class CandidateMeasurement:
-    """A further measurement that can be made.
-
-    Attributes
-    ----------
-    name : str
-    title : str
-        Description for a report.
-    scan : ProposedScan
-        The readings that the measurement adds.
-    """
+    """A further measurement that can be made."""
 
     name: str
     title: str
+    """Description for a report."""
     scan: ProposedScan
+    """The readings that the measurement adds."""
 
 
 @dataclass(frozen=True)
 class Separation:
-    """The measurements that can distinguish an identified effect from a rival.
-
-    Attributes
-    ----------
-    identified, rival : Hypothesis
-    candidates : tuple of CandidateMeasurement
-        All candidate measurements, the cheapest first.
-    gains : dict
-        Expected gain in the log Bayes factor by name of the candidate.
-    recommended : CandidateMeasurement or None
-        The cheapest candidate whose gain exceeds `SEPARATING_GAIN`.
-    """
+    """The measurements that can distinguish an identified effect from a rival."""
 
     identified: Hypothesis
     rival: Hypothesis
     candidates: tuple[CandidateMeasurement, ...]
+    """All candidate measurements, the cheapest first."""
     gains: dict[str, float]
+    """Expected gain in the log Bayes factor by name of the candidate."""
     recommended: CandidateMeasurement | None
+    """The cheapest candidate whose gain exceeds `SEPARATING_GAIN`."""
 
 
 @dataclass(frozen=True)
@@ -150,20 +123,15 @@ class ScanFields(NominalFields):
 
     The magnet is rotated before the mapper. Effects of the instrument take their signatures from
     these fields.
-
-    Attributes
-    ----------
-    unrotated : NominalFields
-        The study's magnet at the points of all scans, in the magnet's own axes.
-    part : slice
-        The points of this scan among all points of ``unrotated``.
-    magnet_rotation, probe_rotation : ndarray, shape (3, 3)
     """
 
     unrotated: NominalFields
+    """The study's magnet at the points of all scans, in the magnet's own axes."""
     part: slice
+    """The points of this scan among all points of ``unrotated``."""
     magnet_rotation: Floats
     probe_rotation: Floats
+    """Shape (3, 3)."""
 
     @cached_property
     def field(self) -> Floats:
@@ -189,10 +157,8 @@ def separations(
 
     Parameters
     ----------
-    diagnosis : Diagnosis
     data : Dataset or dict of str to Dataset
         The maps that were diagnosed.
-    session : Session
     effects : sequence of Effect, optional
         The effects among which the diagnosis chose; default the whole catalogue.
     """
@@ -274,8 +240,7 @@ def candidate_measurements(
     radius = 0.8 * magnet.bore_radius
     if radii[-1] > 0.9 * radius:
         radius = 0.5 * max(float(radii[0]), 0.5 * radius)
-    heights = np.unique(np.round(places[:, 2], 9))
-    heights = heights[np.linspace(0, len(heights) - 1, min(len(heights), 40)).astype(int)]
+    heights = spread(np.unique(np.round(places[:, 2], 9)), 40)
     others = [("second_radius", f"circles of radius {1e3 * radius:.0f} mm",
                np.vstack([_circle(radius, z) for z in heights]))]
     if study.dimension == 3:

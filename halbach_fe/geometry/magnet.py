@@ -471,12 +471,7 @@ def _check_neighbours(
     dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None,
     neighbours: tuple[Neighbour, ...],
 ) -> None:
-    """Refuse neighbouring magnets in the place of the magnet or of one another.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse neighbouring magnets in the place of the magnet or of one another."""
     own = tuple(block for block in blocks_of_array(array, dimension) if block.remanence)
     reach = max(abs(end) for block in own for end in (block.z_min, block.z_max))
     solids = iron_solids(dimension, iron_ring, iron, reach)
@@ -503,12 +498,7 @@ NEAR = 0.1
 
 @lru_cache(maxsize=128)
 def _check_windings(coils: tuple[AnyCoil, ...]) -> None:
-    """Refuse coils in the winding of another one; they may touch.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse coils in the winding of another one; they may touch."""
     windings = [points_in_winding(coil) for coil in coils]
     steps = [np.median(np.linalg.norm(np.diff(points, axis=0), axis=1)) for points in windings]
     middles = np.array([points.mean(axis=0) for points in windings])
@@ -557,10 +547,6 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
 
     Points of bodies are tested, and points of windings, so that thin ones are found too. Blocks and
     iron of a cross-section have no ends, so that the height of a coil does not matter.
-
-    Raises
-    ------
-    StudyError
     """
     blocks = tuple(block for block in blocks_of_array(array, dimension) if block.remanence)
     reach = max((abs(end) for block in blocks for end in (block.z_min, block.z_max)), default=0.0)
@@ -596,12 +582,7 @@ def _check_coils(dimension: int, array: Array, iron_ring: IronRing | None, iron:
 def _check_overlaps(
     dimension: int, array: Array, iron_ring: IronRing | None, iron: Iron | None
 ) -> None:
-    """Refuse blocks that overlap one another or iron, in their nominal or in their real places.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse blocks that overlap one another or iron, in their nominal or in their real places."""
     # overlap of nominal blocks that is rounding, as a fraction of a block's half width. Tables of
     # blocks are often rounded to a micrometre, 1e-4 of the half width of a block of 20 mm.
     rounding_overlap, table_overlap = 1e-6, 2e-4

@@ -184,37 +184,24 @@ def infer(
 
 @dataclass(frozen=True)
 class _Update:
-    """One update of all parameters: those of the blocks, then what is beside them.
-
-    Attributes
-    ----------
-    readings : Readings
-    vectors, model : Response
-        The responses of `Readings.vectors` and of the readings to the parameters of the blocks.
-    matrix : Rows
-        Derivatives (readings, parameters) by all parameters.
-    exact : Rows
-        The same for a solver without the error that readings share, see `_Search._beside`: its
-        columns are 0.
-    prior : Gaussian
-    residual : ndarray, shape (readings,), in T
-        Readings less what the model reads of the nominal magnet.
-    errors : NoiseCovariance
-        Noise of the readings, with the solver's error and the bend of |B|.
-    magnitudes : Magnitudes
-        About which readings of |B| are linear.
-    update : LinearPosterior
-    """
+    """One update of all parameters: those of the blocks, then what is beside them."""
 
     readings: Readings
     vectors: Response
     model: Response
+    """The responses of `Readings.vectors` and of the readings to the parameters of the blocks."""
     matrix: Rows
+    """Derivatives (readings, parameters) by all parameters."""
     exact: Rows
+    """The same for a solver without the error that readings share, see `_Search._beside`: its
+    columns are 0."""
     prior: Gaussian
     residual: Floats
+    """Readings less what the model reads of the nominal magnet. Shape (readings,), in T."""
     errors: NoiseCovariance
+    """Noise of the readings, with the solver's error and the bend of |B|."""
     magnitudes: Magnitudes
+    """About which readings of |B| are linear."""
     update: linear_gaussian.LinearPosterior
 
     @property
@@ -236,70 +223,46 @@ class _Update:
 
 @dataclass
 class _Search:
-    """Updates, each about what the last one found, until the terms of the instruments are at rest.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    session : Session
-    similar : Magnet or None
-        See `infer`.
-    of_blocks : MeasuredPrior or None
-        Prior from a table of measured blocks.
-    prior : Gaussian or None
-        Prior of the blocks' parameters that replaces it and that of the study.
-    terms : OpenTerms
-        Terms of the instruments that are estimated.
-    amplitudes : tuple of Uncertain
-        What else is uncertain of the instruments.
-    maps : sequence of Map
-        With the instruments as they are estimated.
-    total : ndarray, shape (terms,)
-        Change of the open terms since the study.
-    at : _Estimate or None
-        The magnet as it is estimated; None if all terms are known.
-    nominal_field : callable or None
-        Field of the nominal magnet, if ``amplitudes`` act on it.
-    magnitudes : Magnitudes
-        The field about which readings of |B| are linear.
-    noises : dict
-        Noise of each map, computed once for one magnet.
-    noise_blocks : tuple of MagnetBlock or None
-        In whose gradient uncertain positions make the noise; None for the nominal ones.
-    solved : _Solved or None
-        The last response that was solved for.
-    error, shared_error : ndarray or None, in T
-        Of the solver in each reading, and in all together, see `Response`.
-    place : _Place or None
-        What the last update that was not worse has found.
-    share : float
-        Part of the last change of the terms that was taken.
-    level : int
-        Number of updates since the last that was better by more than `NO_WORSE`, but for those that
-        were worse.
-    last : _Update
-    """
+    """Updates, each about what the last one found, until the instruments are at rest."""
 
     magnet: Magnet
     session: Session
     similar: Magnet | None
+    """See `infer`."""
     of_blocks: MeasuredPrior | None
+    """Prior from a table of measured blocks."""
     prior: Gaussian | None
+    """Prior of the blocks' parameters that replaces it and that of the study."""
     terms: OpenTerms
+    """Terms of the instruments that are estimated."""
     amplitudes: tuple[Uncertain, ...]
+    """What else is uncertain of the instruments."""
     maps: Sequence[Map]
+    """With the instruments as they are estimated."""
     total: Floats
+    """Change of the open terms since the study. Shape (terms,)."""
     at: _Estimate | None
+    """The magnet as it is estimated; None if all terms are known."""
     nominal_field: Callable[[Floats], Floats] | None
+    """Field of the nominal magnet, if ``amplitudes`` act on it."""
     magnitudes: Magnitudes = field(default_factory=Magnitudes)
+    """The field about which readings of |B| are linear."""
     noises: Noises = field(default_factory=dict)
+    """Noise of each map, computed once for one magnet."""
     noise_blocks: tuple[MagnetBlock, ...] | None = None
+    """In whose gradient uncertain positions make the noise; None for the nominal ones."""
     solved: _Solved | None = None
+    """The last response that was solved for."""
     error: Floats | None = None
     shared_error: Floats | None = None
+    """Of the solver in each reading, and in all together, see `Response`. In T."""
     place: _Place | None = None
+    """What the last update that was not worse has found."""
     share: float = 1.0
+    """Part of the last change of the terms that was taken."""
     level: int = 0
+    """Number of updates since the last that was better by more than `NO_WORSE`, but for those that
+    were worse."""
     last: _Update = field(init=False)
 
     @classmethod
@@ -549,30 +512,20 @@ class _Estimate:
 
 @dataclass(frozen=True)
 class _Place:
-    """Terms of the instruments about which an update was made, and what it found.
-
-    Attributes
-    ----------
-    maps : sequence of Map
-        With instruments of these terms.
-    total : ndarray, shape (terms,)
-        Their change since the study.
-    estimate : _Estimate
-        The magnet about which the update was made.
-    change : ndarray, shape (terms,)
-        Of the terms, that the update found.
-    deviations : ndarray, shape (parameters,)
-        Of the blocks, that the update found.
-    log_posterior : float
-        Log posterior density of the terms about which the update was made, but for a constant.
-    """
+    """Terms of the instruments about which an update was made, and what it found."""
 
     maps: Sequence[Map]
+    """With instruments of these terms."""
     total: Floats
+    """Their change since the study. Shape (terms,)."""
     estimate: _Estimate
+    """The magnet about which the update was made."""
     change: Floats
+    """Of the terms, that the update found. Shape (terms,)."""
     deviations: Floats
+    """Of the blocks, that the update found. Shape (parameters,)."""
     log_posterior: float
+    """Log posterior density of the terms about which the update was made, but for a constant."""
 
     def moved(
         self, open_terms: OpenTerms, share: float

@@ -53,25 +53,17 @@ from halbach_fe.study.uncertain import shifted
 
 @dataclass(frozen=True)
 class OpenTerms:
-    """The terms of the instruments of some maps that are not known exactly.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of each term, after the name of its map, stage or probe: ``fringe.translation_x_m``.
-    sd : ndarray, shape (terms,)
-        Prior standard deviations.
-    effects : tuple of ndarray, shape (30, terms)
-        For each map, how the open terms change the terms of its instrument (see `NAMES`). Maps of
-        one probe or stage share open terms.
-    shifts : tuple of ndarray, shape (3, terms)
-        For each map, how the open terms shift it along the axes of its stage.
-    """
+    """The terms of the instruments of some maps that are not known exactly."""
 
     names: tuple[str, ...]
+    """Of each term, after the name of its map, stage or probe: ``fringe.translation_x_m``."""
     sd: Floats
+    """Prior standard deviations. Shape (terms,)."""
     effects: tuple[Floats, ...]
+    """For each map, how the open terms change the terms of its instrument (see `NAMES`). Maps of
+    one probe or stage share open terms. Shape (30, terms)."""
     shifts: tuple[Floats, ...]
+    """For each map, how the open terms shift it along the axes of its stage. Shape (3, terms)."""
 
     @classmethod
     def of(cls, maps: Sequence[Map]) -> OpenTerms:
@@ -216,8 +208,6 @@ def amplitude_columns(
         With the instruments as they are estimated.
     field : callable
         See `OpenTerms.columns`.
-    maps : sequence of Map
-    readings : Readings
     """
     # Step of the differences by uncertain amplitudes of an instrument, in standard deviations: its
     # laws are linear to 1e-6 over it.

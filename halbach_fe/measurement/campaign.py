@@ -16,7 +16,7 @@ from scipy import special
 from scipy.spatial import KDTree
 
 from halbach_fe.core.arguments import typed
-from halbach_fe.core.arrays import Floats
+from halbach_fe.core.arrays import Floats, box_middle
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.measurement.field_map import (
     TOTAL_COLUMN,
@@ -68,46 +68,27 @@ below which so many repetitions are no chance."""
 
 @dataclass(frozen=True)
 class Map:
-    """A map, and what the study says about it.
-
-    Attributes
-    ----------
-    name : str
-    data : Dataset
-    study : Study
-        The study of this map alone.
-    middle_m : ndarray, shape (3,)
-        Middle of its points in the coordinates that the map states.
-    pivot_m : ndarray, shape (3,)
-        The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
-        middle, or that of the first map on the same stage.
-    probe : str
-        Name of its probe. Maps of one probe share its terms.
-    pose : str
-        Name of the stage or of the map whose pose it shares, mostly its own.
-    offsets : str
-        Name of the map whose offsets and drift it has, mostly its own.
-    shift_sd_m : tuple of float
-        Prior standard deviations of an own shift along the axes of the stage.
-    is_validation : bool
-        Whether it is predicted but does not update the model.
-    """
+    """A map, and what the study says about it."""
 
     name: str
     data: xr.Dataset
     study: Study
+    """The study of this map alone."""
     middle_m: Floats
+    """Middle of its points in the coordinates that the map states. Shape (3,)."""
     pivot_m: Floats
+    """The point, in the same coordinates, that the uncertain pose shifts and turns about: its own
+    middle, or that of the first map on the same stage. Shape (3,)."""
     probe: str
+    """Name of its probe. Maps of one probe share its terms."""
     pose: str
+    """Name of the stage or of the map whose pose it shares, mostly its own."""
     offsets: str
+    """Name of the map whose offsets and drift it has, mostly its own."""
     shift_sd_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Prior standard deviations of an own shift along the axes of the stage."""
     is_validation: bool = False
-
-
-def middle_of(points: Floats) -> Floats:
-    """Return the middle (3,) in m of the box about points (n, 3)."""
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+    """Whether it is predicted but does not update the model."""
 
 
 @typed
@@ -157,7 +138,6 @@ def maps_of(
 
     Parameters
     ----------
-    study : Study
     data : Dataset or dict of str to Dataset
         The only map of a study that lists none, or the maps that it lists, by name.
     validation_map : Dataset, optional
@@ -409,4 +389,4 @@ def _seen_from(study: Study, first: Map) -> Floats:
 
 
 def _middle(study: Study, data: xr.Dataset) -> Floats:
-    return middle_of(points_of(in_si_and_magnet_axes(study.instrument, data)))
+    return box_middle(points_of(in_si_and_magnet_axes(study.instrument, data)))

@@ -693,11 +693,8 @@ def _without_total(
     """Return which rows of a map hold nothing, |B| included; ``blank`` (n,) are those without any
     component.
 
-    Raises
-    ------
-    MeasurementError
-        If |B| is negative or infinite, its noise is not positive, or some rows hold components and
-        others |B| alone.
+    MeasurementError if |B| is negative or infinite, its noise is not positive, or some rows hold
+    components and others |B| alone.
     """
     total = data[TOTAL_COLUMN].values
     wrong = np.isinf(total) | (total < 0)

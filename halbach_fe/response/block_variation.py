@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sparse
 
-from halbach_fe.core.arrays import Floats, Ints, radii_of
+from halbach_fe.core.arrays import Floats, Ints, radii_of, slices
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
 from halbach_fe.geometry.blocks import MagnetBlock, rotation_about_z, vector
 from halbach_fe.geometry.magnet import Magnet, build_magnet
@@ -50,23 +50,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Variations:
-    """The variations inside the blocks of a magnet, as polarizations of cells.
-
-    Attributes
-    ----------
-    interaction : Interaction
-    starts : ndarray of int, shape (blocks + 1,)
-        Number of the first cell of every block.
-    polarization : tuple of ndarray, shape (cells of a block, q, 3, modes), in T
-        For every block the polarization of the parts of its cells per amplitude.
-    names : tuple of str
-        Names of all amplitudes, block by block, such as ``r01s05.v03``.
-    """
+    """The variations inside the blocks of a magnet, as polarizations of cells."""
 
     interaction: Interaction
     starts: Ints
+    """Number of the first cell of every block. Shape (blocks + 1,)."""
     polarization: tuple[Floats, ...]
+    """For every block the polarization of the parts of its cells per amplitude.
+    Shape (cells of a block, q, 3, modes), in T."""
     names: tuple[str, ...]
+    """Names of all amplitudes, block by block, such as ``r01s05.v03``."""
 
     @classmethod
     def of(cls, magnet: Magnet) -> Variations | None:
@@ -151,7 +144,7 @@ class Variations:
         # number of field components of parts at points that are in memory at a time, 240 MB
         numbers_at_once = 30_000_000
         step = max(1, numbers_at_once // (9 * self.interaction.cells.weights.size))
-        return (every[first:first + step] for first in range(0, len(every), step))
+        return (every[part] for part in slices(len(every), step))
 
     def _of_amplitudes(self, by_part: Floats) -> Floats:
         """Return values (r, amplitudes) per amplitude of those (r, parts 3) per polarization."""
@@ -393,13 +386,7 @@ Field = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class Deviations:
-    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks.
-
-    Attributes
-    ----------
-    magnet : Magnet
-    variations : Variations or None
-    """
+    """The blocks of a magnet whose magnetizations deviate, and vary within the blocks."""
 
     magnet: Magnet
     variations: Variations | None

@@ -48,40 +48,28 @@ Field = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class Reach:
-    """The largest distance at which |B| reaches the limit.
-
-    Attributes
-    ----------
-    distance_m : float
-        From the z axis, or from the plane z = 0.
-    sd_m : float
-        Its standard deviation, linearized; 0 for the nominal magnet.
-    at_m : tuple of float
-        The point.
-    """
+    """The largest distance at which |B| reaches the limit."""
 
     distance_m: float
+    """From the z axis, or from the plane z = 0."""
     sd_m: float
+    """Its standard deviation, linearized; 0 for the nominal magnet."""
     at_m: tuple[float, float, float]
+    """The point."""
 
 
 @dataclass(frozen=True)
 class StrayPlane:
-    """|B| outside of the magnet in a plane through its middle.
-
-    Attributes
-    ----------
-    across : str
-        The axis that is normal to the plane.
-    first_m, second_m, size_T : ndarray, shape (k, m)
-        Coordinates along the other axes, in the order of x, y and z, and |B|: k curves around the
-        magnet, from the nearest outwards, of which the last point is the first one again.
-    """
+    """|B| outside of the magnet in a plane through its middle."""
 
     across: str
+    """The axis that is normal to the plane."""
     first_m: Floats
     second_m: Floats
     size_T: Floats
+    """Coordinates along the other axes, in the order of x, y and z, and |B|: k curves around the
+    magnet, from the nearest outwards, of which the last point is the first one again.
+    Shape (k, m)."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ import scipy.sparse.linalg as sparse_linalg
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, slices
 from halbach_fe.core.errors import PointsOutsideError, StudyError, must_be
 from halbach_fe.core.threads import available_memory, in_threads, share_out
 from halbach_fe.geometry import domain as tags
@@ -79,33 +79,23 @@ numbering of the unknowns makes 0.5 or more."""
 
 @dataclass(frozen=True)
 class Problem:
-    """The discrete problem of the iron.
-
-    Attributes
-    ----------
-    bodies : tuple of IronSolid
-    stiffness_of_vacuum : sparse array, shape (n, n)
-    nodes : ndarray of int, shape (e, 10)
-        Unknowns of the iron's elements.
-    slopes : ndarray, shape (e, 15, 10, 3), in 1/m
-        Gradients of the functions of the nodes at the Gauss points.
-    weights : ndarray, shape (e, 15), in m^3
-    places : ndarray, shape (e, 10, 3), in m
-        Places of the nodes.
-    body : ndarray of int, shape (e,)
-        Body of each element.
-    coarse : sparse array, shape (n, corners)
-        Values at all nodes of those at the corners, linear in between.
-    """
+    """The discrete problem of the iron."""
 
     bodies: tuple[IronSolid, ...]
     stiffness_of_vacuum: sparse.csr_array
+    """Shape (n, n)."""
     nodes: Ints
+    """Unknowns of the iron's elements. Shape (e, 10)."""
     slopes: Floats
+    """Gradients of the functions of the nodes at the Gauss points. Shape (e, 15, 10, 3), in 1/m."""
     weights: Floats
+    """Shape (e, 15), in m^3."""
     places: Floats
+    """Places of the nodes. Shape (e, 10, 3), in m."""
     body: Ints
+    """Body of each element. Shape (e,)."""
     coarse: sparse.csr_array
+    """Values at all nodes of those at the corners, linear in between. Shape (n, corners)."""
 
     @cached_property
     def points(self) -> Floats:
@@ -184,8 +174,7 @@ class Problem:
         size = self.stiffness_of_vacuum.shape[0]
         parts = np.empty((len(self.nodes), 10, 10))
         step = 4096  # elements at a time, which limits the memory
-        for first in range(0, len(parts), step):
-            some = slice(first, first + step)
+        for some in slices(len(parts), step):
             weighted = differential[some] * self.weights[some, :, None, None]
             parts[some] = np.einsum("eqai,eqij,eqbj->eab", self.slopes[some], weighted,
                                     self.slopes[some], optimize=True)
@@ -256,26 +245,17 @@ class Tangent:
 
 @dataclass(frozen=True)
 class BodiesReaction(WithBar):
-    """The field that iron adds to that of its sources; `solve_bodies` returns it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the study.
-    problem : Problem
-    total : ndarray, shape (n, 1), in T m
-        The total potential in the iron.
-    residuals : tuple of float
-        Relative residual of Newton's method at the start and after every step.
-    coarse : BodiesReaction or None
-        The solution with larger elements, for the error bar.
-    """
+    """The field that iron adds to that of its sources; `solve_bodies` returns it."""
 
     name: str
+    """Name of the study."""
     problem: Problem
     total: Floats
+    """The total potential in the iron. Shape (n, 1), in T m."""
     residuals: tuple[float, ...]
+    """Relative residual of Newton's method at the start and after every step."""
     coarse: BodiesReaction | None
+    """The solution with larger elements, for the error bar."""
 
     @cached_property
     def polarization(self) -> Floats:
@@ -398,10 +378,8 @@ def solve_bodies(
 
     Parameters
     ----------
-    magnet : Magnet
     source : callable
         mu_0 H of the sources in T at points (n, 3) in m in the iron.
-    session : Session
     estimate : bool
         Whether to solve once more with larger elements, for the error bar.
     start : BodiesReaction, optional
@@ -523,10 +501,6 @@ def _check_memory(magnet: Magnet, coarseness: float, known: int | None = None) -
     """Refuse iron whose mesh would not fit into memory, with a size of elements that would.
 
     ``known`` is the number of unknowns once it is meshed. Before, the estimate may be a third low.
-
-    Raises
-    ------
-    StudyError
     """
     from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
 

@@ -148,41 +148,31 @@ class ElementFields:
 
     For the method ``reaction`` this is the reaction of permeability and iron, to be added to the
     exact field in vacuum; for ``direct`` it is B itself.
-
-    Attributes
-    ----------
-    superposition_tolerance : float
-        Largest accepted difference between ``along_nominal`` and the sum over the blocks, relative
-        to the sum of the magnitudes of the blocks' finite-element parts.
-    nominal : ndarray, shape (n, 3), in T
-        The whole array, solved for at once.
-    along_nominal : ndarray, shape (n, 3), in T
-        The value to which the blocks must add up: ``nominal``, or with non-linear iron the
-        derivative of the field along the nominal magnetization.
-    sources : tuple of MagnetBlock
-        The blocks of the array for which single blocks were solved.
-    block : callable
-        Takes the number of a block, from 0, and indices (k,) of points or a slice. Returns the
-        finite-element part (k, 3, D) of the block's B there in T per T of remanence along each of
-        the D axes. By symmetry several blocks share one solve.
-    error : ndarray, shape (n, 3), in T, or None
-        How far finer elements would change ``nominal``, where the solve already yields it, NaN
-        elsewhere; None if it is known nowhere. Its length is the error bar in any direction.
-    for_deviations : bool
-        Whether the blocks' parts only serve for deviations from ``nominal``, which is more exact
-        than their sum. Derivatives at the nominal array do so too.
-    anywhere : bool
-        Whether points may lie in magnet and iron, of a cross-section.
     """
 
     superposition_tolerance: float
+    """Largest accepted difference between ``along_nominal`` and the sum over the blocks, relative
+    to the sum of the magnitudes of the blocks' finite-element parts."""
     nominal: Floats
+    """The whole array, solved for at once. Shape (n, 3), in T."""
     along_nominal: Floats
+    """The value to which the blocks must add up: ``nominal``, or with non-linear iron the
+    derivative of the field along the nominal magnetization. Shape (n, 3), in T."""
     sources: tuple[MagnetBlock, ...]
+    """The blocks of the array for which single blocks were solved."""
     block: Callable[[int, Ints | slice], Floats]
+    """Takes the number of a block, from 0, and indices (k,) of points or a slice. Returns the
+    finite-element part (k, 3, D) of the block's B there in T per T of remanence along each of the D
+    axes. By symmetry several blocks share one solve."""
     error: Floats | None = None
+    """How far finer elements would change ``nominal``, where the solve already yields it, NaN
+    elsewhere; None if it is known nowhere. Its length is the error bar in any direction.
+    Shape (n, 3), in T."""
     for_deviations: bool = False
+    """Whether the blocks' parts only serve for deviations from ``nominal``, which is more exact
+    than their sum. Derivatives at the nominal array do so too."""
     anywhere: bool = False
+    """Whether points may lie in magnet and iron, of a cross-section."""
 
     @property
     def linearized(self) -> bool:
@@ -284,10 +274,8 @@ def finite_element_part(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
         In air, or ``anywhere`` in a cross-section.
-    session : Session
     columns : bool
         Whether to solve for single blocks too, the columns of the response matrix.
     estimate : bool
@@ -533,7 +521,6 @@ def check_points(
 
     Parameters
     ----------
-    magnet : Magnet
     points : ndarray, shape (n, 3), in m
     key : str
         Key of the study that the points come from, for the error message.
@@ -601,22 +588,16 @@ def _external_past_iron(magnet: Magnet, points: Floats, route: Route) -> str | N
 
 
 def gateaux_derivative(magnet: Magnet, block: int, points: Floats, session: Session) -> Floats:
-    """Return the derivative of B along the nominal direction of magnetization of a block.
+    """Return the derivative (n, 3) in T m/A of B along a block's nominal magnetization.
 
     The iron is at its operating point in the nominal array.
 
     Parameters
     ----------
-    magnet : Magnet
     block : int
         Number of the block, from 0.
     points : ndarray, shape (n, 3), in m
         Anywhere inside the outer boundary, also in magnet and iron.
-    session : Session
-
-    Returns
-    -------
-    ndarray, shape (n, 3), in T m/A
 
     Raises
     ------

@@ -49,24 +49,17 @@ Field = Callable[[Floats], Floats]
 
 @dataclass(frozen=True)
 class SeparateReaction:
-    """The reaction of blocks and iron to the remanence of the blocks.
-
-    Attributes
-    ----------
-    blocks : tuple of Moments
-        Polarization of the blocks in cells of the study's size and, for the error bar, of another
-        size; none if all permeabilities are 1 and nothing is lost. Of blocks with losses the other
-        one has those of the mean field in every cell. It is left out if the study infers variations
-        inside the blocks, which make up for errors of the losses.
-    iron : IronReaction, BodiesReaction or None
-    without_losses : tuple of Moments
-        If there are losses, polarization of blocks that have lost nothing, in cells of two sizes:
-        for the error bar of what permeability induces.
-    """
+    """The reaction of blocks and iron to the remanence of the blocks."""
 
     blocks: tuple[Moments, ...]
+    """Polarization of the blocks in cells of the study's size and, for the error bar, of another
+    size; none if all permeabilities are 1 and nothing is lost. Of blocks with losses the other one
+    has those of the mean field in every cell. It is left out if the study infers variations inside
+    the blocks, which make up for errors of the losses."""
     iron: IronReaction | BodiesReaction | None
     without_losses: tuple[Moments, ...] = ()
+    """If there are losses, polarization of blocks that have lost nothing, in cells of two sizes:
+    for the error bar of what permeability induces."""
 
     def field(self, points: Floats) -> Floats:
         """Return the reaction (n, 3) in T at points (n, 3) in m."""
@@ -321,27 +314,18 @@ def _permeable(blocks: Sequence[MagnetBlock]) -> bool:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """What the polarization of blocks depends on.
-
-    Attributes
-    ----------
-    blocks : tuple of MagnetBlock
-        Those that are there.
-    law : KneeLaw or None
-        Of irreversible losses, if there are any.
-    varies : bool
-        Whether the study infers variations inside the blocks.
-    cells_per_side : int or None
-        See `halbach_fe.solver.moments.solve.refinement`.
-    sizes : int
-        Number of sizes of the cells: 2 for error bars.
-    """
+    """What the polarization of blocks depends on."""
 
     blocks: tuple[MagnetBlock, ...]
+    """Those that are there."""
     law: KneeLaw | None
+    """Of irreversible losses, if there are any."""
     varies: bool
+    """Whether the study infers variations inside the blocks."""
     cells_per_side: int | None
+    """See `halbach_fe.solver.moments.solve.refinement`."""
     sizes: int
+    """Number of sizes of the cells: 2 for error bars."""
 
     @classmethod
     def of(cls, magnet: Magnet, sizes: int) -> _Blocks:

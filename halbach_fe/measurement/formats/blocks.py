@@ -37,6 +37,7 @@ from halbach_fe.measurement.formats.text import (
     text_of_table,
     uncommented,
 )
+from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
 from halbach_fe.study.free_blocks import SIZES, FreeBlocks
 from halbach_fe.study.free_blocks_file import validated_blocks
@@ -91,22 +92,15 @@ QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
 
 @dataclass(frozen=True)
 class DeclaredBlocks(DeclaredFormat):
-    """Statements of the user about a table of blocks.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
-        magnet) along which each component of the strength lies, as ``-y``.
-    along_block : bool
-        Whether components of the strength of free blocks lie along the block's own axes.
-    fixed : mapping of str to str
-        Value and unit of quantities for which the table has no column, such as ``12 cm^3``.
-    """
+    """Statements of the user about a table of blocks."""
 
     axes: tuple[str, str, str] = ("x", "y", "z")
+    """Axis of the block (x radial, y azimuthal, z along the magnet; of a free block those of the
+    magnet) along which each component of the strength lies, as ``-y``."""
     along_block: bool = False
+    """Whether components of the strength of free blocks lie along the block's own axes."""
     fixed: Mapping[str, str] = field(default_factory=dict)
+    """Value and unit of quantities for which the table has no column, such as ``12 cm^3``."""
     unused: ClassVar[tuple[str, ...]] = ("component", "at", "origin_m", "positions")
 
     def _wrong(self) -> dict[str, str]:
@@ -457,21 +451,12 @@ def _volume(table: _Table) -> Floats:
         len(table.lines), np.nan)
 
 
-def _turned(vectors: Floats, axes: Sequence[str]) -> Floats:
-    """Return vectors (n, 3) whose components lie along named axes, along x, y and z."""
-    found = np.empty_like(vectors)
-    for column, axis in enumerate(axes):
-        sign = -1.0 if axis.startswith("-") else 1.0
-        found[:, COMPONENTS.index(axis[-1])] = sign * vectors[:, column]
-    return found
-
-
 def _measured_blocks(
     table: _Table, declared: DeclaredBlocks, attributes: Mapping[str, str]
 ) -> BlockTable:
     """Return the table of measured blocks."""
     strength = _strength(table)
-    vectors = _turned(table.vector(strength), declared.axes)
+    vectors = to_magnet_axes(declared.axes, table.vector(strength))
     volume = _volume(table)
     moment = vectors if strength == "moment" else vectors * (volume / MU_0)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # zero is refused below
@@ -559,7 +544,7 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
                     "Leave them out."))
             columns["remanence_T"] = vectors[:, 0].tolist()
         else:
-            vectors = _turned(vectors, declared.axes)
+            vectors = to_magnet_axes(declared.axes, vectors)
             if declared.along_block:
                 turn = np.column_stack([turns.get(f"rotation_{axis}", np.zeros(len(vectors)))
                                         for axis in COMPONENTS])
