@@ -151,6 +151,19 @@ def test_without_open_terms_it_is_what_is_predicted(generator, tmp_path):
     assert "B along (0.9996, 0.0294, 0.0000) at (" in answer(result).said
 
 
+def test_an_offset_that_is_an_uncertain_amplitude(generator, tmp_path):
+    """The field is without it, as without one of `instrument_sd`; it was 3 mT off, 340 bars."""
+    magnet_of, offset_T = truth(generator), 3e-3
+    data = reading(magnet_of, generator, BODY, STRAIGHT)
+    data["B_T"][:, 0] += offset_T
+    result = updated(tmp_path, data, uncertain=[{
+        "name": "offset", "sd": offset_T, "change": {"instrument.offset_T[1]": 1.0}}])
+    off = (result.field.mean - true_field(magnet_of, result)) / result.field.sd
+    np.testing.assert_allclose(off, 0, atol=5)  # of 975 normal numbers
+    read = result.prediction_posterior.mean - result.field.mean
+    np.testing.assert_allclose(read, offset_T * result.field.along[:, 0], atol=5e-5)
+
+
 def test_circles_that_the_mapper_has_moved_are_none_of_the_magnet(generator, tmp_path):
     """Their middle is not that of the magnet; the field is said at its place in the magnet."""
     angle = 2 * np.pi * np.arange(16) / 16
