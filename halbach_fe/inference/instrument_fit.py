@@ -229,18 +229,16 @@ def amplitude_columns(
     for number, one in enumerate(maps):
         data = in_si_and_magnet_axes(one.study.instrument, one.data)
         points = points_of(data)
-        if one.is_validation:
-            found.append(np.zeros((len(uncertain), len(points), 3)))
-            continue
         before = sensor_positions(one.study.instrument, points)
         at_sensors, gradient = field_at_sensors(field, before)
 
         def off(other: Study, number: int = number, data: xr.Dataset = data,
                 points: Floats = points, before: Floats = before,
                 at_sensors: Floats = at_sensors, gradient: Floats = gradient,
-                name: str = one.name) -> Floats:
+                name: str = one.name, listed: bool = not one.is_validation) -> Floats:
             """Return what the sensors show, less the values that are read."""
-            own = other.of_map(number).instrument if other.maps else other.instrument
+            own = (other.of_map(number).instrument if other.maps and listed
+                   else other.instrument)  # which a held-out map has
             away = sensor_positions(own, points) - before
             shown = seen(sensor_matrix(own), at_sensors + np.einsum(
                 "nscj,nsj->nsc", gradient, away))
