@@ -124,3 +124,17 @@ def test_a_held_out_map_has_the_uncertain_amplitudes_of_its_instrument(generator
     (score,) = (one for one in result.scores if one.part == HELD_OUT_MAP)
     assert score.chi2_posterior == pytest.approx(1, abs=5 * np.sqrt(2 / score.readings))
     assert result.disagreement == ""
+
+
+@pytest.mark.parametrize("length_unit_m", [1.0, 1e-3])
+def test_circles_of_a_map_in_its_own_unit(dipole, length_unit_m):
+    """Fourier coefficients are observed of a held-out map whose points are on the study's circles
+    once they are in m; one in mm was taken for a map of flux densities, and its noise asked for.
+    """
+    study = dipole(noise=NOISE, instrument={"length_unit_m": length_unit_m}, observation={
+        "quantity": "fourier_coefficients", "harmonics": 3, "positions": {
+            "kind": "circles", "radius_m": 0.07, "angles": 12}})
+    field = np.column_stack([np.linspace(0.1, 0.2, 12), np.zeros(12), np.zeros(12)])
+    points = circle(0.07, 12) / length_unit_m
+    maps = maps_of(study, field_map(points, field), field_map(points, 1.1 * field))
+    assert [one.study.observation.quantity for one in maps] == 2 * ["fourier_coefficients"]
