@@ -223,9 +223,11 @@ def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
         turn = rotation_about_z(np.radians(one.turn_deg))
         local = (points - [0.0, 0.0, one.z_m]) @ turn
         own = np.zeros((root.shape[1], *points.shape))
-        for number, unit in enumerate(unit_fields(magnet.blocks, local)):
-            own += np.moveaxis(unit @ root[3 * number:3 * number + 3], -1, 0)
-        found.append(MU_0 * one.factor * own @ turn.T)
+        for number, (block, unit) in enumerate(zip(
+                magnet.blocks, unit_fields(magnet.blocks, local), strict=True)):
+            remanence = MU_0 * block.recoil_tensor @ root[3 * number:3 * number + 3]
+            own += np.moveaxis(unit @ remanence, -1, 0)
+        found.append(one.factor * own @ turn.T)
     return np.concatenate(found)
 
 
