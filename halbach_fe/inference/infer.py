@@ -416,7 +416,7 @@ class _Search:
                 with_instruments(self.magnet.study, self.maps),
                 self.nominal_field if self.at is None else self.at.field, self.maps, readings)
             yield "instrument", columns, *_unit_prior(columns)
-        neighbours = _neighbour_columns(self.magnet, self.maps, readings)
+        neighbours = neighbour_columns(self.magnet, self.maps, readings)
         if neighbours.size:
             yield "neighbours", neighbours, *_unit_prior(neighbours)
         if self.shared_error is not None and self.shared_error.size:
@@ -488,7 +488,7 @@ def _unit_prior(columns: Floats) -> tuple[Floats, Floats]:
     return np.zeros(columns.shape[1]), np.ones(columns.shape[1])
 
 
-def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
+def neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
     """Return readings (n, k) in T of neighbours' blocks that deviate by a standard deviation."""
     if not magnet.study.external.neighbours:
         return np.zeros((len(readings.values), 0))
