@@ -14,7 +14,7 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.inference.readings import check_validation_map, read_campaign
 from halbach_fe.inference.result import HELD_OUT_MAP
 from halbach_fe.measurement.campaign import maps_of
-from halbach_fe.measurement.field_map import field_map, points_of
+from halbach_fe.measurement.field_map import field_map, points_of, total_field_map
 from halbach_fe.study.reader import parse_study
 from tests.conftest import circle
 from tests.support.short_dipole import BODY, TEXT, reading, truth
@@ -124,6 +124,20 @@ def test_a_held_out_map_has_the_uncertain_amplitudes_of_its_instrument(generator
     (score,) = (one for one in result.scores if one.part == HELD_OUT_MAP)
     assert score.chi2_posterior == pytest.approx(1, abs=5 * np.sqrt(2 / score.readings))
     assert result.disagreement == ""
+
+
+def test_what_the_probe_of_a_held_out_map_cannot_have(generator, session):
+    """|B| has no offset of one component, and is predicted without it."""
+    magnet_of = truth(generator)
+    data = reading(magnet_of, generator, BODY, (Rotation.identity(), np.zeros(3)))
+    points = BODY[::7] + np.array([1e-3, 2e-3, 3e-3])
+    total = np.linalg.norm(magnet_of.getB(points), axis=1)
+    total += 2e-5 * generator.standard_normal(len(total))
+    result = infer(build_magnet(parse_study(tomllib.loads(TEXT) | {"uncertain": [{
+        "name": "offset", "sd": 3e-3, "change": {"instrument.offset_T[1]": 1.0}}]})),
+        data, session, validation_map=total_field_map(points, total))
+    (score,) = (one for one in result.scores if one.part == HELD_OUT_MAP)
+    assert score.chi2_posterior == pytest.approx(1, abs=5 * np.sqrt(2 / score.readings))
 
 
 @pytest.mark.parametrize("length_unit_m", [1.0, 1e-3])
