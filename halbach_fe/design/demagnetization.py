@@ -88,6 +88,9 @@ class Places:
     """What of the volume of its cell each stands for. Shape (n,), in m^3 (in 2D areas in m^2)."""
     along: Floats
     """H along the magnetization. Shape (n,), in A/m."""
+    outside: Floats
+    """The part of it that external sources make which do not change with the temperature: all but
+    neighbours. Shape (n,), in A/m."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +158,17 @@ class DemagnetizationMap(ShownInNotebook):
     def share_beyond(self, temperature_C: Floats) -> Floats:
         """Return the share of the volume past the knee, for temperatures (t,) in °C.
 
-        H is assumed to be proportional to the remanence when the temperature changes. This is exact
-        without iron and for iron of constant permeability.
+        H is assumed to be proportional to the remanence when the temperature changes, but for that
+        of external sources. This is exact without iron, and for iron of constant permeability
+        unless these magnetize it.
         """
         weight = self.places.volumes / self.places.volumes.sum()
         grown = (remanence_factor(self.material, temperature_C)
                  / remanence_factor(self.material, self.material.temperature_C))
         limit = knee(self.material, temperature_C)
-        return np.array([weight[self.places.along * g < -h].sum()
+        outside = self.places.outside
+        own = self.places.along - outside
+        return np.array([weight[own * g + outside < -h].sum()
                          for g, h in zip(grown, limit, strict=True)])
 
     @property
@@ -177,14 +183,15 @@ class DemagnetizationMap(ShownInNotebook):
         every one above absolute zero. Where `worst_when_cold`, it is the lowest such temperature,
         and the signs of the infinities are the others.
         """
-        material = self.material
-        at_reference = -self.places.along / remanence_factor(material, material.temperature_C)
-        # solve -along (1 + alpha d) = knee (1 + beta d) for the temperature difference d of each
-        # place, where alpha and beta are the coefficients of remanence and coercivity
+        material, outside = self.material, self.places.outside
+        at_reference = (outside - self.places.along) / remanence_factor(
+            material, material.temperature_C)
+        # solve -own (1 + alpha d) - outside = knee (1 + beta d) for the temperature difference d of
+        # each place, where alpha and beta are the coefficients of remanence and coercivity
         rate = (at_reference * material.remanence_coefficient_per_K
                 - knee(material, material.reference_temperature_C)
                 * material.coercivity_coefficient_per_K)
-        spare = knee(material, material.reference_temperature_C) - at_reference
+        spare = knee(material, material.reference_temperature_C) - at_reference + outside
         sign = -1 if self.worst_when_cold else 1
         with np.errstate(divide="ignore", invalid="ignore"):
             limit = np.where(sign * rate > 0, spare / rate,
@@ -285,14 +292,17 @@ def demagnetization_map(
     opposed = np.einsum("nc,nc->n", field + from_outside, easy[cells.block]) < OPPOSED * strength
     cell, points = _anywhere(cells, np.flatnonzero(opposed))
     number = np.append(cells.block, cells.block[cell])
+    everywhere = np.vstack([cells.middles, points])
     field = _field_strength(
-        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, None)]),
-        np.vstack([cells.middles, points]), number, session)
-    along, other = np.split(np.einsum("nc,nc->n", field, easy[number]), [len(cells.block)])
+        warm, blocks, np.vstack([field, _vacuum_field(blocks, points, None)]), everywhere, number,
+        session)
+    fixed = external_field(warm.with_(external__neighbours=()), everywhere) / MU_0
+    along, outside = (np.einsum("nc,nc->n", each, easy[number]) for each in (field, fixed))
     cell = np.append(np.flatnonzero(~opposed), cell)
-    return DemagnetizationMap(magnet, material, blocks, cells, along, Places(
+    used = np.append(np.flatnonzero(~opposed), np.arange(len(opposed), len(number)))
+    return DemagnetizationMap(magnet, material, blocks, cells, along[:len(opposed)], Places(
         cell, (cells.volumes / np.maximum(1, np.bincount(cell, minlength=len(opposed))))[cell],
-        np.append(along[~opposed], other)))
+        along[used], outside[used]))
 
 
 def _anywhere(cells: Cells, numbers: Ints) -> tuple[Ints, Floats]:

@@ -37,6 +37,7 @@ from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.core.pace import Progress, quiet
 from halbach_fe.design.objective import DeviationModel, Objective
 from halbach_fe.design.remounting import LARGEST_ANGLE, Mounts, mounts_of, rotation_deg
+from halbach_fe.design.tolerance import assembled_prior
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.geometry.symmetry import as_meant
 from halbach_fe.inference.block_prior import (
@@ -48,7 +49,6 @@ from halbach_fe.inference.block_prior import (
     with_types,
 )
 from halbach_fe.measurement.block_table import BlockTable
-from halbach_fe.response.block_variation import with_variations
 from halbach_fe.response.homogeneity import Homogeneity
 from halbach_fe.response.multipoles import MultipoleModel
 from halbach_fe.stats.gaussian import Gaussian
@@ -288,12 +288,11 @@ def _blocks(
 
 
 def _assembled(magnet: Magnet, placed: BlockTable, model: Objective) -> Gaussian:
-    """Return the distribution of the magnetizations, and variations inside, of an assembled magnet.
+    """Return the distribution of all parameters of an assembled magnet.
 
     It has the uncertainty of the measured moments, of the coil's calibration and of the mounting.
     """
-    known = prior_from_blocks(magnet, placed).gaussian
-    return with_variations(known, len(model.nominal) - len(known.mean))
+    return assembled_prior(magnet, model.nominal, prior_from_blocks(magnet, placed).gaussian)
 
 
 def present(magnet: Magnet) -> Ints:

@@ -40,12 +40,12 @@ from halbach_fe.geometry.magnet import build_magnet
 from halbach_fe.inference.result import HELD_OUT_MAP, InstrumentTerms
 from halbach_fe.measurement.campaign import Data
 from halbach_fe.measurement.scan_lines import motion
-from halbach_fe.solver.exact_block_field import external_field, unit_fields
+from halbach_fe.response.block_variation import Deviations, vacuum_changes
+from halbach_fe.solver.exact_block_field import external_field
 from halbach_fe.solver.routes import solve_nominal
 from halbach_fe.solver.session import Session
 from halbach_fe.stats.noise import NoiseCovariance, independent_noise
 from halbach_fe.study.inference import PROBE_KEYS
-from halbach_fe.study.materials import MU_0
 from halbach_fe.study.measurement import Instrument
 from halbach_fe.study.model import Study
 from halbach_fe.study.types import COMPONENTS
@@ -319,13 +319,23 @@ class _NominalMagnet:
 
     @cached_property
     def response(self) -> Floats:
-        """B (parameters, n, 3) in T for a magnetization of 1 A/m of each block along each axis."""
-        size = self.nominal.study.dimension
-        return np.concatenate([
-            np.moveaxis(unit @ (MU_0 * block.recoil_tensor[:, :size]), 2, 0)
-            for block, unit in zip(
-                self.nominal.blocks, unit_fields(self.nominal.blocks, self.nominal.points),
-                strict=True)])
+        """B (parameters, n, 3) in T per unit of all parameters of the magnet, in its axes."""
+        columns = Deviations.of(self.nominal.magnet).columns(self.nominal.points)
+        return np.moveaxis(columns.reshape(*self.nominal.points.shape, -1), 2, 0)
+
+    def seen(self, scan: ProposedScan, part: slice) -> Floats:
+        """Return `response` (parameters, k, 3) at the points of a scan, in the mapper's axes.
+
+        What is outside of the magnet does not turn with it.
+        """
+        found = self.response[:, part] @ scan.magnet_rotation.T
+        amplitudes = self.nominal.study.uncertain_of_magnet
+        outside = np.flatnonzero([all(name.startswith("external.") for name in one.change)
+                                  for one in amplitudes])
+        if len(outside):
+            found[len(found) - len(amplitudes) + outside] = vacuum_changes(
+                self.nominal.magnet, scan.points)[outside]
+        return found
 
     def signature(self, hypothesis: Hypothesis) -> Floats:
         """Return the signature (k, n, 3) in T of an effect of the magnet, in the magnet's axes."""
@@ -373,8 +383,8 @@ class _Readings:
             nominal, part, scan.magnet_rotation, np.eye(3),
             way=np.zeros_like(scan.points) if scan.way is None else scan.way)
         self.sensors = replace(self.mapper, probe_rotation=scan.probe_rotation)
-        self.blocks = np.hstack([self._whitened(
-            magnet.response[:, part] @ scan.magnet_rotation.T) @ diagnosis.before.prior.root,
+        self.blocks = np.hstack([
+            self._whitened(magnet.seen(scan, part)) @ diagnosis.before.prior.root,
             self._open_terms(diagnosis.before.terms)])
 
     def _open_terms(self, terms: InstrumentTerms | None) -> Floats:

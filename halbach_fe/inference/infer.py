@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -195,6 +196,8 @@ class _Update:
     exact: Rows
     """The same for a solver without the error that readings share, see `_Search._beside`: its
     columns are 0."""
+    of_field: Rows
+    """The same for instruments that are known. Its columns of theirs are 0."""
     prior: Gaussian
     residual: Floats
     """Readings less what the model reads of the nominal magnet. Shape (readings,), in T."""
@@ -209,12 +212,11 @@ class _Update:
         """The posterior of all parameters."""
         return self.update.distribution
 
-    def predicted(self, parameters: Gaussian, exact: bool = False) -> Prediction:
-        """Return the prediction of all readings from a distribution of all parameters.
-
-        With ``exact`` the solver makes no error that readings share.
+    def predicted(self, parameters: Gaussian, matrix: Rows | None = None) -> Prediction:
+        """Return the prediction of all readings from a distribution of all parameters, by all of
+        these unless ``matrix`` is that of some.
         """
-        matrix = self.exact if exact else self.matrix
+        matrix = self.matrix if matrix is None else matrix
         mean, sd = predict(matrix, parameters)
         offset = self.model.offset + bent(self.readings, self.vectors, self.model, parameters)
         return Prediction(offset + mean, sd, lambda rows: matrix[rows] @ parameters.root,
@@ -342,15 +344,16 @@ class _Search:
         if self.error is None:  # one for all updates: they are compared by their probabilities
             self.error, self.shared_error = model.error, _seen(model.shared_error.T, readings)
         matrix: Rows = model.matrix
-        exact, prior = matrix, self._prior_of_blocks(len(model.parameters))
-        for columns, mean, sd in self._beside(readings):
+        exact, of_field, prior = matrix, matrix, self._prior_of_blocks(len(model.parameters))
+        for of, columns, mean, sd in self._beside(readings):
             matrix, prior = Beside(matrix, columns), joined(prior, mean, sd)
-            exact = Beside(exact, 0 * columns if columns is self.shared_error else columns)
+            exact = Beside(exact, 0 * columns if of == "solver" else columns)
+            of_field = Beside(of_field, 0 * columns if of == "instrument" else columns)
         magnitudes = self.magnitudes.about(readings, vectors, model, prior)
         errors = magnitudes.with_bend(readings.noise).with_independent_errors(self.error)
         residual, training = readings.values - model.offset, readings.training
         return _Update(
-            readings, vectors, model, matrix, exact, prior, residual, errors, magnitudes,
+            readings, vectors, model, matrix, exact, of_field, prior, residual, errors, magnitudes,
             linear_gaussian.update(matrix, residual[training], errors.subset(training), prior,
                                    np.flatnonzero(training)))
 
@@ -362,8 +365,11 @@ class _Search:
         return study_prior(self.magnet, others) if self.of_blocks is None else with_others(
             self.of_blocks.gaussian, self.magnet, others)
 
-    def _beside(self, readings: Readings) -> Iterator[tuple[Floats, Floats, Floats]]:
-        """Yield derivatives, prior mean and prior standard deviations of what is beside blocks.
+    def _beside(
+        self, readings: Readings
+    ) -> Iterator[tuple[Literal["instrument", "neighbours", "solver"], Floats, Floats, Floats]]:
+        """Yield of what it is, derivatives, prior mean and prior standard deviations of what is
+        beside blocks.
 
         The solver's error is shared by all readings: it may be any multiple of the change that
         another discretization makes, normally distributed about 0. As noise that is independent
@@ -373,13 +379,15 @@ class _Search:
             columns = amplitude_columns(
                 with_instruments(self.magnet.study, self.maps),
                 self.nominal_field if self.at is None else self.at.field, self.maps, readings)
-            yield columns, np.zeros(len(self.amplitudes)), np.ones(len(self.amplitudes))
-        for each in (_neighbour_columns(self.magnet, self.maps, readings), self.shared_error):
-            if each is not None and each.size:
-                yield each, np.zeros(each.shape[1]), np.ones(each.shape[1])
+            yield "instrument", columns, *_unit_prior(columns)
+        neighbours = neighbour_columns(self.magnet, self.maps, readings)
+        if neighbours.size:
+            yield "neighbours", neighbours, *_unit_prior(neighbours)
+        if self.shared_error is not None and self.shared_error.size:
+            yield "solver", self.shared_error, *_unit_prior(self.shared_error)
         if self.at is not None:
-            yield (self.terms.columns(self.at.field, self.maps, readings), -self.total,
-                   self.terms.sd)
+            yield ("instrument", self.terms.columns(self.at.field, self.maps, readings),
+                   -self.total, self.terms.sd)
 
     def _sd_of_terms(self) -> Floats:
         """Return the posterior standard deviations of the open terms, as they are counted."""
@@ -417,8 +425,10 @@ class _Search:
             regions=readings.regions, maps=readings.maps, response=last.model,
             prior=prior, posterior=posterior, prediction_prior=before,
             prediction_posterior=last.predicted(whole),
-            prediction_exact=last.predicted(last.prior, exact=True)
+            prediction_exact=last.predicted(last.prior, last.exact)
             if last.model.shared_error.any() else before,
+            prediction_field=last.predicted(whole, last.of_field)
+            if len(self.terms) or self.amplitudes else None,
             prior_conflict=last.update.prior_conflict,
             parameters_learnt=last.update.parameters_learnt,
             log_evidence=last.update.log_evidence,
@@ -437,7 +447,12 @@ class _Search:
             noise_blocks=self.noise_blocks)
 
 
-def _neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
+def _unit_prior(columns: Floats) -> tuple[Floats, Floats]:
+    """Return mean and standard deviations of what columns (n, k) are per standard deviation of."""
+    return np.zeros(columns.shape[1]), np.ones(columns.shape[1])
+
+
+def neighbour_columns(magnet: Magnet, maps: Sequence[Map], readings: Readings) -> Floats:
     """Return readings (n, k) in T of neighbours' blocks that deviate by a standard deviation."""
     if not magnet.study.external.neighbours:
         return np.zeros((len(readings.values), 0))

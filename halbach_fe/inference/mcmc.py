@@ -382,4 +382,4 @@ def with_samples(update: InferenceResult, sampled: SampledPosterior) -> Inferenc
     from_samples = replace(update.posterior, mean=sampled.mean,
                            root=vectors * np.sqrt(np.maximum(values, 0)))
     return replace(update, kind="samples", posterior=from_samples,
-                   prediction_posterior=sampled.prediction)
+                   prediction_posterior=sampled.prediction, prediction_field=None)

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from halbach_fe.core.arrays import Floats, box_middle, spread
 from halbach_fe.core.errors import HalbachError, MeasurementError, StudyError, must_be
 from halbach_fe.core.pace import Pace
+from halbach_fe.geometry.blocks import rotation_matrix
 from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.line_search import line_of
 from halbach_fe.inference.pose_result import OpenKey, PosePrior, ProbePrior, Registration
@@ -609,12 +610,12 @@ class PoseFit:
         matrix = sensor_matrix(instrument)
         here, gradient = field_at_sensors(self._field(values), sensors)
         nominal = seen(matrix, here) + near.shift @ matrix.T
-        at_mean = gradient.mean(axis=1)
+        at_mean, stage = gradient.mean(axis=1), rotation_matrix(instrument.rotation_rad)
         of_blocks = np.einsum("ij,njk->nik", matrix, near.fields)
 
         def about(along: Floats) -> tuple[Floats, Floats, Floats]:
             """Return residual, derivatives by blocks and noise about directions of the field."""
-            moved = self._shown(np.einsum("ij,njk->nik", matrix, at_mean), along)
+            moved = self._shown(matrix @ at_mean @ stage, along)
             return (self.readings - self._shown(nominal, along) - values[OFFSETS],
                     self._shown(of_blocks, along),
                     np.sqrt(self.sigma**2 + np.sum((moved * self.position_sd)**2, axis=2)))

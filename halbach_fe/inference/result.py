@@ -44,7 +44,7 @@ from halbach_fe.response.magnetic_axis import MagneticAxis
 from halbach_fe.response.matrix import Response
 from halbach_fe.response.stray_field import StrayField
 from halbach_fe.stats.gaussian import Gaussian
-from halbach_fe.stats.linear_gaussian import contraction, predict, row_slices, whitened
+from halbach_fe.stats.linear_gaussian import contraction, row_slices, whitened
 from halbach_fe.stats.noise import NoiseCovariance
 from halbach_fe.study.model import Study
 from halbach_fe.study.uncertain import shifted
@@ -364,6 +364,9 @@ class InferenceResult(ShownInNotebook):
         Their predictions of all readings.
     prediction_exact : Prediction
         That of the prior by a solver whose error no readings share.
+    prediction_field : Prediction or None
+        That of the posterior by instruments without the errors that were estimated; None if none
+        was, so that it is `prediction_posterior`.
     prior_conflict : float
         Chi-squared per training reading of the prior's prediction. It is about 1 if prior, model
         and noise are right; see `conflict_limit`.
@@ -436,6 +439,7 @@ class InferenceResult(ShownInNotebook):
     amplitudes: Amplitudes | None = None
     overlaps: tuple[Overlap, ...] = ()
     regions_left_out: tuple[LeftOut, ...] = ()
+    prediction_field: Prediction | None = None
     noise_blocks: tuple[MagnetBlock, ...] | None = None
     stray_field: StrayField | None = None
     magnetic_axis: MagneticAxis | None = None
@@ -520,17 +524,13 @@ class InferenceResult(ShownInNotebook):
         """The field of the updated magnet at the places of the readings.
 
         A reading is linear in B at its sensor, so that the field is what the magnetizations make of
-        the reading, divided by the sensor's sensitivity. Terms of the instrument that were
-        estimated with the magnetizations are in their covariance, not in the field.
+        the reading, divided by the sensor's sensitivity. Terms and amplitudes of the instrument
+        that were estimated with the magnetizations are in their covariance, not in the field.
         """
-        observation, known = self.observation, self.prediction_posterior
-        mean, sd = known.mean, known.sd
-        if self.terms is not None:
-            mean, sd = predict(self.response.matrix, self.posterior)
-            mean = self.response.offset + mean
+        observation, known = self.observation, self.prediction_field or self.prediction_posterior
         size = np.linalg.norm(observation.sensitivities, axis=1)
         return SensedField(observation.places, observation.sensitivities / size[:, None],
-                           mean / size, np.hypot(sd, self.response.error) / size)
+                           known.mean / size, np.hypot(known.sd, self.response.error) / size)
 
     @cached_property
     def held_out(self) -> NDArray[np.bool_]:

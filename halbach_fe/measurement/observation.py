@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from halbach_fe.core.arrays import Floats, Ints
 from halbach_fe.core.errors import MeasurementError, must_be
 from halbach_fe.measurement.field_map import points_of
-from halbach_fe.measurement.instrument import sensor_model
+from halbach_fe.measurement.instrument import by_stated_units, sensor_model
 from halbach_fe.measurement.scan_lines import held_out_lines, scan_lines
 from halbach_fe.study.measurement import CirclePositions, FluxDensity, FourierCoefficients
 from halbach_fe.study.model import Study
@@ -298,7 +298,7 @@ def study_for_validation_map(study: Study, data: xr.Dataset) -> Study:
     """
     observed = study.observation
     if observed.quantity == "flux_density" or _on_circles(
-            points_of(data), observed.positions).any():
+            points_of(by_stated_units(study.instrument, data)), observed.positions).any():
         return study
     if "sigma_T" not in data:
         raise MeasurementError(must_be(

@@ -26,10 +26,11 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 
 from halbach_fe.core.arrays import Floats, Ints, radii_of, slices
 from halbach_fe.core.errors import HalbachWarning, MeasurementError, StudyError, must_be
@@ -216,9 +217,11 @@ def neighbour_deviations(magnet: Magnet, points: Floats) -> Floats:
         turn = rotation_about_z(np.radians(one.turn_deg))
         local = (points - [0.0, 0.0, one.z_m]) @ turn
         own = np.zeros((root.shape[1], *points.shape))
-        for number, unit in enumerate(unit_fields(magnet.blocks, local)):
-            own += np.moveaxis(unit @ root[3 * number:3 * number + 3], -1, 0)
-        found.append(MU_0 * one.factor * own @ turn.T)
+        for number, (block, unit) in enumerate(zip(
+                magnet.blocks, unit_fields(magnet.blocks, local), strict=True)):
+            remanence = MU_0 * block.recoil_tensor @ root[3 * number:3 * number + 3]
+            own += np.moveaxis(unit @ remanence, -1, 0)
+        found.append(one.factor * own @ turn.T)
     return np.concatenate(found)
 
 
@@ -249,14 +252,15 @@ def amplitude_names(magnet: Magnet) -> tuple[str, ...]:
 
 def shared_deviations(magnet: Magnet) -> Floats:
     """Return the change (parameters, amplitudes) in A/m of the nominal magnetizations."""
-    return _changes(magnet, STEP, lambda other: other.nominal_magnetization)
+    return changes_by_amplitudes(magnet, lambda other: other.nominal_magnetization)
 
 
 def vacuum_changes(magnet: Magnet, points: Floats) -> Floats:
     """Return the change (amplitudes, n, 3) in T of the field of blocks in vacuum and of external
     sources at points (n, 3) in m, magnetizations changed as in `shared_deviations`.
     """
-    return _changes(magnet, STEP, lambda other: vacuum_part(other, points)).transpose(2, 0, 1)
+    return changes_by_amplitudes(magnet, lambda other: vacuum_part(other, points)).transpose(
+        2, 0, 1)
 
 
 def field_changes(magnet: Magnet, points: Floats, session: Session) -> Floats:
@@ -271,7 +275,7 @@ def field_changes(magnet: Magnet, points: Floats, session: Session) -> Floats:
     # step of the differences of what permeability and iron add, in standard deviations: large
     # enough for differences between meshes, which a small step would magnify
     solved_step = 0.1
-    return changes + _changes(magnet, solved_step, solved).transpose(2, 0, 1)
+    return changes + changes_by_amplitudes(magnet, solved, solved_step).transpose(2, 0, 1)
 
 
 def with_amplitudes(prior: Gaussian, magnet: Magnet) -> Gaussian:
@@ -290,7 +294,9 @@ def with_amplitudes(prior: Gaussian, magnet: Magnet) -> Gaussian:
                     stacked_root(sparse.csr_array(root)))
 
 
-def _changes(magnet: Magnet, step: float, of: Callable[[Magnet], Floats]) -> Floats:
+def changes_by_amplitudes(
+    magnet: Magnet, of: Callable[[Magnet], NDArray[Any]], step: float = STEP
+) -> NDArray[Any]:
     """Return the derivatives (..., amplitudes), per standard deviation, of values of a magnet."""
     found = []
     for one in magnet.study.uncertain_of_magnet:

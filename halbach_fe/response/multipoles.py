@@ -39,7 +39,7 @@ from halbach_fe.geometry.magnet import Magnet, neighbour_blocks
 from halbach_fe.geometry.outline import at_heights
 from halbach_fe.measurement.observation import Observation, concatenate, fourier_analysis, observe
 from halbach_fe.measurement.positions import points_from
-from halbach_fe.response.block_variation import Deviations
+from halbach_fe.response.block_variation import Deviations, changes_by_amplitudes
 from halbach_fe.response.matrix import Response, StoredMatrix, response_matrix
 from halbach_fe.solver.exact_block_field import external_field, unit_fields
 from halbach_fe.solver.session import Session
@@ -616,28 +616,41 @@ def _along_all_z(
     size = summed.shape[1]
     matrix, offset = model.matrix[part].copy(), model.offset[part] - sources
     matrix[:, :size] -= summed
-    unknown = magnet.study.uncertain_of_magnet
-    for column, one in enumerate(unknown, matrix.shape[1] - len(unknown)):
-        uniform = [one.sd * one.change.get(f"external.background_T[{axis}]", 0.0)
-                   for axis in (1, 2, 3)]
-        matrix[:, column] -= observation.operator @ np.tile(uniform, len(observation.points))
+    amplitudes = magnet.study.uncertain_of_magnet
+    first = matrix.shape[1] - len(amplitudes)  # whose sources have integrals of their own, too
+    if amplitudes:
+        matrix[:, first:] -= observation.operator @ changes_by_amplitudes(
+            magnet, lambda other: external_field(other, observation.points)).reshape(
+                -1, len(amplitudes))
     near, far = complexes(matrix)
     offset_near, offset_far = complexes(offset)
     radius, highest = float(np.hypot(*observation.points[0, :2])), len(near)
     shapes, inexact = _integrals_of_shapes(magnet.blocks, radius, highest)
-    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
-    of_others, inexact_others = _integrals_of_shapes(others, radius, highest)
-    sources = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
-                  for one, shape in zip(others, of_others, strict=True))
-    coils, coils_error = _integrals_of_coils(magnet, radius, highest)
+    sources, sources_error = _integrals_of_sources(magnet, radius, highest)
     mesh = model.error[part].reshape(2, 2, -1).max(axis=1).sum(axis=0)
-    error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + inexact_others + coils_error
+    error = mesh + np.abs(offset_far + far @ model.nominal) + inexact + sources_error
     total = near + far
+    if amplitudes:
+        total[:, first:] += changes_by_amplitudes(
+            magnet, lambda other: _integrals_of_sources(other, radius, highest)[0])
     tensors = MU_0 * np.array([block.recoil_tensor for block in magnet.blocks])
     total[:, :size] += np.einsum("bk,bj->kbj", shapes, tensors[:, 0] + 1j * tensors[:, 1]).reshape(
         highest, size)
-    external = sources + coils
-    return total, offset_near + offset_far + external, error
+    return total, offset_near + offset_far + sources, error
+
+
+def _integrals_of_sources(
+    magnet: Magnet, radius: float, highest: int
+) -> tuple[Complexes, Floats]:
+    """Return C_n (K,) of external sources but a uniform field, integrated along all of z, and error
+    bars (K,), in T m.
+    """
+    others = neighbour_blocks(magnet.blocks, magnet.external.neighbours)
+    shapes, inexact = _integrals_of_shapes(others, radius, highest)
+    of_others = sum((one.polarization[0] + 1j * one.polarization[1]) * shape
+                    for one, shape in zip(others, shapes, strict=True))
+    coils, error = _integrals_of_coils(magnet, radius, highest)
+    return of_others + coils, inexact + error
 
 
 def _integrals_of_shapes(
