@@ -350,7 +350,7 @@ class Magnet(ShownInNotebook):
         Parameters
         ----------
         points_m : array_like, shape (..., 3), in m
-            Of a DataArray, DataFrame or Series that names x, y and z, these, in any order.
+            Of a DataArray, DataFrame, Series or dict that names x, y and z, these, in any order.
 
         Returns
         -------
