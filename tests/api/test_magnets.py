@@ -556,8 +556,8 @@ def test_labels_are_read_as_names_of_columns(generator, labels):
 
 
 @pytest.mark.parametrize("label", [
-    "z_nm", "z [\u00b5m]", "z (inches)", "Bz (Gauss)", "Bz [Oe]", "Bz_A/m", "Bz (kA/m)", "Bz_\u00b5T",
-    "Bz [mG]", "z [millimetre] "])
+    "z_nm", "z [\u00b5m]", "z (inches)", "Bz (Gauss)", "Bz [Oe]", "Bz_A/m", "Bz (kA/m)",
+    "Bz_\u00b5T", "Bz [mG]", "z [millimetre] "])
 def test_labels_that_state_another_unit(label):
     """These were read as m and T. Control: names that end like units, and m and T themselves."""
     points = np.arange(6.0).reshape(2, 3) / 100

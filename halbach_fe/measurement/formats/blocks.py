@@ -542,8 +542,9 @@ def _outlines(table: _Table) -> Iterator[tuple[tuple[float, ...], ...] | None]:
             raise MeasurementError(must_be(
                 f"outline in line {line}", table.where, "corners as `x y; x y; x y`",
                 f"'{cell[:40]}'")) from None
-        yield corners and tuple(tuple(np.round(units.in_si(np.array(corner), table.unit["outline"]), 12)
-                          .tolist()) for corner in corners)
+        unit = table.unit["outline"]
+        yield corners and tuple(
+            tuple(np.round(units.in_si(np.array(corner), unit), 12).tolist()) for corner in corners)
 
 
 def _less_whole_turns(turns: dict[str, Floats]) -> dict[str, Floats]:
