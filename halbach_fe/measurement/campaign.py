@@ -339,8 +339,8 @@ def refuse_shared(
                 f"`maps` '{one}' and '{other}'", where,
                 "different maps, as the same readings must not count twice",
                 f"the same readings in {shared if rounded else copies} of {len(fewer)} rows" + (
-                    f", but for an offset of {1e6 * np.abs(offset).max():.3g}\u00a0\u00b5T that all "
-                    "share" if shifted and rounded else ""),
+                    f", but for an offset of {1e6 * np.abs(offset).max():.3g}\u00a0\u00b5T that "
+                    "all share" if shifted and rounded else ""),
                 "Remove one of them, or these rows of one."))
 
 
