@@ -20,7 +20,13 @@ from halbach_fe.core.arrays import Bools, Floats, radii_of
 from halbach_fe.core.errors import HalbachWarning, StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.geometry.array_layout import blocks_of_array, nominal_blocks, ring_limits
-from halbach_fe.geometry.blocks import MagnetBlock, bore_radius, moved_block, rotation_matrix
+from halbach_fe.geometry.blocks import (
+    MagnetBlock,
+    bore_radius,
+    moved_block,
+    present_blocks,
+    rotation_matrix,
+)
 from halbach_fe.geometry.coils import (
     closest,
     distance_in_magnet,
@@ -289,6 +295,23 @@ class Magnet(ShownInNotebook):
         rounding_rad = 1e-6
         return bool(widest < np.pi + rounding_rad and not self.contains(axis).any())
 
+    @cached_property
+    def cancels_along_z(self) -> bool:
+        """Whether what the blocks make on the z axis cancels along it, as in an undulator.
+
+        Their moments count as dipoles, whose field integrated along z is m / w^2 at a distance w.
+        """
+        small = 0.01  # of what they could make together
+        blocks = [block for block in present_blocks(self.blocks) if np.hypot(*block.middle[:2])]
+        if self.dimension == 2 or not blocks:
+            return False
+        moments = np.array([block.volume * block.magnetization for block in blocks])
+        places = np.array([block.middle for block in blocks])[:, :2] @ [1, 1j]
+        apart = np.abs(places) ** 2
+        most = small * float(np.sum(np.linalg.norm(moments, axis=1) / apart))
+        across = abs(np.sum(moments[:, :2] @ [1, 1j] / places ** 2))
+        return bool(across <= most and abs(np.sum(moments[:, 2] / apart)) <= most)
+
     @property
     def iron_half_length(self) -> float:
         """Largest |z| in m of the iron, or of the array without iron; infinite in 2D."""
@@ -350,7 +373,7 @@ class Magnet(ShownInNotebook):
         Parameters
         ----------
         points_m : array_like, shape (..., 3), in m
-            Of a DataArray, DataFrame or Series that names x, y and z, these, in any order.
+            Of a DataArray, DataFrame, Series or dict that names x, y and z, these, in any order.
 
         Returns
         -------

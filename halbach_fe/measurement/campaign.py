@@ -305,6 +305,9 @@ def refuse_shared(
             both.sum(), max(SAME_READING * min(noise, sigma), MIN_SIGMA_T)))
         fewer, more = sorted(sides, key=len)
         shared = int(repeated(fewer, more, tolerance).sum())
+        offset = _offset(fewer, more)
+        beside = int(repeated(fewer - np.append(np.zeros(3), offset), more, tolerance).sum())
+        shifted, shared = beside > shared, max(beside, shared)
         exact = np.append(np.full(3, SAME_PLACE_M), np.full(both.sum(), SAME_DIGITS_T))
         copies = int(repeated(fewer, more, exact).sum())
         there = int(repeated(fewer[:, :3], more[:, :3], exact[:3]).sum())
@@ -315,8 +318,26 @@ def refuse_shared(
             _refuse(count, must_be(
                 f"`maps` '{one}' and '{other}'", where,
                 "different maps, as the same readings must not count twice",
-                f"the same readings in {shared if rounded else copies} of {len(fewer)} rows",
+                f"the same readings in {shared if rounded else copies} of {len(fewer)} rows" + (
+                    f", but for an offset of {1e6 * np.abs(offset).max():.3g}\u00a0\u00b5T that "
+                    "all share" if shifted and rounded else ""),
                 "Remove one of them, or these rows of one."))
+
+
+def _offset(rows: Floats, others: Floats) -> Floats:
+    """Return by how much values (k,) of rows (n, 3 + k) and others (m, 3 + k) at the same places
+    differ in the median.
+
+    Copies of which a zero was taken off scatter no more about it than copies do.
+    """
+    if not len(rows) or not len(others):
+        return np.zeros(rows.shape[1] - 3)
+    distance, nearest = KDTree(others[:, :3]).query(
+        rows[:, :3], distance_upper_bound=SAME_PLACE_M)
+    near = np.isfinite(distance)
+    if not near.any():
+        return np.zeros(rows.shape[1] - 3)
+    return np.asarray(np.median(rows[near, 3:] - others[nearest[near], 3:], axis=0))
 
 
 def _refuse_mixed_probes(maps: Sequence[Map]) -> None:

@@ -20,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from halbach_fe.core.errors import printable
 from halbach_fe.core.files import write_text
+from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.result import OWN_NOISE, Reservation
 from halbach_fe.report.words import in_a_row
 from halbach_fe.study.model import Study
@@ -193,6 +194,15 @@ def agreement(disagreement: str | None) -> str:
     """Say that an answer may be trusted whose update agrees with its map, or is not known to."""
     return ("Yes, as far as the update agrees with its map, which its own page says."
             if disagreement is None else "Yes: the update agrees with its map.")
+
+
+def along_the_axis(magnet: Magnet, options: str = "") -> tuple[str, str]:
+    """Return the next step, and its command, of a magnet whose field has to cancel along z."""
+    middle, reach = magnet.middle_z_m, 5 * (magnet.half_length + magnet.radius)
+    return ("See its field on the axis, whose first and second integrals must vanish: an undulator "
+            "has no mean field to be homogeneous.",
+            f"halbach-fe field STUDY {options}--from-m 0 0 {middle - reach:.3g} --to-m 0 0 "
+            f"{middle + reach:.3g} --count 2001 -o DIR")
 
 
 STATE_NOISE = ("State the noise that the map has (sigma_T, position_sd_m) and update again. This "

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -40,7 +40,7 @@ from halbach_fe.measurement.formats.text import (
 from halbach_fe.measurement.instrument import to_magnet_axes
 from halbach_fe.study.free_blocks import COLUMNS as FREE_COLUMNS
 from halbach_fe.study.free_blocks import SIZES, FreeBlocks
-from halbach_fe.study.free_blocks_file import validated_blocks
+from halbach_fe.study.free_blocks_file import outline_of, validated_blocks
 from halbach_fe.study.types import COMPONENTS
 
 TEXTS = ("serial", "type", "ring", "slot", "shape", "material")
@@ -78,7 +78,10 @@ TURN = re.compile(
     r"tilt(?:ed)?|azimuth(?:al)?|orient(?:ation|ed)?)(?:[xyz]|angles?|deg|rad|vec)*(?:m(?:ag)?)?"
     r"(?:about.*|[\W\d_].*)?")
 """Names of columns that say how a block lies; a rotor and the turns of a coil do not."""
-LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width")
+LENGTHS = ("radius", "inner_radius", "outer_radius", "inner_width", "outer_width", "outline")
+NUMBERS = ("recoil_permeability", "recoil_permeability_across", "magnetization_gradient",
+           "inner_corner_loss")
+"""Numbers without a unit, which are named as in a table of free blocks."""
 KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys(
     LENGTHS, "length") | {
     f"{name}_{axis}": kind for axis in COMPONENTS for name, kind in (
@@ -87,7 +90,7 @@ KIND = {"volume": "volume", "angle": "angle", "sigma": "moment"} | dict.fromkeys
 KELVIN = ("K", "kelvin")
 TEMPERATURES = ("C", "\u00b0C", "degC", "Celsius", "celsius", *KELVIN)
 """Units of temperatures; C if none is stated."""
-QUANTITIES = (*TEXTS, "temperature", "sides", *KIND)
+QUANTITIES = (*TEXTS, "temperature", "sides", *NUMBERS, *KIND)
 
 
 @dataclass(frozen=True)
@@ -186,8 +189,7 @@ def import_blocks(path: Path, declared: DeclaredBlocks) -> BlockTable | FreeBloc
 
 def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Table:
     """Return the cells of a table, whose header is the first line that names two quantities."""
-    delimiter = delimiter_of(max((line for _, line in lines), key=lambda one: sum(
-        one.count(mark) for mark in ",;\t")), declared)
+    delimiter = _delimiter(lines, declared)
     rows = [(number, cells_of(uncommented(line) if is_comment(line) else line, delimiter),
              is_comment(line)) for number, line in lines]
     start = next((n for n, (_, cells, _) in enumerate(rows)
@@ -216,6 +218,20 @@ def _table(lines: Sequence[Line], declared: DeclaredBlocks, where: str) -> _Tabl
         name: text.strip() for text, (name, _) in zip(own, header, strict=False) if name}
     return _Table(table, _with_stated(unit, declared, where), tuple(number for number, _ in body),
                   where, declared.decimal_comma, tuple(unknown), named)
+
+
+def _delimiter(lines: Sequence[Line], declared: DeclaredBlocks) -> str | None:
+    """Return what separates the cells: of the line of most marks, or of one that names two
+    quantities, as outlines have semicolons among commas.
+    """
+    found = delimiter_of(max((line for _, line in lines), key=lambda one: sum(
+        one.count(mark) for mark in ",;\t")), declared)
+    first = 100  # lines, below which there is no header
+    for _, line in lines[:first]:
+        own = delimiter_of(line, declared)
+        if sum(bool(quantity_of(cell)[0]) for cell in cells_of(uncommented(line), own)) > 1:
+            return own
+    return found
 
 
 def _header(
@@ -434,7 +450,7 @@ def _unread(table: _Table, free: bool) -> list[str]:
             "serial", "type", "ring", "slot"}
     sizes = {f"size_{axis}" for axis in COMPONENTS}
     if free:
-        read |= {"shape", "material", "sides"} | {
+        read |= {"shape", "material", "sides", *NUMBERS} | {
             name for name, kind in KIND.items() if kind in ("length", "angle")}
         read |= {"volume"} if strength == "moment" else set()
     else:
@@ -501,6 +517,21 @@ def _whole(cell: str, name: str, line: int, table: _Table) -> int:
     return int(value)
 
 
+def _outlines(table: _Table) -> Iterator[tuple[tuple[float, ...], ...] | None]:
+    """Yield the corners in m of each block, None where the cell is empty."""
+    for cell, line in zip(table.cells["outline"], table.lines, strict=True):
+        try:
+            corners = outline_of(cell.replace(",", ".") if table.decimal_comma else cell
+                                 ) if cell else None
+        except ValueError:
+            raise MeasurementError(must_be(
+                f"outline in line {line}", table.where, "corners as `x y; x y; x y`",
+                f"'{cell[:40]}'")) from None
+        unit = table.unit["outline"]
+        yield corners and tuple(
+            tuple(np.round(units.in_si(np.array(corner), unit), 12).tolist()) for corner in corners)
+
+
 def _less_whole_turns(turns: dict[str, Floats]) -> dict[str, Floats]:
     """Return the components (n,) in rad of rotation vectors, without whole turns of 360 degrees."""
     squares = [np.nan_to_num(one)**2 for one in turns.values()]
@@ -526,8 +557,10 @@ def _free_blocks(table: _Table, declared: DeclaredBlocks) -> FreeBlocks:
     for name in table.cells:
         own = name.removeprefix("at_") if name.startswith("at_") else name
         own, values = (f"{own}_deg", np.degrees) if KIND.get(name) == "angle" else (
-            f"{own}_m", np.asarray)
-        if own in FREE_COLUMNS:
+            own if name in NUMBERS else f"{own}_m", np.asarray)
+        if name == "outline":
+            columns[own] = [*_outlines(table)]
+        elif own in FREE_COLUMNS:
             si = turns[name] if name in turns else table.si(name)
             columns[own] = [None if np.isnan(value) else value
                             for value in np.round(values(si), 12).tolist()]
