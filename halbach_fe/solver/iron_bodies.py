@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Generic, TypeVar
 
 import numpy as np
 import scipy.sparse as sparse
@@ -57,9 +57,6 @@ from halbach_fe.solver.iron_modes import MESH, alone, assembled
 from halbach_fe.solver.magnetostatics import SOLUTIONS_FILE
 from halbach_fe.solver.mesh import VerifiedMesh, verify_mesh, write_files
 from halbach_fe.solver.session import RunSize, Session
-
-if TYPE_CHECKING:
-    from halbach_fe.geo.iron_bodies import Sizes
 
 PROBLEM = "iron_bodies.pro"
 POINTS = 15  # Gauss points of an element
@@ -539,35 +536,41 @@ def solve_bodies(
     return BodiesReaction(magnet.name, problem, total, residuals, coarse)
 
 
+Found = TypeVar("Found", covariant=True)
+
+
 @dataclass(frozen=True)
-class _Asked:
-    """A problem to assemble: what it depends on, and how to do it."""
+class Asked(Generic[Found]):
+    """What is to be computed once: what it depends on, and how to do it."""
 
     key: tuple[object, ...]
-    assemble: Callable[[], Problem] = field(compare=False)
+    compute: Callable[[], Found] = field(compare=False)
 
 
 @lru_cache(maxsize=2)  # that of the field and a coarser one; blocks that are updated change neither
-def _assembled(asked: _Asked) -> Problem:
-    return asked.assemble()
+def _assembled(asked: Asked[Problem]) -> Problem:
+    return asked.compute()
+
+
+def key_of(magnet: Magnet, session: Session, coarseness: float) -> tuple[object, ...]:
+    """Return what the problem of a magnet's iron depends on."""
+    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
+
+    sizes = Sizes.of(magnet.study.mesh, coarseness)
+    return magnet.study.iron, magnet.array_half_length, sizes, session.getdp
 
 
 def assemble_bodies(magnet: Magnet, session: Session, coarseness: float) -> Problem:
     """Mesh the iron and the air near it, have GetDP assemble the stiffness, and verify it."""
-    from halbach_fe.geo.iron_bodies import Sizes  # imports Gmsh
-
-    sizes = Sizes.of(magnet.study.mesh, coarseness)
-    key = magnet.study.iron, magnet.array_half_length, sizes, session.getdp
-    return _assembled(_Asked(key, partial(_assemble, magnet, session, sizes, coarseness)))
+    return _assembled(Asked(key_of(magnet, session, coarseness),
+                            partial(_assemble, magnet, session, coarseness)))
 
 
-def _assemble(
-    magnet: Magnet, session: Session, sizes: Sizes, coarseness: float
-) -> Problem:
-    """Assemble the problem for elements of some sizes, as `assemble_bodies` does."""
-    from halbach_fe.geo.iron_bodies import mesh_iron  # imports Gmsh
+def _assemble(magnet: Magnet, session: Session, coarseness: float) -> Problem:
+    """Assemble the problem, as `assemble_bodies` does."""
+    from halbach_fe.geo.iron_bodies import Sizes, mesh_iron  # imports Gmsh
 
-    shells = []
+    shells, sizes = [], Sizes.of(magnet.study.mesh, coarseness)
 
     def draw(path: Path) -> tags.Regions:
         regions, shell = mesh_iron(magnet.name, magnet.iron, sizes, path)

@@ -22,6 +22,7 @@ from halbach_fe.inference.infer import infer
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.response.resource_estimate import estimate_solve
 from halbach_fe.response.solution import study_observation
+from halbach_fe.response.stray_field import stray_field
 from halbach_fe.solver import iron_bodies
 from halbach_fe.solver.iron_bodies import COARSER, assemble_bodies, solve_bodies
 from halbach_fe.solver.routes import (
@@ -401,6 +402,33 @@ def test_a_mesh_serves_other_blocks(session):
         study_with(SPHERE | {"radius_m": 0.019}, mesh=study.mesh.model_dump())))
     assert again is first
     assert other is not first
+
+
+def test_the_solution_serves_the_stray_field(session, coarse_mesh, monkeypatch):
+    """The iron is solved once for field and 0.5 mT line; other blocks, or a field from outside,
+    which the line leaves out, have it solved again.
+    """
+    solved = []
+
+    def count(*arguments, **options):
+        solved.append(arguments)
+        return solve_bodies(*arguments, **options)
+
+    monkeypatch.setattr(iron_bodies, "solve_bodies", count)
+    magnet = build_magnet(study_with({"kind": "box", "size_m": [0.02, 0.004, 0.02],
+                                      "centre_m": [-0.03, -0.012, 0.0]}, permeability=1.05))
+    solve_separate(magnet, session)
+    once = len(solved)
+    assert once >= 3  # the turns on the coarser mesh, and the last on the finer one
+    found = stray_field(magnet, session)
+    assert len(solved) == once
+    solve_separate(magnet.with_(array__free_blocks__remanence_T=[1.4]), session)
+    assert len(solved) > once
+    once = len(solved)
+    outside = magnet.with_(external__background_T=[0.0, 0.0, 0.01])
+    there = stray_field(outside, session).radial.distance_m
+    assert there == pytest.approx(found.radial.distance_m, rel=1e-6)
+    assert len(solved) > once
 
 
 def test_the_key_of_finer_iron_is_named():
