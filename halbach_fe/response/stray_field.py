@@ -199,8 +199,11 @@ def _field(magnet: Magnet, session: Session, magnetizations: Gaussian | None) ->
     if magnet.is_vacuum:
         return vacuum
     alone = magnet.with_(external=External())
-    coarse = alone if magnet.has_losses else alone.with_(mesh__cells_per_side=1)
-    reaction = solve_separate(coarse, session.within("stray"), estimate=False)
+    # beside iron of any shape as for the readings: without other sources that is solved already
+    as_readings = not magnet.iron_is_axisymmetric
+    reaction = solve_separate(
+        alone if magnet.has_losses or as_readings else alone.with_(mesh__cells_per_side=1),
+        session.within("stray"), estimate=as_readings)
     return lambda points: vacuum(points) + reaction.field(points)
 
 
