@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halbach_fe.core.arrays import Floats, Ints
+from halbach_fe.core.arrays import Floats, Ints, box_middle
 from halbach_fe.core.errors import StudyError, must_be
 from halbach_fe.core.notebook import ShownInNotebook
 from halbach_fe.design.objective import Deviations, deviation_model
@@ -36,7 +36,7 @@ from halbach_fe.geometry.magnet import Magnet
 from halbach_fe.inference.infer import neighbour_columns
 from halbach_fe.inference.instrument_fit import OpenTerms, amplitude_columns, joined
 from halbach_fe.inference.readings import Readings, read_campaign
-from halbach_fe.measurement.campaign import ONLY_MAP, Map, middle_of
+from halbach_fe.measurement.campaign import ONLY_MAP, Map
 from halbach_fe.measurement.field_map import field_map
 from halbach_fe.measurement.instrument import sensor_matrix, sensor_positions
 from halbach_fe.measurement.instrument_terms import seen
@@ -223,7 +223,7 @@ def _readings(
     field = field_function(magnet, session) if is_open else _any_field
     sensors = sensor_positions(steady, points)
     shown = seen(sensor_matrix(steady), field(sensors.reshape(-1, 3)).reshape(sensors.shape))
-    middle = middle_of(points)
+    middle = box_middle(points)
     one = Map(ONLY_MAP, field_map(points, shown), study, middle, middle, *3 * (ONLY_MAP,))
     return read_campaign(magnet.with_study(study), [one]), one, field
 
@@ -260,6 +260,11 @@ def _candidates(magnet: Magnet, baseline: Floats, count: int | None) -> tuple[Fl
             f"Input `observation.quantity` of study {magnet.name} must be flux_density for a plan; "
             f"instead it is {magnet.study.observation.quantity}. Plan with a study that observes "
             "flux densities.")
+    if magnet.study.noise is None or not magnet.study.noise.regions:
+        raise StudyError(
+            f"Input `noise` of study {magnet.name} must say how noisy the readings will be, since "
+            "no map is there that has sigma_T; instead it is missing. Add [[noise.regions]] to "
+            "the study.")
     sets = magnet.study.plan.candidates or (magnet.study.observation.positions,)
     places: list[Floats] = [points_from(positions) for positions in sets]
     candidates: Floats = np.unique(np.vstack(places).round(9), axis=0)

@@ -91,9 +91,8 @@ def reading_noise(
     elif settings is None or not settings.regions:
         raise StudyError(
             f"Input `noise` of study {magnet.name} must say how noisy the readings are, since "
-            + (f"{where} has no sigma_T" if data else "no map is there that has sigma_T")
-            + "; instead it is missing. Add [[noise.regions]] to the study"
-            + (", or sigma_T to the map." if data else "."))
+            f"{where} has no sigma_T; instead it is missing. Add [[noise.regions]] to the study, "
+            "or sigma_T to the map.")
     else:
         sigma = np.array([region.sigma_T for region in settings.regions])[noise_regions(
             settings, observation.positions[:, 2], observation.components, where)]
