@@ -167,6 +167,33 @@ def test_what_is_past_the_knee_between_the_middles_of_cells(session, temperature
     assert found.limit_temperature(0.01) == pytest.approx(77.5, abs=0.7)  # of magpylib's points
 
 
+def test_a_permeable_cube_against_cells_of_magpylib(session):
+    """H in the middles of 6 x 6 x 6 cells of a cube, solved for in cells of magpylib's field. Its
+    mean is the demagnetizing factor 1/3: -M / 3. By default all these middles lie on faces of the
+    parts of the method of moments, a third on edges, where each was off by up to 29 % of the
+    largest H, and the mean by 4.7 %. Left are what uniform cells leave, 1 % here.
+    """
+    side, number, chi = 0.01, 6, 0.1
+    found = demagnetization_map(magnet_of_blocks({
+        "shape": ["cuboid"], "x_m": [0.0], "y_m": [0.0], "z_m": [0.0], "size_x_m": [side],
+        "size_y_m": [side], "size_z_m": [side], "remanence_T": [1.2],
+        "recoil_permeability": [1 + chi]}).with_(demagnetization={
+            **COLD, "temperature_C": 20.0}), session, number)
+    middles = found.cells.middles
+    apart = (middles[:, None] - middles).reshape(-1, 3)
+    matrix = np.stack([magpylib.magnet.Cuboid(
+        dimension=(side / number,) * 3, polarization=way).getH(apart).reshape(-1, len(middles), 3)
+        for way in np.eye(3)], axis=-1).transpose(0, 2, 1, 3).reshape(3 * len(middles), -1)
+    remanence = np.tile([1.2, 0.0, 0.0], len(middles))
+    polarization = np.linalg.solve(np.eye(len(matrix)) - chi * MU_0 * matrix, remanence)
+    strength = (matrix @ polarization).reshape(-1, 3)[:, 0]
+    mean = -polarization.reshape(-1, 3)[:, 0].mean() / 3 / MU_0
+    assert strength.mean() == pytest.approx(mean, rel=0.01)  # of middles, not of the volume
+    assert found.along.mean() == pytest.approx(strength.mean(), rel=2e-3)
+    assert np.abs(found.along - strength).max() < 0.02 * np.abs(strength).max()
+    assert found.along.min() == pytest.approx(strength.min(), rel=0.01)
+
+
 def test_permeability_and_iron_against_ngsolve(short_dipole, session):
     """The curl-curl equation by edge elements of order 2 on another mesh. Measured 1.5 % at most,
     0.5 % rms; on finer meshes of two rings 0.8 % and 0.16 %.
