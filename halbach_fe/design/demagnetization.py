@@ -328,7 +328,9 @@ def _inside(cells: Cells, cell: Ints, place: Floats) -> Floats:
     return np.asarray(np.einsum("nc,nck->nk", weights, cells.vertices[cells.corners[cell]]))
 
 
-def _reaction_by_moments(reacting: Magnet, cells: Cells, points: Floats, session: Session) -> Floats:
+def _reaction_by_moments(
+    reacting: Magnet, cells: Cells, points: Floats, session: Session
+) -> Floats:
     """Return mu_0 H (n, 3) in T of what permeability induces, at points (n, 3) in m inside blocks.
 
     The method of moments has blocks of uniform parts, on whose edges its field is infinite. The

@@ -300,8 +300,9 @@ class Magnet(ShownInNotebook):
         """Whether what the blocks make on the z axis cancels along it, as in an undulator.
 
         Their moments count as dipoles, whose field integrated along z is m / w^2 at a distance w.
+        Of a quadrupole there is no field anywhere on the axis, which is no undulator's.
         """
-        small = 0.01  # of what they could make together
+        small, weak = 0.01, 0.1  # of what they could make together: along the axis, and at a place
         blocks = [block for block in present_blocks(self.blocks) if np.hypot(*block.middle[:2])]
         if self.dimension == 2 or not blocks:
             return False
@@ -310,7 +311,16 @@ class Magnet(ShownInNotebook):
         apart = np.abs(places) ** 2
         most = small * float(np.sum(np.linalg.norm(moments, axis=1) / apart))
         across = abs(np.sum(moments[:, :2] @ [1, 1j] / places ** 2))
-        return bool(across <= most and abs(np.sum(moments[:, 2] / apart)) <= most)
+        if not (across <= most and abs(np.sum(moments[:, 2] / apart)) <= most):
+            return False
+        for z in np.unique([round(block.middle[2], 6) for block in blocks])[:200]:
+            away = np.array([0.0, 0.0, z]) - [block.middle for block in blocks]
+            far = np.linalg.norm(away, axis=1)[:, None]
+            along = np.einsum("ij,ij->i", away, moments)[:, None]
+            field = 3 * along * away / far**5 - moments / far**3
+            if np.linalg.norm(field.sum(axis=0)) > weak * np.linalg.norm(field, axis=1).sum():
+                return True
+        return False
 
     @property
     def iron_half_length(self) -> float:

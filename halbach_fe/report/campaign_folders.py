@@ -108,6 +108,15 @@ class Chapter:
         """Tell whether the study is one that the other command has written."""
         return any(name.endswith(".toml") for name in self.uses(other))
 
+    def shares_study_with(self, other: Chapter) -> bool:
+        """Tell whether both commands began with one file of a study.
+
+        That of a diagnosis is what it found, which may be a magnet of another order.
+        """
+        mine, others = ({digest for name, digest in one.record.inputs.items()
+                         if name.endswith(".toml")} for one in (self, other))
+        return bool(mine & others)
+
 
 def read_chapters(folders: Sequence[Path]) -> list[Chapter]:
     """Read folders of results, and bring them into the order in which data flow.
@@ -209,7 +218,7 @@ def _check_same_magnet(chapters: Sequence[Chapter]) -> None:
     """Refuse results of several magnets.
 
     A study that another of these commands has written (study.diagnosed.toml) is one of the same
-    magnet, whatever it changed.
+    magnet, whatever it changed, and so is what two commands found that began with one file.
     """
     of_study = [(one, one.study) for one in chapters if one.study is not None]
     if not of_study:
@@ -221,7 +230,8 @@ def _check_same_magnet(chapters: Sequence[Chapter]) -> None:
             raise OutputError(must_be(
                 "DIR", "the report", "results of one magnet", f"{first.folder} of study "
                 f"{its_study.name} and {one.folder} of study {study.name}", "Leave one out."))
-        if not any(map(one.has_study_of, chapters)) and not is_same_magnet(its_study, study):
+        if not (any(map(one.has_study_of, chapters)) or one.shares_study_with(first)
+                or is_same_magnet(its_study, study)):
             changed = differences(magnet_description(its_study), magnet_description(study))
             key = next(iter(changed), "array")
             raise OutputError(must_be(

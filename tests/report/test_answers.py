@@ -916,7 +916,8 @@ def undulator(**axial):
 
 def test_an_undulator_is_sent_to_its_axis(tmp_path, monkeypatch):
     """Both were sent to `homogeneity`, of a field that has no mean; the command runs. Controls: a
-    dipole, axial magnets with a field along z, a single block, and a region that the study names.
+    dipole, axial magnets with a field along z, a single block, a quadrupole (which has no field on
+    its axis at all), one of whose blocks is shifted, and a region that the study names.
     """
     monkeypatch.chdir(tmp_path)
     magnet = undulator()
@@ -941,8 +942,10 @@ def test_an_undulator_is_sent_to_its_axis(tmp_path, monkeypatch):
     single = hf.magnet_of_blocks({name: [value] for name, value in {
         "shape": "cuboid", "x_m": 0.04, "y_m": 0.0, "z_m": 0.0, "size_x_m": 0.02,
         "size_y_m": 0.02, "size_z_m": 0.02, "remanence_T": 1.3}.items()})
-    assert [one.cancels_along_z for one in (magnet, dipole, axial, single)] == [
-        True, False, False, False]
+    quadrupole = dipole.with_(array__multipole_order=2)
+    shifted = quadrupole.with_(array__exceptions=[{"slot": 3, "shift_m": [0.0, 0.0, 3e-4]}])
+    assert [one.cancels_along_z for one in (
+        magnet, dipole, axial, single, quadrupole, shifted)] == [True] + 5 * [False]
 
 
 def test_an_order_that_hardly_matters(given):

@@ -222,6 +222,22 @@ def test_a_study_that_was_written_is_of_the_same_magnet(tmp_path):
         hf.campaign_report([first, after], tmp_path / "all.html")
 
 
+def test_a_diagnosis_may_find_a_magnet_of_another_order(tmp_path):
+    """Both began with one file, as in `explain` of a quadrupole's map with a study of a dipole,
+    which ended in a refusal. Control: files that differ.
+    """
+    (tmp_path / "dipole.toml").write_text("one file")
+    (tmp_path / "other.toml").write_text("another")
+    first = results(tmp_path / "first", "infer", STUDY, [tmp_path / "dipole.toml"])
+    order = another(array__multipole_order=2)
+    found = results(tmp_path / "found", "diagnose", order, [tmp_path / "dipole.toml"],
+                    files=["study.diagnosed.toml"])
+    assert hf.campaign_report([first, found], tmp_path / "all.html").exists()
+    apart = results(tmp_path / "apart", "diagnose", order, [tmp_path / "other.toml"])
+    with pytest.raises(hf.HalbachError, match="of one magnet"):
+        hf.campaign_report([first, apart], tmp_path / "all.html")
+
+
 def no_page(folder):
     with result_folder(folder, "halbach-fe solve", "tiny"):
         write_text(folder / "field.csv", "1")
