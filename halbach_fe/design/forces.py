@@ -332,9 +332,9 @@ def _converged(
     if len(todo):
         # What the forces of blocks on blocks do not add up to, zero by Newton's third law, is an
         # error of these blocks: two orders may differ by less.
-        missing = np.linalg.norm(loads[:, 0, :3].sum(axis=0))
-        stated = np.linalg.norm(errors[todo, 0, 0])
-        errors[todo] *= max(1.0, missing / stated) if stated else 1.0
+        missing = float(np.linalg.norm(loads[:, 0, :3].sum(axis=0)))
+        stated = float(np.linalg.norm(errors[todo, 0, 0]))
+        errors[todo] *= missing / stated if missing > stated > 0 else 1.0
         warnings.warn(
             f"The forces on {len(todo)} of {len(blocks)} blocks, {blocks[todo[0]].name} among "
             f"them, are less certain than {100 * tolerance:g} %: see their error bars.",
