@@ -286,11 +286,12 @@ def require_convergence(
         raise SamplingError(
             f"The chains are too short: {names[worst]} has {smallest[worst]:.0f} effective samples "
             f"of {found.samples} (autocorrelation time {time:.0f}), where {effective:.0f} are "
-            f"needed. Take about {time * effective / found.chains:.0f} draws per chain, and a "
-            "tenth more as burn-in.")
+            f"needed. Take about {2 * time * effective / found.chains:.0f} draws per chain, and a "
+            "tenth more as burn-in.")  # twice: short chains hardly know their autocorrelation time
     apart = int(np.argmax(found.r_hat))
     if found.r_hat[apart] > MAX_R_HAT:
         raise SamplingError(
             f"The chains do not agree on {names[apart]}: its R-hat is {found.r_hat[apart]:.3f}, "
-            f"where at most {MAX_R_HAT} is allowed. Take more draws; if that does not help, the "
+            f"where at most {MAX_R_HAT} is allowed. Take "
+            f"{2 * found.samples // found.chains} draws per chain; if that does not help, the "
             "posterior probably has several modes.")

@@ -10,6 +10,7 @@ from halbach_fe.stats.gaussian import Gaussian
 from halbach_fe.stats.linear_gaussian import update
 from halbach_fe.stats.noise import independent_noise
 from halbach_fe.stats.pcn import (
+    ConvergenceDiagnostics,
     Posterior,
     Proposal,
     assess_convergence,
@@ -161,6 +162,18 @@ def test_a_short_chain_is_refused(generator):
         require_convergence(assess_convergence(chains), ["a", "b", "c"])
     good = generator.standard_normal((4, 2000, 3))
     require_convergence(assess_convergence(good), ["a", "b", "c"])
+
+
+@pytest.mark.parametrize(("r_hat", "bulk", "draws"), [(1.0, 37.0, 778), (1.018, 440.0, 784)])
+def test_refused_chains_are_told_how_many_draws_will_do(r_hat, bulk, draws):
+    """Of a dipole with iron, 36 draws were told to become 392. Those were refused without a number;
+    784 are accepted.
+    """
+    samples = 4 * 392 if r_hat > 1 else 144
+    ones = np.ones(1)
+    found = ConvergenceDiagnostics(r_hat * ones, bulk * ones, 500 * ones, ones, 4, samples)
+    with pytest.raises(SamplingError, match=f"{draws} draws per chain"):
+        require_convergence(found, ["a"])
 
 
 def test_mode_that_is_not_there_is_said():
